@@ -1,0 +1,34 @@
+# Plain venv + pip; constraints.txt pins every package.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+
+.PHONY: demo test setup lint types examples clean
+
+demo: $(VENV)/demo.stamp
+	$(BIN)/python examples/jump.py --out out/jump
+
+test: setup
+	$(BIN)/python -m pytest
+
+setup: $(VENV)/setup.stamp
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: setup
+	$(BIN)/pyright
+
+$(VENV)/demo.stamp: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(PIP) -e .
+	touch $@
+
+$(VENV)/setup.stamp: $(VENV)/demo.stamp
+	$(PIP) -e ".[torch,dev]"
+	touch $@
+
+clean:
+	rm -rf $(VENV) out

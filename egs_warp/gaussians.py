@@ -1,0 +1,116 @@
+"""A set of 3D Gaussians on one Warp device."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from egs_warp.errors import UserError
+
+
+@dataclass(frozen=True)
+class GaussianCloud:
+    """A 3DGS capture. All arrays live on one device; torch sees them without copies through ``wp.to_torch``."""
+
+    means: wp.array
+    """(n,) vec3, scene units (metres once animated)."""
+    rotations: wp.array
+    """(n,) vec4, unit quaternions w, x, y, z."""
+    log_scales: wp.array
+    """(n,) vec3, natural logarithm of the standard deviation along each axis."""
+    opacity_logits: wp.array
+    """(n,) float32, finite."""
+    sh: wp.array
+    """(n, (degree+1)^2) vec3: real spherical-harmonic coefficients of colour, band 0 first, in the INRIA sign convention."""
+
+    @classmethod
+    def from_numpy(
+        cls,
+        means: np.ndarray,
+        rotations: np.ndarray,
+        log_scales: np.ndarray,
+        opacity_logits: np.ndarray,
+        sh: np.ndarray,
+        *,
+        device: str | None = None,
+    ) -> GaussianCloud:
+        """Upload (n, 3), (n, 4), (n, 3), (n,), (n, K, 3) arrays; quaternions are normalised.
+
+        Raises ``UserError`` for zero Gaussians, mismatched counts or a non-finite value, which it names.
+        """
+        count = len(means)
+        if count == 0:
+            raise UserError("capture: it has no Gaussians; export it again from the tool that made it")
+        named = {
+            "means": (means, (count, 3)),
+            "rotations": (rotations, (count, 4)),
+            "log_scales": (log_scales, (count, 3)),
+            "opacity_logits": (opacity_logits, (count,)),
+            "sh": (sh, (count, np.shape(sh)[1] if np.ndim(sh) == 3 else -1, 3)),
+        }
+        for name, (values, shape) in named.items():
+            if np.shape(values) != shape:
+                raise UserError(f"capture: {name} has shape {np.shape(values)}, expected {shape}")
+            bad = np.flatnonzero(~np.isfinite(values).reshape(count, -1).all(axis=1))
+            if len(bad):
+                raise UserError(
+                    f"capture: {name} of {len(bad)} Gaussians is not finite (first: number {bad[0]}); remove them and export again"
+                )
+        if np.shape(sh)[1] not in (1, 4, 9, 16):
+            raise UserError(f"capture: {np.shape(sh)[1]} SH coefficients, expected 1, 4, 9 or 16 (degree 0 to 3)")
+        lengths = np.linalg.norm(rotations, axis=1, keepdims=True)
+        unit = np.where(lengths > 0, rotations / np.where(lengths > 0, lengths, 1.0), [1.0, 0.0, 0.0, 0.0])
+
+        def upload(values: np.ndarray, dtype: type) -> wp.array:
+            return wp.array(np.ascontiguousarray(values, dtype=np.float32), dtype=dtype, device=device)
+
+        return cls(
+            means=upload(means, wp.vec3),
+            rotations=upload(unit, wp.vec4),
+            log_scales=upload(log_scales, wp.vec3),
+            opacity_logits=upload(opacity_logits, wp.float32),
+            sh=upload(sh, wp.vec3),
+        )
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians n."""
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        """0 to 3."""
+        return int(round(self.sh.shape[1] ** 0.5)) - 1
+
+    @property
+    def device(self) -> wp.Device:
+        """The Warp device of every array."""
+        return self.means.device
+
+    def opacities(self) -> np.ndarray:
+        """(n,) float64 on the host, 0 to 1."""
+        return 1.0 / (1.0 + np.exp(-self.opacity_logits.numpy().astype(np.float64)))
+
+    def scaled(self, factor: float) -> GaussianCloud:
+        """The same capture with every length multiplied by ``factor``."""
+        return GaussianCloud.from_numpy(
+            self.means.numpy() * factor,
+            self.rotations.numpy(),
+            self.log_scales.numpy() + np.log(factor),
+            self.opacity_logits.numpy(),
+            self.sh.numpy(),
+            device=str(self.device),
+        )
+
+    def subset(self, chosen: np.ndarray) -> GaussianCloud:
+        """The Gaussians picked by a boolean mask or an index array."""
+        return GaussianCloud.from_numpy(
+            self.means.numpy()[chosen],
+            self.rotations.numpy()[chosen],
+            self.log_scales.numpy()[chosen],
+            self.opacity_logits.numpy()[chosen],
+            self.sh.numpy()[chosen],
+            device=str(self.device),
+        )

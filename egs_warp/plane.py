@@ -1,0 +1,45 @@
+"""The plane the object rests on: N.x + d = 0."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from egs_warp.errors import UserError
+
+
+@dataclass(frozen=True)
+class Plane:
+    """N.x + d = 0 with |N| = 1 and N pointing to the object's side (up)."""
+
+    normal: np.ndarray
+    """(3,) float64, unit."""
+    offset: float
+    """d, in the units of x."""
+
+    @classmethod
+    def from_coefficients(cls, nx: float, ny: float, nz: float, d: float) -> Plane:
+        """Plane nx x + ny y + nz z + d = 0, scaled to a unit normal. Raises ``UserError`` for a zero or non-finite one."""
+        normal = np.array([nx, ny, nz], dtype=np.float64)
+        length = float(np.linalg.norm(normal))
+        if not np.isfinite([nx, ny, nz, d]).all() or length == 0.0:
+            raise UserError(
+                f"plane {nx},{ny},{nz},{d}: give four finite numbers nx,ny,nz,d with a normal that is not zero"
+            )
+        return cls(normal / length, float(d) / length)
+
+    def heights(self, points: np.ndarray) -> np.ndarray:
+        """(...,) signed distance of ``points`` (..., 3); positive above."""
+        return np.asarray(points, float) @ self.normal + self.offset
+
+    def scaled(self, factor: float) -> Plane:
+        """The same plane after all lengths are multiplied by ``factor``."""
+        return Plane(self.normal, self.offset * factor)
+
+    def tangents(self) -> tuple[np.ndarray, np.ndarray]:
+        """Two unit vectors (3,) that span the plane; (t1, t2, N) is right-handed."""
+        helper = np.eye(3)[int(np.argmin(np.abs(self.normal)))]
+        first = np.cross(helper, self.normal)
+        first /= np.linalg.norm(first)
+        return first, np.cross(self.normal, first)

@@ -1,0 +1,9 @@
+"""Number types: Gaussian work is float32 (Warp's ``vec3``, ``mat33``), mechanics is float64 (the names below)."""
+
+import warp as wp
+
+real = wp.float64
+Vec2 = wp.vec2d
+Vec3 = wp.vec3d
+Vec4 = wp.vec4d
+Mat33 = wp.mat33d

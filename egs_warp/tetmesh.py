@@ -1,0 +1,78 @@
+"""A tetrahedral mesh in its rest shape."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from egs_warp.errors import UserError
+
+
+@dataclass(frozen=True)
+class TetMesh:
+    """Nodes and tetrahedra; every tetrahedron has positive volume."""
+
+    nodes: np.ndarray
+    """(N, 3) float64, metres."""
+    tets: np.ndarray
+    """(T, 4) int32, node indices; (x1-x0, x2-x0, x3-x0) is right-handed."""
+
+    @classmethod
+    def oriented(cls, nodes: np.ndarray, tets: np.ndarray) -> TetMesh:
+        """The mesh with each left-handed tetrahedron (fTetWild's winding) turned right-handed.
+
+        Raises ``UserError`` if an element has no volume.
+        """
+        nodes = np.ascontiguousarray(nodes, dtype=np.float64)
+        tets = np.array(tets, dtype=np.int32)
+        volumes = _signed_volumes(nodes, tets)
+        if len(tets) == 0 or not np.all(np.abs(volumes) > 0):
+            raise UserError(
+                f"mesh: {int(np.sum(volumes == 0))} of {len(tets)} tetrahedra have no volume; remesh the body"
+            )
+        left_handed = volumes < 0
+        tets[left_handed, 2], tets[left_handed, 3] = tets[left_handed, 3].copy(), tets[left_handed, 2].copy()
+        return cls(nodes, tets)
+
+    def volumes(self) -> np.ndarray:
+        """(T,) float64, cubic metres, positive."""
+        return _signed_volumes(self.nodes, self.tets)
+
+    def lumped_masses(self, density: float) -> np.ndarray:
+        """(N,) float64, kg: a quarter of each tetrahedron's mass on each of its nodes. ``density`` in kg/m^3."""
+        masses = np.zeros(len(self.nodes))
+        np.add.at(masses, self.tets.ravel(), np.repeat(density * self.volumes() / 4.0, 4))
+        return masses
+
+    def boundary_faces(self) -> np.ndarray:
+        """(B, 3) int32 node indices of the surface triangles, wound outwards."""
+        faces = self.tets[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)
+        _, first, counts = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+        return faces[np.sort(first[counts == 1])]
+
+    def min_dihedral_degrees(self) -> float:
+        """Smallest dihedral angle between two faces of one tetrahedron, degrees."""
+        corners = self.nodes[self.tets]
+        normals = np.stack(
+            [
+                np.cross(corners[:, b] - corners[:, a], corners[:, c] - corners[:, a])
+                for a, b, c in ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1))
+            ],
+            axis=1,
+        )
+        normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+        cosines = -np.einsum("tai,tbi->tab", normals, normals)[:, *np.triu_indices(4, 1)]
+        return float(np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)).min()))
+
+    def write_vtu(self, path: Path) -> None:
+        """Write the mesh as .vtu through meshio."""
+        import meshio
+
+        meshio.Mesh(self.nodes, [("tetra", self.tets)]).write(path)
+
+
+def _signed_volumes(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
+    x = nodes[tets]
+    return np.einsum("ti,ti->t", x[:, 1] - x[:, 0], np.cross(x[:, 2] - x[:, 0], x[:, 3] - x[:, 0])) / 6.0

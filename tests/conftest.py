@@ -1,0 +1,36 @@
+"""Fixtures: devices and the folder of real captures."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+wp.config.quiet = True
+
+_DATA = Path(os.environ.get("EGS_WARP_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Skip, with the reason, what this machine cannot run."""
+    no_data = pytest.mark.skip(reason=f"real captures not found in {_DATA}; set EGS_WARP_DATA")
+    no_cuda = pytest.mark.skip(reason="no CUDA device")
+    for item in items:
+        if "data" in item.keywords and not _DATA.is_dir():
+            item.add_marker(no_data)
+        if "cuda" in item.keywords and not wp.is_cuda_available():
+            item.add_marker(no_cuda)
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """Folder of real captures; tests that use it carry the marker ``data``."""
+    return _DATA
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
+def device(request: pytest.FixtureRequest) -> str:
+    """Each Warp device in turn."""
+    return request.param
