@@ -1,0 +1,118 @@
+"""The soft body: what never changes (``SoftBody``) and what a step changes (``BodyState``)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+import scipy.sparse.linalg as sparse_linalg
+
+from egs_warp.elasticity import ElasticAssembly, Material
+from egs_warp.plane import Plane
+from egs_warp.tetmesh import TetMesh
+
+GRAVITY = 9.81
+"""m/s^2."""
+
+
+@dataclass(frozen=True)
+class SoftBody:
+    """A tetrahedral body under gravity."""
+
+    mesh: TetMesh
+    assembly: ElasticAssembly
+    node_mass: np.ndarray
+    """(N,) float64, kg."""
+    gravity: np.ndarray
+    """(3,) float64, m/s^2."""
+    height: float
+    """H, metres: extent along the plane's normal."""
+
+    @property
+    def mass(self) -> float:
+        """Kilograms."""
+        return float(self.node_mass.sum())
+
+    @property
+    def weight(self) -> float:
+        """Newtons."""
+        return self.mass * float(np.linalg.norm(self.gravity))
+
+    def centre_of_mass(self, positions: np.ndarray) -> np.ndarray:
+        """(3,) mean of ``positions`` (N, 3) weighted by mass; of velocities, the velocity of the centre of mass."""
+        return self.node_mass @ positions / self.mass
+
+    def angular_momentum(self, positions: np.ndarray, velocities: np.ndarray) -> np.ndarray:
+        """(3,) kg m^2/s about the centre of mass."""
+        arms = positions - self.centre_of_mass(positions)
+        return (self.node_mass[:, None] * np.cross(arms, velocities)).sum(axis=0)
+
+    def inertia(self, positions: np.ndarray) -> np.ndarray:
+        """(3, 3) kg m^2 about the centre of mass."""
+        arms = positions - self.centre_of_mass(positions)
+        second = np.einsum("n,ni,nj->ij", self.node_mass, arms, arms)
+        return np.trace(second) * np.eye(3) - second
+
+    def best_fit_rotation(self, positions: np.ndarray) -> np.ndarray:
+        """(3, 3) rotation that best carries the rest shape to ``positions`` (Kabsch, mass-weighted)."""
+        rest = self.mesh.nodes - self.centre_of_mass(self.mesh.nodes)
+        arms = positions - self.centre_of_mass(positions)
+        u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", self.node_mass, arms, rest))
+        return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+
+    def mechanical_energy(self, positions: np.ndarray, velocities: np.ndarray) -> float:
+        """Kinetic + elastic + gravitational energy, joules."""
+        kinetic = 0.5 * float(self.node_mass @ (velocities**2).sum(axis=1))
+        elastic = self.assembly.energy(positions, np.zeros_like(positions), 0.0)
+        return kinetic + elastic - self.mass * float(self.gravity @ self.centre_of_mass(positions))
+
+
+@dataclass(frozen=True)
+class BodyState:
+    """Positions and velocities of the nodes at one time."""
+
+    positions: np.ndarray
+    """(N, 3) float64, metres."""
+    velocities: np.ndarray
+    """(N, 3) float64, m/s."""
+    time: float = 0.0
+    """Seconds."""
+
+
+def make_body(
+    mesh: TetMesh,
+    plane: Plane,
+    *,
+    sag: float = 0.03,
+    poisson_ratio: float = 0.4,
+    density: float = 1000.0,
+    damping_ratio: float = 0.05,
+    device: str | None = None,
+) -> SoftBody:
+    """A body whose elasticity follows from its own height H: E = density g H / sag (DESIGN 4).
+
+    ``damping_ratio`` is that of the first mode of the body held at its base (nodes within 5 % of H above the plane); it sets the
+    Rayleigh coefficient beta.
+    """
+    heights = plane.heights(mesh.nodes)
+    height = float(heights.max() - heights.min())
+    young = density * GRAVITY * height / sag
+    undamped = ElasticAssembly(mesh, Material(young, poisson_ratio, density, 0.0), device=device)
+    node_mass = mesh.lumped_masses(density)
+    frequency = _first_frequency(undamped, node_mass, heights > heights.min() + 0.05 * height)
+    damped = Material(young, poisson_ratio, density, 2.0 * damping_ratio / frequency)
+    assembly = ElasticAssembly(mesh, damped, device=device)
+    return SoftBody(mesh, assembly, node_mass, -GRAVITY * plane.normal, height)
+
+
+def _first_frequency(assembly: ElasticAssembly, node_mass: np.ndarray, free: np.ndarray) -> float:
+    """Smallest angular frequency, rad/s, with the nodes that are not ``free`` (N,) held."""
+    entries = assembly.matrix_entries(assembly.mesh.nodes, stiffness=1.0, damping=0.0)
+    upper = assembly.matrix(entries)
+    kept = np.flatnonzero(np.repeat(free, 3))
+    stiffness = (upper + sparse.triu(upper, 1).T).tocsc()[kept][:, kept]
+    mass = sparse.diags(np.repeat(node_mass, 3)[kept]).tocsc()
+    start = np.ones(len(kept))
+    value = sparse_linalg.eigsh(stiffness, k=1, M=mass, sigma=0.0, v0=start, return_eigenvectors=False)[0]
+    return float(np.sqrt(value))

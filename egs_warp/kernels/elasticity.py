@@ -1,0 +1,279 @@
+"""Neo-Hookean tetrahedra with objective damping: energy, gradient and Hessian per element, gathered without atomics."""
+
+import warp as wp
+
+from egs_warp.precision import Mat33, Vec3, real
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def deformation_gradient(x: wp.array[Vec3], tet: wp.vec4i, rest_inverse: Mat33) -> Mat33:
+    edges = wp.matrix_from_cols(x[tet[1]] - x[tet[0]], x[tet[2]] - x[tet[0]], x[tet[3]] - x[tet[0]])
+    return edges * rest_inverse
+
+
+@wp.func
+def shape_gradient(rest_inverse: Mat33, corner: int) -> Vec3:
+    """Gradient of a corner's hat function in the rest shape, so that F = sum_a x_a outer shape_gradient(a)."""
+    if corner == 0:
+        return -(rest_inverse[0] + rest_inverse[1] + rest_inverse[2])
+    return rest_inverse[corner - 1]
+
+
+@wp.func
+def damping_stress(start_gradient: Mat33, rate: Mat33, mu: real, lam: real) -> Mat33:
+    """First Piola stress F (2 mu E' + lambda tr(E') I) of E' = sym(F^T F'), F at the start of the step."""
+    product = wp.transpose(start_gradient) * rate
+    strain_rate = real(0.5) * (product + wp.transpose(product))
+    return start_gradient * (
+        real(2.0) * mu * strain_rate + lam * wp.trace(strain_rate) * wp.identity(n=3, dtype=wp.float64)
+    )
+
+
+@wp.kernel
+def deformation_gradients_kernel(
+    # Model:
+    tets: wp.array[wp.vec4i],
+    rest_inverses: wp.array[Mat33],
+    # In:
+    positions: wp.array[Vec3],
+    # Out:
+    gradients_out: wp.array[Mat33],
+):
+    e = wp.tid()
+    gradients_out[e] = deformation_gradient(positions, tets[e], rest_inverses[e])
+
+
+@wp.kernel
+def element_energies_kernel(
+    # Model:
+    tets: wp.array[wp.vec4i],
+    rest_inverses: wp.array[Mat33],
+    volumes: wp.array[real],
+    mu: real,
+    lam: real,
+    damping_time: real,
+    # In:
+    start_gradients: wp.array[Mat33],
+    positions: wp.array[Vec3],
+    velocities: wp.array[Vec3],
+    dt: real,
+    # Out:
+    energies_out: wp.array[real],
+    determinants_out: wp.array[real],
+):
+    """Eq. (5) plus dt times half the dissipated power; infinite where an element is inverted."""
+    e = wp.tid()
+    f = deformation_gradient(positions, tets[e], rest_inverses[e])
+    j = wp.determinant(f)
+    determinants_out[e] = j
+    if j <= real(0.0):
+        energies_out[e] = real(wp.inf)
+    else:
+        log_j = wp.log(j)
+        density = real(0.5) * mu * (wp.ddot(f, f) - real(3.0)) - mu * log_j + real(0.5) * lam * log_j * log_j
+        rate = deformation_gradient(velocities, tets[e], rest_inverses[e])
+        dissipation = real(0.5) * damping_time * wp.ddot(rate, damping_stress(start_gradients[e], rate, mu, lam))
+        energies_out[e] = volumes[e] * (density + dt * dissipation)
+
+
+@wp.kernel
+def element_gradients_kernel(
+    # Model:
+    tets: wp.array[wp.vec4i],
+    rest_inverses: wp.array[Mat33],
+    volumes: wp.array[real],
+    mu: real,
+    lam: real,
+    damping_time: real,
+    # In:
+    start_gradients: wp.array[Mat33],
+    positions: wp.array[Vec3],
+    velocities: wp.array[Vec3],
+    # Out:
+    corner_gradients_out: wp.array2d[Vec3],
+):
+    """Minus the elastic and damping force on each corner."""
+    e = wp.tid()
+    f = deformation_gradient(positions, tets[e], rest_inverses[e])
+    inverse_transpose = wp.transpose(wp.inverse(f))
+    log_j = wp.log(wp.determinant(f))
+    stress = mu * (f - inverse_transpose) + lam * log_j * inverse_transpose
+    if damping_time > real(0.0):
+        rate = deformation_gradient(velocities, tets[e], rest_inverses[e])
+        stress += damping_time * damping_stress(start_gradients[e], rate, mu, lam)
+    for a in range(4):
+        corner_gradients_out[e, a] = volumes[e] * (stress * shape_gradient(rest_inverses[e], a))
+
+
+@wp.kernel
+def gather_corners_kernel(
+    # Model:
+    corner_offsets: wp.array[int],
+    corner_from_slot: wp.array[int],
+    # In:
+    corner_values: wp.array2d[Vec3],
+    # Out:
+    node_values_out: wp.array[Vec3],
+):
+    node = wp.tid()
+    total = Vec3(real(0.0))
+    for slot in range(corner_offsets[node], corner_offsets[node + 1]):
+        corner = corner_from_slot[slot]
+        total += corner_values[corner // 4, corner % 4]
+    node_values_out[node] = total
+
+
+@wp.kernel
+def element_hessians_kernel(
+    # Model:
+    tets: wp.array[wp.vec4i],
+    rest_inverses: wp.array[Mat33],
+    volumes: wp.array[real],
+    mu: real,
+    lam: real,
+    # In:
+    positions: wp.array[Vec3],
+    # Out:
+    blocks_out: wp.array2d[Mat33],
+):
+    """True Hessian of Eq. (5): block (a, b) = V [mu g_a.g_b I + (mu - lambda ln J) h_b h_a^T + lambda h_a h_b^T], h = F^-T g."""
+    e = wp.tid()
+    rest_inverse = rest_inverses[e]
+    f = deformation_gradient(positions, tets[e], rest_inverse)
+    inverse_transpose = wp.transpose(wp.inverse(f))
+    cross_term = mu - lam * wp.log(wp.determinant(f))
+    for a in range(4):
+        g_a = shape_gradient(rest_inverse, a)
+        h_a = inverse_transpose * g_a
+        for b in range(4):
+            g_b = shape_gradient(rest_inverse, b)
+            h_b = inverse_transpose * g_b
+            block = (
+                mu * wp.dot(g_a, g_b) * wp.identity(n=3, dtype=wp.float64)
+                + cross_term * wp.outer(h_b, h_a)
+                + lam * wp.outer(h_a, h_b)
+            )
+            blocks_out[e, 4 * a + b] = volumes[e] * block
+
+
+@wp.kernel
+def element_projected_hessians_kernel(
+    # Model:
+    tets: wp.array[wp.vec4i],
+    rest_inverses: wp.array[Mat33],
+    volumes: wp.array[real],
+    mu: real,
+    lam: real,
+    # In:
+    positions: wp.array[Vec3],
+    # Out:
+    blocks_out: wp.array2d[Mat33],
+):
+    """The Hessian with the negative eigenvalues of each element set to zero, by the eigensystem of an isotropic energy.
+
+    In the frames of F = U diag(s) V^T the Hessian splits into the 3x3 block d2Psi/ds_i ds_j and, for each pair i < k, a twist
+    eigenvalue (Psi_i + Psi_k)/(s_i + s_k) and a flip eigenvalue (Psi_i - Psi_k)/(s_i - s_k) (Smith, de Goes, Kim 2019). For
+    Eq. (5) these are mu + (lambda ln J - mu)/(s_i s_k) and mu - (lambda ln J - mu)/(s_i s_k).
+    """
+    e = wp.tid()
+    rest_inverse = rest_inverses[e]
+    f = deformation_gradient(positions, tets[e], rest_inverse)
+    u = Mat33()
+    s = Vec3()
+    v = Mat33()
+    wp.svd3(f, u, s, v)
+    if wp.determinant(u) < real(0.0):
+        u = wp.matrix_from_cols(
+            Vec3(u[0, 0], u[1, 0], u[2, 0]), Vec3(u[0, 1], u[1, 1], u[2, 1]), -Vec3(u[0, 2], u[1, 2], u[2, 2])
+        )
+        s = Vec3(s[0], s[1], -s[2])
+    if wp.determinant(v) < real(0.0):
+        v = wp.matrix_from_cols(
+            Vec3(v[0, 0], v[1, 0], v[2, 0]), Vec3(v[0, 1], v[1, 1], v[2, 1]), -Vec3(v[0, 2], v[1, 2], v[2, 2])
+        )
+        s = Vec3(s[0], s[1], -s[2])
+    pressure = lam * wp.log(s[0] * s[1] * s[2]) - mu
+    scaling = Mat33()
+    direct = Mat33()
+    swapped = Mat33()
+    for i in range(3):
+        scaling[i, i] = mu + (lam - pressure) / (s[i] * s[i])
+        for k in range(3):
+            if i != k:
+                scaling[i, k] = lam / (s[i] * s[k])
+                twist = wp.max(mu + pressure / (s[i] * s[k]), real(0.0))
+                flip = wp.max(mu - pressure / (s[i] * s[k]), real(0.0))
+                direct[i, k] = real(0.5) * (twist + flip)
+                swapped[i, k] = real(0.5) * (flip - twist)
+    q = Mat33()
+    d = Vec3()
+    wp.eig3(scaling, q, d)
+    clamped = wp.diag(Vec3(wp.max(d[0], real(0.0)), wp.max(d[1], real(0.0)), wp.max(d[2], real(0.0))))
+    scaling = q * clamped * wp.transpose(q)
+    for a in range(4):
+        g_a = wp.transpose(v) * shape_gradient(rest_inverse, a)
+        for b in range(4):
+            g_b = wp.transpose(v) * shape_gradient(rest_inverse, b)
+            block = Mat33()
+            for i in range(3):
+                block[i, i] += scaling[i, i] * g_a[i] * g_b[i]
+                for k in range(3):
+                    if i != k:
+                        block[i, i] += direct[i, k] * g_a[k] * g_b[k]
+                        block[i, k] += scaling[i, k] * g_a[i] * g_b[k] + swapped[i, k] * g_a[k] * g_b[i]
+            blocks_out[e, 4 * a + b] = volumes[e] * (u * block * wp.transpose(u))
+
+
+@wp.kernel
+def element_damping_kernel(
+    # Model:
+    rest_inverses: wp.array[Mat33],
+    volumes: wp.array[real],
+    mu: real,
+    lam: real,
+    damping_time: real,
+    # In:
+    start_gradients: wp.array[Mat33],
+    # Out:
+    blocks_out: wp.array2d[Mat33],
+):
+    """Matrix C of the damping force -C v of ``damping_stress``: symmetric, positive semi-definite, zero for rigid velocities."""
+    e = wp.tid()
+    f = start_gradients[e]
+    metric = f * wp.transpose(f)
+    for a in range(4):
+        g_a = shape_gradient(rest_inverses[e], a)
+        for b in range(4):
+            g_b = shape_gradient(rest_inverses[e], b)
+            block = mu * (wp.dot(g_a, g_b) * metric + wp.outer(f * g_b, f * g_a)) + lam * wp.outer(f * g_a, f * g_b)
+            blocks_out[e, 4 * a + b] = (damping_time * volumes[e]) * block
+
+
+@wp.kernel
+def gather_matrix_kernel(
+    # Model:
+    contribution_offsets: wp.array[int],
+    block_from_contribution: wp.array[int],
+    entry_from_block: wp.array2d[int],
+    # In:
+    stiffness_blocks: wp.array2d[Mat33],
+    stiffness_factor: real,
+    damping_blocks: wp.array2d[Mat33],
+    damping_factor: real,
+    # Out:
+    entries_out: wp.array[real],
+):
+    """Upper-triangular matrix entries of stiffness_factor K + damping_factor C, one thread a 3x3 block."""
+    block_index = wp.tid()
+    total = Mat33()
+    for slot in range(contribution_offsets[block_index], contribution_offsets[block_index + 1]):
+        source = block_from_contribution[slot]
+        total += stiffness_factor * stiffness_blocks[source // 16, source % 16]
+        total += damping_factor * damping_blocks[source // 16, source % 16]
+    for i in range(3):
+        for k in range(3):
+            entry = entry_from_block[block_index, 3 * i + k]
+            if entry >= 0:
+                entries_out[entry] = total[i, k]

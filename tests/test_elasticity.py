@@ -1,0 +1,131 @@
+"""Eq. (5): Neo-Hookean elasticity against finite differences, closed forms and symmetries."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sparse
+from scipy.spatial.transform import Rotation
+
+from egs_warp.elasticity import ElasticAssembly, Material
+from egs_warp.tetmesh import TetMesh
+from tests.meshes import block_mesh
+
+MATERIAL = Material(young_modulus=3.0e4, poisson_ratio=0.4, density=1000.0, damping_time=0.01)
+
+
+def full(assembly: ElasticAssembly, entries: np.ndarray) -> np.ndarray:
+    upper = assembly.matrix(entries).toarray()
+    return upper + np.triu(upper, 1).T
+
+
+@pytest.fixture
+def bent(device: str) -> tuple[ElasticAssembly, np.ndarray, np.ndarray]:
+    mesh = block_mesh()
+    rng = np.random.default_rng(1)
+    x = mesh.nodes @ Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix().T
+    x = x * [1.0, 0.9, 1.1] + 0.008 * rng.standard_normal(x.shape)
+    assembly = ElasticAssembly(mesh, MATERIAL, device=device)
+    assembly.begin_step(x + 0.003 * rng.standard_normal(x.shape))
+    assert assembly.determinants(x).min() > 0.1
+    return assembly, x, rng.standard_normal(x.shape)
+
+
+def test_gradient_is_derivative_of_energy(bent) -> None:
+    """Eq. (5): central differences of Psi + dt/2 v^T C v in x and in v."""
+    assembly, x, v = bent
+    rng = np.random.default_rng(2)
+    for _ in range(4):
+        direction = rng.standard_normal(x.shape)
+        h = 1e-6
+        elastic = (assembly.energy(x + h * direction, 0 * v, 0) - assembly.energy(x - h * direction, 0 * v, 0)) / (2 * h)
+        assert elastic == pytest.approx(np.sum(assembly.gradient(x, 0 * v) * direction), rel=1e-6)
+        damped = (assembly.energy(x, v + h * direction, 1.0) - assembly.energy(x, v - h * direction, 1.0)) / (2 * h)
+        damping = assembly.gradient(x, v) - assembly.gradient(x, 0 * v)
+        assert damped == pytest.approx(np.sum(damping * direction), rel=1e-6)
+
+
+def test_hessian_is_derivative_of_gradient(bent) -> None:
+    """Eq. (5): K and C against differences of the gradient."""
+    assembly, x, v = bent
+    stiffness = full(assembly, assembly.matrix_entries(x, stiffness=1.0, damping=0.0))
+    damping = full(assembly, assembly.matrix_entries(x, stiffness=0.0, damping=1.0))
+    direction = np.random.default_rng(3).standard_normal(x.shape)
+    h = 1e-6
+    change = (assembly.gradient(x + h * direction, 0 * v) - assembly.gradient(x - h * direction, 0 * v)) / (2 * h)
+    assert np.abs(stiffness @ direction.ravel() - change.ravel()).max() < 1e-6 * np.abs(change).max()
+    damping_force = assembly.gradient(x, v) - assembly.gradient(x, 0 * v)
+    assert np.abs(damping @ v.ravel() - damping_force.ravel()).max() < 1e-10 * np.abs(damping_force).max()
+
+
+def test_projected_hessian_clamps_each_element(device: str) -> None:
+    """The analytic projection equals clamping the eigenvalues of the element's 9x9 (here 12x12) Hessian numerically."""
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    assembly = ElasticAssembly(TetMesh.oriented(corners, np.array([[0, 1, 2, 3]])), MATERIAL, device=device)
+    weights = np.linalg.cholesky(assembly_gram(corners)).T
+    rng = np.random.default_rng(4)
+    indefinite = 0
+    for _ in range(20):
+        x = corners @ (np.diag(rng.uniform(0.3, 1.6, 3)) + 0.3 * rng.standard_normal((3, 3))).T
+        if np.linalg.det((x[1:] - x[0]).T) < 0.05:
+            continue
+        true = full(assembly, assembly.matrix_entries(x, stiffness=1.0, damping=0.0))
+        projected = full(assembly, assembly.matrix_entries(x, stiffness=1.0, damping=0.0, projected=True))
+        # The projection is taken in deformation-gradient space: pull both back there.
+        pull = np.kron(np.linalg.pinv(weights), np.eye(3))
+        values, vectors = np.linalg.eigh(pull.T @ true @ pull)
+        indefinite += values.min() < -1e-6 * values.max()
+        clamped = vectors @ np.diag(np.maximum(values, 0)) @ vectors.T
+        assert np.abs(pull.T @ projected @ pull - clamped).max() < 1e-8 * values.max()
+    assert indefinite >= 5
+
+
+def assembly_gram(corners: np.ndarray) -> np.ndarray:
+    """4x4 matrix whose Cholesky factor maps corner values to gradients (3 rows) and their mean (1 row)."""
+    inverse = np.linalg.inv((corners[1:] - corners[0]).T)
+    gradients = np.vstack([-inverse.sum(0), inverse])
+    return gradients @ gradients.T + np.full((4, 4), 1.0 / 16.0)
+
+
+def test_rigid_motion_costs_nothing(bent) -> None:
+    """No energy, force or damping from rotation; internal forces carry no net force or torque."""
+    assembly, x, v = bent
+    nodes = assembly.mesh.nodes
+    turned = nodes @ Rotation.from_rotvec([1.0, 2.0, -0.5]).as_matrix().T + [1.0, 2.0, 3.0]
+    assert abs(assembly.energy(turned, 0 * v, 0.0)) < 1e-9 * MATERIAL.mu
+    assert np.abs(assembly.gradient(turned, 0 * v)).max() < 1e-9 * MATERIAL.mu
+    assembly.begin_step(x)
+    spin = np.cross([0.3, -1.0, 0.7], x) + [1.0, 0.0, 2.0]
+    assert np.abs(assembly.gradient(x, spin) - assembly.gradient(x, 0 * v)).max() < 1e-10 * MATERIAL.mu
+    force = assembly.gradient(x, v)
+    scale = np.abs(force).sum()
+    assert np.abs(force.sum(0)).max() < 1e-12 * scale
+    elastic = assembly.gradient(x, 0 * v)
+    assert np.abs(np.cross(x, elastic).sum(0)).max() < 1e-12 * scale
+    assert np.abs(np.cross(x, force).sum(0)).max() < 1e-12 * scale
+
+
+def test_uniaxial_stretch_closed_form(device: str) -> None:
+    """Eq. (5) for diag(a, b, c): Psi = mu/2 (a^2+b^2+c^2-3) - mu ln J + lambda/2 ln^2 J, times the volume."""
+    mesh = block_mesh()
+    assembly = ElasticAssembly(mesh, MATERIAL, device=device)
+    stretch = np.array([1.2, 0.9, 0.8])
+    log_j = np.log(stretch.prod())
+    density = MATERIAL.mu / 2 * (np.sum(stretch**2) - 3) - MATERIAL.mu * log_j + MATERIAL.lam / 2 * log_j**2
+    energy = assembly.energy(mesh.nodes * stretch, np.zeros_like(mesh.nodes), 0.0)
+    assert energy == pytest.approx(density * mesh.volumes().sum(), rel=1e-12)
+
+
+def test_inverted_element_has_infinite_energy(device: str) -> None:
+    mesh = block_mesh()
+    assembly = ElasticAssembly(mesh, MATERIAL, device=device)
+    assert assembly.energy(mesh.nodes * [1, 1, -1], np.zeros_like(mesh.nodes), 0.0) == np.inf
+
+
+def test_pattern_is_the_meshs(device: str) -> None:
+    mesh = block_mesh()
+    assembly = ElasticAssembly(mesh, MATERIAL, device=device)
+    pairs = sparse.coo_matrix(
+        (np.ones(16 * len(mesh.tets)), (np.repeat(mesh.tets, 4, 1).ravel(), np.tile(mesh.tets, (1, 4)).ravel()))
+    ).tocsr()
+    assert full(assembly, np.ones(assembly.upper_pattern.nnz)).astype(bool).sum() == 9 * pairs.nnz
