@@ -60,15 +60,13 @@ class GaussianCloud:
                 )
         if np.shape(sh)[1] not in (1, 4, 9, 16):
             raise UserError(f"capture: {np.shape(sh)[1]} SH coefficients, expected 1, 4, 9 or 16 (degree 0 to 3)")
-        lengths = np.linalg.norm(rotations, axis=1, keepdims=True)
-        unit = np.where(lengths > 0, rotations / np.where(lengths > 0, lengths, 1.0), [1.0, 0.0, 0.0, 0.0])
 
         def upload(values: np.ndarray, dtype: type) -> wp.array:
             return wp.array(np.ascontiguousarray(values, dtype=np.float32), dtype=dtype, device=device)
 
         return cls(
             means=upload(means, wp.vec3),
-            rotations=upload(unit, wp.vec4),
+            rotations=upload(unit_quaternions(rotations), wp.vec4),
             log_scales=upload(log_scales, wp.vec3),
             opacity_logits=upload(opacity_logits, wp.float32),
             sh=upload(sh, wp.vec3),
@@ -114,3 +112,16 @@ class GaussianCloud:
             self.sh.numpy()[chosen],
             device=str(self.device),
         )
+
+
+def unit_quaternions(quaternions: np.ndarray) -> np.ndarray:
+    """(n, 4) float32 of unit length; those of length 0 become the identity (w first).
+
+    Quaternions that are unit already, to rounding, keep their bits, so that a capture survives any number of copies.
+    """
+    lengths = np.sqrt(np.einsum("ni,ni->n", quaternions, quaternions, dtype=np.float64))
+    off = np.abs(lengths - 1.0) > 2.0**-22
+    unit = np.array(quaternions, dtype=np.float32)
+    unit[off] = quaternions[off] / np.maximum(lengths[off], 1e-300)[:, None]
+    unit[lengths == 0.0] = (1.0, 0.0, 0.0, 0.0)
+    return unit
