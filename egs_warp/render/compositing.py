@@ -1,0 +1,73 @@
+"""From tile lists to pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from egs_warp.kernels.render_compositing import composite_pixel_kernel, composite_tile_kernel
+from egs_warp.kernels.render_projection import View
+from egs_warp.render.projection import ProjectedGaussians
+from egs_warp.render.threads import launch_ranges
+from egs_warp.render.tiles import TileLists
+
+
+@dataclass(frozen=True)
+class RenderedImage:
+    """One picture. Pixel (row, column) has its centre at (column + 0.5, row + 0.5)."""
+
+    colour: wp.array
+    """(H, W) vec3 float32, background included; display-referred as the capture's colours are, not clipped above 1."""
+    alpha: wp.array
+    """(H, W) float32, 0 to 1: one minus the light that the background sends through."""
+    depth: wp.array
+    """(H, W) float32: alpha-weighted mean z-depth divided by alpha, scene units; 0 where alpha is 0."""
+
+    def colour_srgb8(self) -> np.ndarray:
+        """(H, W, 3) uint8 on the host, ready for PNG or video: clipped and quantised; SH colours are sRGB already."""
+        return np.rint(np.clip(self.colour.numpy(), 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def composite(
+    projected: ProjectedGaussians, lists: TileLists, view: View, *, background: wp.array, threads: int
+) -> RenderedImage:
+    """Blend every tile's Gaussians from front to back over ``background``, (1,) or (H * W,) vec3."""
+    device = projected.ellipse.device
+    width, height = int(view.width), int(view.height)
+    colour = wp.empty(width * height, dtype=wp.vec3, device=device)
+    alpha = wp.empty(width * height, dtype=wp.float32, device=device)
+    depth = wp.empty(width * height, dtype=wp.float32, device=device)
+    inputs = [
+        width,
+        height,
+        lists.tile_start,
+        lists.gaussian_from_intersection,
+        projected.ellipse,
+        projected.falloff,
+        projected.colour_depth,
+        background,
+    ]
+    outputs = [colour, alpha, depth]
+    if device.is_cuda:
+        wp.launch(
+            composite_pixel_kernel,
+            dim=lists.tile_count * 256,
+            inputs=inputs,
+            outputs=outputs,
+            device=device,
+            block_dim=256,
+        )
+    else:
+        launch_ranges(
+            composite_tile_kernel,
+            lists.tile_count,
+            inputs=inputs,
+            outputs=outputs,
+            device=device,
+            threads=threads,
+            work=lists.work,
+        )
+    shape = (height, width)
+    return RenderedImage(colour.reshape(shape), alpha.reshape(shape), depth.reshape(shape))

@@ -1,0 +1,90 @@
+"""Screen-space ellipses of a Gaussian cloud seen by one camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from egs_warp.camera import Camera
+from egs_warp.errors import UserError
+from egs_warp.gaussians import GaussianCloud
+from egs_warp.kernels.render_projection import View, project_kernel
+from egs_warp.render.threads import launch_ranges
+
+_ATTRIBUTES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
+
+
+@dataclass(frozen=True)
+class ProjectedGaussians:
+    """Every Gaussian on the screen; entries of Gaussians that cannot show are undefined but for ``depth_key``."""
+
+    ellipse: wp.array
+    """(n,) vec4: centre x, y in pixels, then a and shear of -ln(alpha / opacity) = a (dx + shear dy)^2 + v dy^2."""
+    falloff: wp.array
+    """(n,) vec2: v, ln(opacity)."""
+    colour_depth: wp.array
+    """(n,) vec4: red, green, blue (display-referred, at least 0) and z-depth."""
+    depth_key: wp.array
+    """(n,) float32: z-depth, +inf where the Gaussian cannot show."""
+    first_bad: wp.array
+    """(5,) int32: first Gaussian with a non-finite mean, rotation, scale, opacity and colour; n where there is none."""
+
+    def check(self) -> None:
+        """Raise ``UserError`` that names the first non-finite input, if there is one."""
+        count = self.depth_key.shape[0]
+        for attribute, first in zip(_ATTRIBUTES, self.first_bad.numpy(), strict=True):
+            if first < count:
+                raise UserError(f"render: {attribute} of Gaussian {first} is not finite; repair or remove it")
+
+
+def view_from_camera(camera: Camera) -> View:
+    """The camera in single precision, with the bounds of the projection's Jacobian. Raises ``UserError`` for an impossible camera."""
+    numbers = [camera.fx, camera.fy, camera.cx, camera.cy, camera.near, *camera.rotation.ravel(), *camera.translation]
+    if not np.isfinite(numbers).all() or camera.fx <= 0 or camera.fy <= 0:
+        raise UserError("camera: its pose and intrinsics must be finite and its focal lengths positive")
+    if camera.width < 1 or camera.height < 1:
+        raise UserError(f"camera: image size {camera.width} x {camera.height} must be at least 1 x 1")
+    if not 0 < camera.near < camera.far:
+        raise UserError(f"camera: near {camera.near} and far {camera.far} must satisfy 0 < near < far")
+    view = View()
+    view.rotation = wp.mat33(np.asarray(camera.rotation, dtype=np.float32))
+    view.translation = wp.vec3(*np.asarray(camera.translation, dtype=np.float32))
+    view.centre = wp.vec3(*camera.centre.astype(np.float32))
+    view.fx, view.fy, view.cx, view.cy = camera.fx, camera.fy, camera.cx, camera.cy
+    view.near, view.far = camera.near, min(camera.far, float(np.finfo(np.float32).max))
+    view.width, view.height = camera.width, camera.height
+    margin_x, margin_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy
+    view.slope_low = wp.vec2(-camera.cx / camera.fx - margin_x, -camera.cy / camera.fy - margin_y)
+    view.slope_high = wp.vec2(
+        (camera.width - camera.cx) / camera.fx + margin_x, (camera.height - camera.cy) / camera.fy + margin_y
+    )
+    return view
+
+
+def project(cloud: GaussianCloud, view: View, *, antialiased: bool, threads: int) -> ProjectedGaussians:
+    """Project every Gaussian of ``cloud``; those outside the view, or fainter than 1/255 everywhere, get depth key +inf."""
+    device, count = cloud.device, cloud.count
+    projected = ProjectedGaussians(
+        ellipse=wp.empty(count, dtype=wp.vec4, device=device),
+        falloff=wp.empty(count, dtype=wp.vec2, device=device),
+        colour_depth=wp.empty(count, dtype=wp.vec4, device=device),
+        depth_key=wp.empty(count, dtype=wp.float32, device=device),
+        first_bad=wp.full(5, count, dtype=wp.int32, device=device),
+    )
+    launch_ranges(
+        project_kernel,
+        count,
+        inputs=[view, int(antialiased), *(getattr(cloud, name) for name in _ATTRIBUTES)],
+        outputs=[
+            projected.ellipse,
+            projected.falloff,
+            projected.colour_depth,
+            projected.depth_key,
+            projected.first_bad,
+        ],
+        device=device,
+        threads=threads,
+    )
+    return projected

@@ -1,0 +1,49 @@
+"""The renderer on one page: project, list, composite (DESIGN: Kerbl et al. 2023, in Warp kernels)."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from egs_warp.camera import Camera
+from egs_warp.errors import UserError
+from egs_warp.gaussians import GaussianCloud
+from egs_warp.render.compositing import RenderedImage, composite
+from egs_warp.render.projection import project, view_from_camera
+from egs_warp.render.threads import available_threads
+from egs_warp.render.tiles import build_tile_lists
+
+
+def render(
+    cloud: GaussianCloud,
+    camera: Camera,
+    *,
+    background: tuple[float, float, float] | np.ndarray | wp.array = (1.0, 1.0, 1.0),
+    antialiased: bool = False,
+    threads: int | None = None,
+) -> RenderedImage:
+    """Picture of ``cloud`` through ``camera``, on the device of the cloud.
+
+    ``background`` is one colour, or an image (H, W, 3) of this camera's size. ``antialiased`` dims each splat by what the 0.3 px
+    low-pass adds to its area. ``threads`` (a CPU only) defaults to the available cores; the picture does not depend on it.
+    Raises ``UserError`` for non-finite Gaussians, which it names, for an impossible camera and for a background of another size.
+    """
+    threads = threads or available_threads()
+    view = view_from_camera(camera)
+    behind = _background_array(background, camera, cloud.device)
+    projected = project(cloud, view, antialiased=antialiased, threads=threads)
+    projected.check()
+    lists = build_tile_lists(projected, view, threads=threads)
+    return composite(projected, lists, view, background=behind, threads=threads)
+
+
+def _background_array(background: object, camera: Camera, device: wp.Device) -> wp.array:
+    shape = (camera.height, camera.width)
+    if isinstance(background, wp.array) and background.dtype == wp.vec3 and background.shape == shape:
+        return background.to(device).contiguous().flatten()
+    values = np.asarray(background.numpy() if isinstance(background, wp.array) else background, dtype=np.float32)
+    if values.shape not in ((3,), (*shape, 3)) or not np.isfinite(values).all():
+        raise UserError(
+            f"background: give three finite numbers or an image of {camera.height} x {camera.width} x 3, not shape {values.shape}"
+        )
+    return wp.array(values.reshape(-1, 3), dtype=wp.vec3, device=device)

@@ -1,0 +1,146 @@
+"""Pictures and videos on disk. A file appears whole or not at all: it is written beside its place and then renamed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+
+from egs_warp.errors import UserError
+
+
+def write_png(path: Path | str, image: np.ndarray) -> None:
+    """Write (H, W, 3) uint8 RGB, (H, W, 4) RGBA or (H, W) grey. Raises ``UserError`` if the place cannot be written."""
+    import cv2
+
+    path = Path(path)
+    swap = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}
+    coded = image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), swap[image.shape[2]])
+    ok, data = cv2.imencode(".png", coded)
+    if not ok:
+        raise UserError(f"{path}: the picture of shape {image.shape} could not be encoded as PNG")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        temporary.write_bytes(data.tobytes())
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise UserError(f"{path}: cannot write the picture ({error.strerror}); choose a writable folder") from error
+
+
+def contact_sheet(frames: Sequence[np.ndarray], columns: int, labels: Sequence[str]) -> np.ndarray:
+    """(rows * H, columns * W, 3) uint8: the frames (H, W, 3) side by side, each with its label in its upper left corner."""
+    import cv2
+
+    if len(frames) != len(labels) or not frames:
+        raise UserError(f"contact sheet: {len(frames)} frames and {len(labels)} labels; give one label to each frame")
+    height, width = frames[0].shape[:2]
+    rows = -(-len(frames) // columns)
+    sheet = np.full((rows * height, columns * width, 3), 255, dtype=np.uint8)
+    size = max(0.35, height / 512 * 0.8)
+    for index, (frame, label) in enumerate(zip(frames, labels, strict=True)):
+        cell = np.ascontiguousarray(frame)
+        corner = (int(12 * size), int(30 * size))
+        # A light rim under dark letters reads on any background.
+        for colour, thickness in (
+            ((255, 255, 255), max(2, round(4 * size))),
+            ((20, 20, 20), max(1, round(1.4 * size))),
+        ):
+            cell = cv2.putText(
+                cell.copy(), label, corner, cv2.FONT_HERSHEY_SIMPLEX, size, colour, thickness, cv2.LINE_AA
+            )
+        row, column = divmod(index, columns)
+        sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = cell
+    return sheet
+
+
+class VideoWriter:
+    """H.264 (yuv420p) mp4 through the ffmpeg program that imageio-ffmpeg brings.
+
+    Use as a context manager; leaving it without an exception puts the video at ``path``, otherwise nothing is left behind.
+    """
+
+    def __init__(
+        self, path: Path | str, width: int, height: int, *, frames_per_second: float = 60.0, quality: int = 16
+    ):
+        """``quality`` is x264's constant rate factor: 0 lossless, 16 hardly visible loss, 51 worst."""
+        self._path = Path(path)
+        self._size = (height, width)
+        self._command_tail = [
+            *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width + width % 2}x{height + height % 2}"),
+            *("-r", f"{frames_per_second:g}", "-i", "-", "-an"),
+            *("-vf", "scale=out_color_matrix=bt709:out_range=tv", "-c:v", "libx264", "-pix_fmt", "yuv420p"),
+            *("-crf", str(quality), "-preset", "medium", "-movflags", "+faststart"),
+            *("-color_range", "tv", "-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709"),
+        ]
+
+    def __enter__(self) -> VideoWriter:
+        import imageio_ffmpeg
+
+        self._temporary = self._path.with_name(f".{self._path.name}.{os.getpid()}.part")
+        try:
+            self._temporary.write_bytes(b"")
+        except OSError as error:
+            raise UserError(
+                f"{self._path}: cannot write the video ({error.strerror}); choose a writable folder"
+            ) from error
+        self._log = tempfile.TemporaryFile()
+        self._process = subprocess.Popen(
+            [
+                *(imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"),
+                *self._command_tail,
+                *("-f", "mp4", str(self._temporary)),
+            ],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=self._log,
+        )
+        return self
+
+    def write(self, frame: np.ndarray) -> None:
+        """Append one (H, W, 3) uint8 RGB frame. An odd side is padded by repeating its last line: yuv420p needs even ones."""
+        if frame.shape != (*self._size, 3) or frame.dtype != np.uint8:
+            raise UserError(
+                f"{self._path}: a frame has shape {frame.shape} and type {frame.dtype}, expected {(*self._size, 3)} and uint8"
+            )
+        height, width = self._size
+        if height % 2 or width % 2:
+            frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(np.ascontiguousarray(frame).data)
+        except BrokenPipeError as error:
+            raise self._failure() from error
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        assert self._process.stdin is not None
+        try:
+            if kind is not None:
+                self._process.kill()
+                self._process.wait()
+                return
+            try:
+                self._process.stdin.close()
+            except BrokenPipeError:
+                pass
+            if self._process.wait() != 0:
+                raise self._failure()
+            os.replace(self._temporary, self._path)
+        finally:
+            if kind is not None:
+                self._process.stdin.close()
+            self._temporary.unlink(missing_ok=True)
+            self._log.close()
+
+    def _failure(self) -> UserError:
+        self._process.wait()
+        self._log.seek(0)
+        lines = self._log.read().decode(errors="replace").strip().splitlines()
+        return UserError(f"{self._path}: ffmpeg could not write the video ({lines[-1] if lines else 'no message'})")
