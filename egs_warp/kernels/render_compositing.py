@@ -50,7 +50,9 @@ def composite_tile_kernel(
     alpha_out: wp.array[wp.float32],
     depth_out: wp.array[wp.float32],
 ):
-    """One thread composites one tile, row span by row span of each splat: only pixels inside the ellipse are visited (CPU)."""
+    """One thread composites one tile, row span by row span of each splat: only pixels inside the ellipse are visited
+    (CPU).
+    """
     tile = wp.tid() + first
     columns = (width + TILE - 1) / TILE
     left = (tile % columns) * TILE

@@ -92,7 +92,8 @@ def sh_sum(sh: wp.array2d[wp.vec3], g: wp.int32, coefficients: wp.int32, d: wp.v
 def screen_axes(view: View, p: wp.vec3, q: wp.vec4, log_scale: wp.vec3) -> tuple[wp.vec3, wp.vec3]:
     """Rows x and y of J W R S at the camera-space point ``p``: the screen covariance is their Gram matrix."""
     inv_z = 1.0 / p[2]
-    # As gsplat and Kerbl et al. do, the Jacobian is taken no further out than 15 % beyond the image: it grows without bound there.
+    # As gsplat and Kerbl et al. do, the Jacobian is taken no further out than 15 % beyond the image: it grows without
+    # bound there.
     tx = wp.clamp(p[0] * inv_z, view.slope_low[0], view.slope_high[0])
     ty = wp.clamp(p[1] * inv_z, view.slope_low[1], view.slope_high[1])
     axes = view.rotation * rotation_matrix(q)
@@ -125,7 +126,8 @@ def project_kernel(
 ):
     """Screen ellipse, falloff and colour of every Gaussian; a Gaussian that cannot show gets depth key +inf.
 
-    The ellipse is kept in its Cholesky form: with u = dx + shear dy, -ln(alpha / opacity) = a u^2 + v dy^2. Its terms are all
+    The ellipse is kept in its Cholesky form: with u = dx + shear dy, -ln(alpha / opacity) = a u^2 + v dy^2. Its terms
+    are all
     positive, where the usual conic cancels for long thin splats.
     """
     g = wp.tid() + first

@@ -58,7 +58,9 @@ def band_lists_kernel(
     cursor_out: wp.array[wp.int32],
     gaussian_from_intersection_out: wp.array[wp.int32],
 ):
-    """One thread walks all Gaussians from front to back and counts, or appends, those of its band of tile rows (CPU)."""
+    """One thread walks all Gaussians from front to back and counts, or appends, those of its band of tile rows
+    (CPU).
+    """
     band = wp.tid() + first
     columns = (width + TILE - 1) / TILE
     top = band * band_rows
@@ -115,7 +117,9 @@ def emit_tiles_kernel(
     tile_out: wp.array[wp.int32],
     gaussian_out: wp.array[wp.int32],
 ):
-    """(tile, Gaussian) for every pair that meets, in depth order; ``intersections_end`` is the inclusive scan of the counts."""
+    """(tile, Gaussian) for every pair that meets, in depth order; ``intersections_end`` is the inclusive scan of the
+    counts.
+    """
     rank = wp.tid()
     g = gaussian_from_rank[rank]
     slot = wp.int32(0)

@@ -40,7 +40,9 @@ class ProjectedGaussians:
 
 
 def view_from_camera(camera: Camera) -> View:
-    """The camera in single precision, with the bounds of the projection's Jacobian. Raises ``UserError`` for an impossible camera."""
+    """The camera in single precision, with the bounds of the projection's Jacobian. Raises ``UserError`` for an
+    impossible camera.
+    """
     numbers = [camera.fx, camera.fy, camera.cx, camera.cy, camera.near, *camera.rotation.ravel(), *camera.translation]
     if not np.isfinite(numbers).all() or camera.fx <= 0 or camera.fy <= 0:
         raise UserError("camera: its pose and intrinsics must be finite and its focal lengths positive")
@@ -64,7 +66,9 @@ def view_from_camera(camera: Camera) -> View:
 
 
 def project(cloud: GaussianCloud, view: View, *, antialiased: bool, threads: int) -> ProjectedGaussians:
-    """Project every Gaussian of ``cloud``; those outside the view, or fainter than 1/255 everywhere, get depth key +inf."""
+    """Project every Gaussian of ``cloud``; those outside the view, or fainter than 1/255 everywhere, get depth key
+    +inf.
+    """
     device, count = cloud.device, cloud.count
     projected = ProjectedGaussians(
         ellipse=wp.empty(count, dtype=wp.vec4, device=device),

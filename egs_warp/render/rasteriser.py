@@ -24,9 +24,12 @@ def render(
 ) -> RenderedImage:
     """Picture of ``cloud`` through ``camera``, on the device of the cloud.
 
-    ``background`` is one colour, or an image (H, W, 3) of this camera's size. ``antialiased`` dims each splat by what the 0.3 px
-    low-pass adds to its area. ``threads`` (a CPU only) defaults to the available cores; the picture does not depend on it.
-    Raises ``UserError`` for non-finite Gaussians, which it names, for an impossible camera and for a background of another size.
+    ``background`` is one colour, or an image (H, W, 3) of this camera's size. ``antialiased`` dims each splat by what
+    the 0.3 px
+    low-pass adds to its area. ``threads`` (a CPU only) defaults to the available cores; the picture does not depend
+    on it.
+    Raises ``UserError`` for non-finite Gaussians, which it names, for an impossible camera and for a background of
+    another size.
     """
     threads = threads or available_threads()
     view = view_from_camera(camera)
@@ -44,6 +47,7 @@ def _background_array(background: object, camera: Camera, device: wp.Device) -> 
     values = np.asarray(background.numpy() if isinstance(background, wp.array) else background, dtype=np.float32)
     if values.shape not in ((3,), (*shape, 3)) or not np.isfinite(values).all():
         raise UserError(
-            f"background: give three finite numbers or an image of {camera.height} x {camera.width} x 3, not shape {values.shape}"
+            f"background: give three finite numbers or an image of {camera.height} x {camera.width} x 3,"
+            f" not shape {values.shape}"
         )
     return wp.array(values.reshape(-1, 3), dtype=wp.vec3, device=device)

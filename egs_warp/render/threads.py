@@ -28,8 +28,10 @@ def launch_ranges(
 ) -> None:
     """Run ``kernel``, whose first parameter is added to its thread index, for the indices 0 to ``count`` - 1.
 
-    A Warp launch on a CPU runs on the calling thread and releases the interpreter lock, so launches over disjoint ranges run side by
-    side. ``work`` (count,) is the expected effort of each index; without it all are alike. Results do not depend on ``threads``.
+    A Warp launch on a CPU runs on the calling thread and releases the interpreter lock, so launches over disjoint
+    ranges run side by
+    side. ``work`` (count,) is the expected effort of each index; without it all are alike. Results do not depend on
+    ``threads``.
     """
     if device.is_cuda or threads <= 1 or count <= 1:
         wp.launch(kernel, dim=count, inputs=[0, *inputs], outputs=list(outputs), device=device)

@@ -50,7 +50,9 @@ def build_tile_lists(projected: ProjectedGaussians, view: View, *, threads: int)
 
 
 def _lists_by_counting(projected: ProjectedGaussians, view: View, columns: int, rows: int, threads: int) -> TileLists:
-    """Counting sort: bands of tile rows are filled side by side, each from front to back, so no pair is ever compared."""
+    """Counting sort: bands of tile rows are filled side by side, each from front to back, so no pair is ever
+    compared.
+    """
     device = projected.depth_key.device
     key = projected.depth_key.numpy()
     gaussian_from_visible = np.flatnonzero(np.isfinite(key)).astype(np.int32)
@@ -93,7 +95,9 @@ def _lists_by_counting(projected: ProjectedGaussians, view: View, columns: int, 
 
 
 def _lists_by_sorting(projected: ProjectedGaussians, view: View, tiles: int) -> TileLists:
-    """Depth sort of the visible Gaussians, then a stable sort of the intersections by tile alone: few bits, few passes."""
+    """Depth sort of the visible Gaussians, then a stable sort of the intersections by tile alone: few bits, few
+    passes.
+    """
     device = projected.depth_key.device
     count = projected.depth_key.shape[0]
     visible_end = wp.empty(count, dtype=wp.int32, device=device)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import subprocess
 import tempfile
@@ -34,7 +35,9 @@ def write_png(path: Path | str, image: np.ndarray) -> None:
 
 
 def contact_sheet(frames: Sequence[np.ndarray], columns: int, labels: Sequence[str]) -> np.ndarray:
-    """(rows * H, columns * W, 3) uint8: the frames (H, W, 3) side by side, each with its label in its upper left corner."""
+    """(rows * H, columns * W, 3) uint8: the frames (H, W, 3) side by side, each with its label in its upper left
+    corner.
+    """
     import cv2
 
     if len(frames) != len(labels) or not frames:
@@ -62,7 +65,8 @@ def contact_sheet(frames: Sequence[np.ndarray], columns: int, labels: Sequence[s
 class VideoWriter:
     """H.264 (yuv420p) mp4 through the ffmpeg program that imageio-ffmpeg brings.
 
-    Use as a context manager; leaving it without an exception puts the video at ``path``, otherwise nothing is left behind.
+    Use as a context manager; leaving it without an exception puts the video at ``path``, otherwise nothing is left
+    behind.
     """
 
     def __init__(
@@ -103,10 +107,13 @@ class VideoWriter:
         return self
 
     def write(self, frame: np.ndarray) -> None:
-        """Append one (H, W, 3) uint8 RGB frame. An odd side is padded by repeating its last line: yuv420p needs even ones."""
+        """Append one (H, W, 3) uint8 RGB frame. An odd side is padded by repeating its last line: yuv420p needs even
+        ones.
+        """
         if frame.shape != (*self._size, 3) or frame.dtype != np.uint8:
             raise UserError(
-                f"{self._path}: a frame has shape {frame.shape} and type {frame.dtype}, expected {(*self._size, 3)} and uint8"
+                f"{self._path}: a frame has shape {frame.shape} and type {frame.dtype},"
+                f" expected {(*self._size, 3)} and uint8"
             )
         height, width = self._size
         if height % 2 or width % 2:
@@ -124,18 +131,15 @@ class VideoWriter:
         try:
             if kind is not None:
                 self._process.kill()
-                self._process.wait()
-                return
-            try:
+            # A dead ffmpeg shows in its exit status below, with its own words.
+            with contextlib.suppress(BrokenPipeError):
                 self._process.stdin.close()
-            except BrokenPipeError:
-                pass
-            if self._process.wait() != 0:
+            failed = self._process.wait() != 0
+            if kind is None and failed:
                 raise self._failure()
-            os.replace(self._temporary, self._path)
+            if kind is None:
+                os.replace(self._temporary, self._path)
         finally:
-            if kind is not None:
-                self._process.stdin.close()
             self._temporary.unlink(missing_ok=True)
             self._log.close()
 
