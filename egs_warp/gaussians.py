@@ -23,7 +23,7 @@ class GaussianCloud:
     opacity_logits: wp.array
     """(n,) float32, finite."""
     sh: wp.array
-    """(n, (degree+1)^2) vec3: real spherical-harmonic coefficients of colour, band 0 first, in the INRIA sign convention."""
+    """(n, (degree+1)^2) vec3: real spherical-harmonic coefficients of colour, band 0 first, in the INRIA convention."""
 
     @classmethod
     def from_numpy(
@@ -56,7 +56,8 @@ class GaussianCloud:
             bad = np.flatnonzero(~np.isfinite(values).reshape(count, -1).all(axis=1))
             if len(bad):
                 raise UserError(
-                    f"capture: {name} of {len(bad)} Gaussians is not finite (first: number {bad[0]}); remove them and export again"
+                    f"capture: {name} of {len(bad)} Gaussians is not finite (first: number {bad[0]}); "
+                    "remove them and export again"
                 )
         if np.shape(sh)[1] not in (1, 4, 9, 16):
             raise UserError(f"capture: {np.shape(sh)[1]} SH coefficients, expected 1, 4, 9 or 16 (degree 0 to 3)")
@@ -80,7 +81,7 @@ class GaussianCloud:
     @property
     def sh_degree(self) -> int:
         """0 to 3."""
-        return int(round(self.sh.shape[1] ** 0.5)) - 1
+        return round(self.sh.shape[1] ** 0.5) - 1
 
     @property
     def device(self) -> wp.Device:

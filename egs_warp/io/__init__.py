@@ -1,0 +1,21 @@
+"""Reading and writing: captures and camera poses."""
+
+from egs_warp.io.atomic import atomic_write, writable_folder
+from egs_warp.io.capture import Capture, read_capture
+from egs_warp.io.compressed_ply import write_compressed_ply
+from egs_warp.io.ply import write_ply
+from egs_warp.io.sequence import write_ply_sequence
+from egs_warp.io.splat import write_splat
+from egs_warp.io.spz import write_spz
+
+__all__ = [
+    "Capture",
+    "atomic_write",
+    "read_capture",
+    "writable_folder",
+    "write_compressed_ply",
+    "write_ply",
+    "write_ply_sequence",
+    "write_splat",
+    "write_spz",
+]

@@ -1,0 +1,143 @@
+"""Reading a capture of any format."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from egs_warp.errors import UserError
+from egs_warp.gaussians import GaussianCloud
+from egs_warp.io.compressed_ply import decode_compressed_ply, is_compressed
+from egs_warp.io.ply import decode_ply, read_header
+from egs_warp.io.raw import EXTREME_LOGIT, RawCapture, check_finite
+from egs_warp.io.sog import SogFiles, decode_sog
+from egs_warp.io.splat import decode_splat
+from egs_warp.io.spz import decode_spz
+from egs_warp.io.streamed_sog import decode_streamed_sog
+
+_META, _STREAMED_META = "meta.json", "lod-meta.json"
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A capture as read from disk. Its axes and units are the file's own."""
+
+    cloud: GaussianCloud
+    source: Path
+    format: str
+    """For the user, such as ``.spz version 2``."""
+    infinite_opacities: int
+    """Gaussians whose opacity logit is infinite in the file (opacity 0 or 1); read as -16 or +16. Formats that store
+    opacity in a byte have none: their 0 and 255 stand for ranges."""
+    up: np.ndarray | None
+    """(3,) float64 unit vector where the format defines which way is up, else None."""
+    notes: tuple[str, ...]
+    """What was left out or repaired, for the user."""
+
+
+def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
+    """Read an INRIA or PlayCanvas compressed .ply, .spz, .splat, .sog, or an unbundled SOG (its folder or meta.json).
+
+    The format is told by content; only .splat, which has no mark, by its name. Raises ``UserError`` with one line for
+    anything that cannot be read.
+    """
+    source = Path(path)
+    raw = _decode(source)
+    check_finite(raw, source)
+    infinite = np.isinf(raw.opacity_logits)
+    cloud = GaussianCloud.from_numpy(
+        raw.means,
+        raw.rotations,
+        raw.log_scales,
+        np.where(infinite, np.copysign(np.float32(EXTREME_LOGIT), raw.opacity_logits), raw.opacity_logits),
+        raw.sh,
+        device=device,
+    )
+    return Capture(cloud, source, raw.format, int(np.count_nonzero(infinite)), raw.up, raw.notes)
+
+
+def _decode(source: Path) -> RawCapture:
+    if source.is_dir():
+        return _decode_folder(source)
+    data = _read_bytes(source)
+    if data[:4] in (b"ply\n", b"ply\r"):
+        header = read_header(data, source)
+        return (decode_compressed_ply if is_compressed(header) else decode_ply)(data, header, source)
+    if data[:2] == b"\x1f\x8b" or data[:4] == b"NGSP":
+        return decode_spz(data, source)
+    if data[:2] == b"PK":
+        return _decode_zip(source)
+    if data[:1] == b"{":
+        return _decode_meta(source)
+    if not data:
+        raise UserError(f"{source}: the file is empty; copy or export it again")
+    if source.suffix.lower() == ".splat":
+        return decode_splat(data, source)
+    raise UserError(
+        f"{source}: unknown format (starts with {data[:8]!r}); give a .ply, .spz, .splat, .sog or a SOG folder"
+    )
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise UserError(f"{path}: no such file or folder; check the path") from error
+    # ValueError: a path with a null byte.
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise UserError(f"{path}: cannot be read ({reason}); check the path and its permissions") from error
+
+
+def _decode_folder(folder: Path) -> RawCapture:
+    for name in (_META, _STREAMED_META):
+        if (folder / name).is_file():
+            return _decode_meta(folder / name)
+    nested = sorted(path for path in folder.glob(f"*/{_META}") if path.is_file())
+    if len(nested) == 1:
+        return _decode_meta(nested[0])
+    raise UserError(f"{folder}: a folder without meta.json; give an unbundled SOG folder or a capture file")
+
+
+def _decode_meta(meta: Path) -> RawCapture:
+    def read(name: str) -> bytes:
+        return _read_bytes(meta.parent / _inside(name, meta))
+
+    return _decode_sog_or_streamed(meta, _read_bytes(meta), read)
+
+
+def _decode_zip(source: Path) -> RawCapture:
+    # zipfile raises errors of a dozen classes for corrupted archives; every one means the same to the user.
+    try:
+        with zipfile.ZipFile(source) as archive:
+            content = {name: archive.read(name) for name in archive.namelist() if not name.endswith("/")}
+    except Exception as error:
+        raise UserError(f"{source}: corrupted zip ({error}); copy or export the file again") from error
+    metas = [name for name in content if PurePosixPath(name).name in (_META, _STREAMED_META)]
+    metas.sort(key=lambda name: (name.count("/"), name))
+    if not metas:
+        raise UserError(f"{source}: a zip without meta.json; give a .sog, or unpack it if it holds another capture")
+
+    def read(name: str) -> bytes:
+        inside = str(PurePosixPath(metas[0]).parent / _inside(name, source))
+        if inside not in content:
+            raise UserError(f"{source}: {inside} is missing from the zip; copy or export the file again")
+        return content[inside]
+
+    return _decode_sog_or_streamed(source, content[metas[0]], read)
+
+
+def _decode_sog_or_streamed(source: Path, meta: bytes, read: Callable[[str], bytes]) -> RawCapture:
+    files = SogFiles(source, read)
+    return decode_streamed_sog(meta, files) if b'"lodLevels"' in meta else decode_sog(meta, files)
+
+
+def _inside(name: str, source: Path) -> PurePosixPath:
+    path = PurePosixPath(name)
+    if path.is_absolute() or ".." in path.parts:
+        raise UserError(f"{source}: meta.json names {name!r}, which lies outside the capture; export it again")
+    return path

@@ -1,0 +1,241 @@
+"""Polygon File Format: header, elements, and the INRIA layout of a 3DGS capture.
+
+Public description: Kerbl et al. 2023, https://github.com/graphdeco-inria/gaussian-splatting (properties of
+``point_cloud.ply``); PLY itself: G. Turk 1994.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from egs_warp.errors import UserError
+from egs_warp.gaussians import GaussianCloud
+from egs_warp.io.atomic import atomic_write
+from egs_warp.io.raw import RawCapture, property_names
+
+_TYPES = {
+    **{name: "i1" for name in ("char", "int8")},
+    **{name: "u1" for name in ("uchar", "uint8")},
+    **{name: "i2" for name in ("short", "int16")},
+    **{name: "u2" for name in ("ushort", "uint16")},
+    **{name: "i4" for name in ("int", "int32")},
+    **{name: "u4" for name in ("uint", "uint32")},
+    **{name: "f4" for name in ("float", "float32")},
+    **{name: "f8" for name in ("double", "float64")},
+}
+_BYTE_ORDERS = {b"binary_little_endian": "<", b"binary_big_endian": ">", b"ascii": None}
+# A block of rows this long stays in cache while its columns are gathered one by one.
+_BLOCK_ROWS = 16384
+
+
+@dataclass(frozen=True)
+class PlyElement:
+    """One ``element`` of a header."""
+
+    name: str
+    count: int
+    """Rows, as the header says."""
+    dtype: np.dtype | None
+    """Structured type of one row; None where it holds a list, so that its size is not known beforehand."""
+
+
+@dataclass(frozen=True)
+class PlyHeader:
+    """What stands before the data of a .ply."""
+
+    byte_order: str | None
+    """``<`` or ``>``; None for text."""
+    elements: tuple[PlyElement, ...]
+    size: int
+    """Bytes up to the data."""
+
+    def element(self, name: str) -> PlyElement | None:
+        """The element called ``name``, if there is one."""
+        return next((element for element in self.elements if element.name == name), None)
+
+
+def read_header(data: bytes, source: Path) -> PlyHeader:
+    """Parse a .ply header. Raises ``UserError`` for one that is cut short or malformed."""
+    end = re.search(rb"^end_header[ \t]*\r?\n", data, re.MULTILINE)
+    if end is None:
+        raise UserError(f"{source}: truncated: the .ply header has no end_header line; copy or export the file again")
+    byte_order: str | None = ""
+    elements: list[tuple[str, int, list[tuple[str, str | None]]]] = []
+    for line in data[: end.start()].splitlines()[1:]:
+        words = line.split()
+        match words:
+            case [] | [b"comment", *_] | [b"obj_info", *_]:
+                continue
+            case [b"format", kind, _] if kind in _BYTE_ORDERS:
+                byte_order = _BYTE_ORDERS[kind]
+            case [b"element", name, count] if count.isdigit() and len(count) < 16:
+                elements.append((name.decode("latin-1"), int(count), []))
+            case [b"property", b"list", _, _, name] if elements:
+                elements[-1][2].append((name.decode("latin-1"), None))
+            case [b"property", kind, name] if elements and kind.decode("latin-1") in _TYPES:
+                elements[-1][2].append((name.decode("latin-1"), _TYPES[kind.decode("latin-1")]))
+            case _:
+                shown = line[:60].decode("latin-1").strip()
+                raise UserError(f"{source}: malformed .ply header, line {shown!r}; export the file again")
+    if byte_order == "":
+        raise UserError(f"{source}: malformed .ply header, no format line; export the file again")
+    return PlyHeader(byte_order, tuple(_element(source, byte_order, *element) for element in elements), end.end())
+
+
+def _element(
+    source: Path, byte_order: str | None, name: str, count: int, properties: list[tuple[str, str | None]]
+) -> PlyElement:
+    names = [property_name for property_name, _ in properties]
+    if len(set(names)) < len(names):
+        raise UserError(f"{source}: malformed .ply header, element {name} repeats a property; export the file again")
+    if not names:
+        raise UserError(f"{source}: malformed .ply header, element {name} has no property; export the file again")
+    if any(kind is None for _, kind in properties):
+        return PlyElement(name, count, None)
+    return PlyElement(name, count, np.dtype([(n, f"{byte_order or '<'}{kind}") for n, kind in properties]))
+
+
+def read_elements(data: bytes, header: PlyHeader, wanted: list[str], source: Path) -> dict[str, np.ndarray]:
+    """Structured arrays of the ``wanted`` elements. Raises ``UserError`` for data that ends early or is no number."""
+    if header.byte_order is None:
+        return _read_text(data, header, wanted, source)
+    found: dict[str, np.ndarray] = {}
+    offset = header.size
+    for element in header.elements:
+        if not set(wanted) - set(found):
+            break
+        if element.dtype is None:
+            raise UserError(f"{source}: element {element.name} before the Gaussians holds a list; export it again")
+        end = offset + element.count * element.dtype.itemsize
+        if end > len(data):
+            raise UserError(
+                f"{source}: truncated: {element.count} rows of element {element.name} need a file of {end} bytes, "
+                f"found {len(data)}; copy or export it again"
+            )
+        if element.name in wanted:
+            found[element.name] = np.frombuffer(data, element.dtype, element.count, offset)
+        offset = end
+    return found
+
+
+def _read_text(data: bytes, header: PlyHeader, wanted: list[str], source: Path) -> dict[str, np.ndarray]:
+    lines = [line for line in data[header.size :].splitlines() if line.strip()]
+    found: dict[str, np.ndarray] = {}
+    start = 0
+    for element in header.elements:
+        rows = lines[start : start + element.count]
+        start += element.count
+        if element.name not in wanted or element.dtype is None:
+            continue
+        if len(rows) < element.count:
+            raise UserError(
+                f"{source}: truncated: element {element.name} needs {element.count} lines, found {len(rows)}; "
+                "copy or export it again"
+            )
+        columns = len(element.dtype.names or ())
+        with warnings.catch_warnings():
+            # numpy only warns of text that is not a number; newer ones raise ValueError.
+            warnings.simplefilter("error", DeprecationWarning)
+            try:
+                values = np.fromstring(b" ".join(rows), dtype=np.float64, sep=" ")  # type: ignore[call-overload]
+            except (DeprecationWarning, ValueError):
+                values = np.empty(0)
+        if len(values) != element.count * columns:
+            raise UserError(
+                f"{source}: element {element.name} is not {element.count} lines of {columns} numbers; export it again"
+            )
+        table = values.reshape(element.count, columns)
+        structured = np.empty(element.count, [(name, "f8") for name in element.dtype.names or ()])
+        for i, name in enumerate(element.dtype.names or ()):
+            structured[name] = table[:, i]
+        found[element.name] = structured
+    return found
+
+
+def columns_as_float32(rows: np.ndarray, names: list[str]) -> np.ndarray:
+    """(n, len(names)) float32 from the named fields of a structured array."""
+    out = np.empty((len(rows), len(names)), np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for start in range(0, len(rows), _BLOCK_ROWS):
+            block = rows[start : start + _BLOCK_ROWS]
+            for column, name in enumerate(names):
+                out[start : start + _BLOCK_ROWS, column] = block[name]
+    return out
+
+
+def decode_ply(data: bytes, header: PlyHeader, source: Path) -> RawCapture:
+    """INRIA layout: the Gaussians are the rows of element ``vertex``, properties in any order and of any number type.
+
+    Raises ``UserError`` for a file of another kind, naming the properties it lacks.
+    """
+    vertex = header.element("vertex")
+    present = set((vertex.dtype.names or ()) if vertex is not None and vertex.dtype is not None else ())
+    missing = [name for names in property_names(1).values() for name in names if name not in present]
+    if missing:
+        raise UserError(
+            f"{source}: not a 3DGS capture: element vertex has no {', '.join(missing)}; "
+            "a mesh or a point cloud cannot be animated, train or export it as Gaussians"
+        )
+    rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in present)
+    if rest not in (0, 9, 24, 45) or any(f"f_rest_{i}" not in present for i in range(rest)):
+        raise UserError(
+            f"{source}: {rest} f_rest properties, expected 0, 9, 24 or 45 counted from f_rest_0; export it again"
+        )
+    rows = read_elements(data, header, ["vertex"], source)["vertex"]
+    arrays = {array: columns_as_float32(rows, names) for array, names in property_names(1 + rest // 3).items()}
+    return RawCapture(
+        format="INRIA .ply" if header.byte_order else "INRIA .ply (text)",
+        means=arrays["means"],
+        rotations=arrays["rotations"],
+        log_scales=arrays["log_scales"],
+        opacity_logits=arrays["opacity_logits"][:, 0],
+        sh=arrays["sh"].reshape(len(rows), 1 + rest // 3, 3),
+    )
+
+
+def write_ply(path: Path | str, cloud: GaussianCloud) -> None:
+    """Write ``cloud`` as an INRIA .ply, binary little-endian, float32: reading it gives the same bits.
+
+    Normals, always 0, are included because some viewers rely on the place of each property. Raises ``UserError`` if the
+    file cannot be written.
+    """
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        file.write(ply_bytes(cloud))
+
+
+def ply_bytes(cloud: GaussianCloud) -> bytes:
+    """What ``write_ply`` writes."""
+    sh = cloud.sh.numpy()
+    count = cloud.count
+    rest_count = 3 * ((cloud.sh_degree + 1) ** 2 - 1)
+    names = [
+        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+        *(f"f_rest_{i}" for i in range(rest_count)),
+        *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+    ]
+    rows = np.zeros((count, len(names)), np.dtype("<f4"))
+    rows[:, 0:3] = cloud.means.numpy()
+    rows[:, 6:9] = sh[:, 0]
+    rows[:, 9 : 9 + rest_count] = channel_major(sh)
+    rows[:, -8] = cloud.opacity_logits.numpy()
+    rows[:, -7:-4] = cloud.log_scales.numpy()
+    rows[:, -4:] = cloud.rotations.numpy()
+    header = "ply\nformat binary_little_endian 1.0\n"
+    header += f"element vertex {count}\n" + "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    return header.encode() + rows.tobytes()
+
+
+def channel_major(sh: np.ndarray) -> np.ndarray:
+    """(n, 3 (K-1)) ``f_rest`` of (n, K, 3) coefficients: all of red, then green, then blue."""
+    return np.ascontiguousarray(sh[:, 1:].transpose(0, 2, 1)).reshape(len(sh), -1)
+
+
+def coefficient_major(f_dc: np.ndarray, f_rest: np.ndarray) -> np.ndarray:
+    """Inverse of ``channel_major``: (n, K, 3) from (n, 3) and (n, 3 (K-1))."""
+    rest = f_rest.reshape(len(f_rest), 3, -1).transpose(0, 2, 1)
+    return np.concatenate([f_dc[:, None], rest], axis=1)

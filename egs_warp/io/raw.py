@@ -1,0 +1,114 @@
+"""What every capture format is decoded to before it becomes a GaussianCloud."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from egs_warp.errors import UserError
+from egs_warp.gaussians import unit_quaternions
+
+SH_C0 = 0.28209479177387814
+"""Band-0 spherical harmonic: colour = 1/2 + SH_C0 f_dc."""
+
+EXTREME_LOGIT = 16.0
+"""Stands for an opacity logit of infinity: 1 - opacity is then 1e-7, below half a step of float32 at 1."""
+
+
+@dataclass(frozen=True)
+class RawCapture:
+    """Host arrays in float32 as the file holds them, not yet checked. Axes are the file's own."""
+
+    format: str
+    """Name of the format, as shown to the user."""
+    means: np.ndarray
+    """(n, 3) float32, file units."""
+    rotations: np.ndarray
+    """(n, 4) float32, w x y z, any length."""
+    log_scales: np.ndarray
+    """(n, 3) float32."""
+    opacity_logits: np.ndarray
+    """(n,) float32, may be infinite."""
+    sh: np.ndarray
+    """(n, (degree+1)^2, 3) float32, coefficient-major."""
+    up: np.ndarray | None = None
+    """(3,) float64 unit, where the format defines which way is up."""
+    notes: tuple[str, ...] = field(default=())
+    """What the reader left out or repaired, for the user."""
+
+
+def property_names(coefficient_count: int) -> dict[str, list[str]]:
+    """Names, as in the INRIA .ply, of the columns of each array of ``RawCapture``, flattened to (n, columns)."""
+    rest = coefficient_count - 1
+    return {
+        "means": ["x", "y", "z"],
+        "rotations": [f"rot_{i}" for i in range(4)],
+        "log_scales": [f"scale_{i}" for i in range(3)],
+        "opacity_logits": ["opacity"],
+        "sh": [f"f_dc_{c}" for c in range(3)] + [f"f_rest_{c * rest + k}" for k in range(rest) for c in range(3)],
+    }
+
+
+def check_finite(raw: RawCapture, source: Path) -> None:
+    """Raise ``UserError`` that names the first property with a value that is not finite; an opacity may be infinite."""
+    count = len(raw.means)
+    if count == 0:
+        raise UserError(f"{source}: it has no Gaussians; export it again from the tool that made it")
+    for array, names in property_names(raw.sh.shape[1]).items():
+        values = getattr(raw, array).reshape(count, len(names))
+        finite = ~np.isnan(values) if array == "opacity_logits" else np.isfinite(values)
+        if finite.all():
+            continue
+        column = int(np.flatnonzero(~finite.all(axis=0))[0])
+        bad = np.flatnonzero(~finite[:, column])
+        raise UserError(
+            f"{source}: {names[column]} of {len(bad)} Gaussians is not finite (first: number {bad[0]}); "
+            "remove them and export again"
+        )
+
+
+def logits_from_bytes(alphas: np.ndarray) -> np.ndarray:
+    """Opacity logits float32 of opacities stored as uint8 / 255; 0 and 255 give -+``EXTREME_LOGIT``."""
+    opacity = np.arange(1, 255) / 255.0
+    table = np.concatenate([[-EXTREME_LOGIT], np.log(opacity / (1.0 - opacity)), [EXTREME_LOGIT]])
+    return table.astype(np.float32)[alphas]
+
+
+def bytes_from_logits(logits: np.ndarray) -> np.ndarray:
+    """Opacities as uint8, 255 for 1."""
+    return byte(255.0 / (1.0 + np.exp(-logits.astype(np.float64))))
+
+
+def byte(values: np.ndarray) -> np.ndarray:
+    """Values rounded and clamped to 0 ... 255, uint8."""
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def largest_dropped(quaternions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(n, 3) the smaller components in order, signed so that the largest is positive; (n,) uint32 index of that."""
+    unit = unit_quaternions(quaternions).astype(np.float64)
+    largest = np.argmax(np.abs(unit), axis=1)
+    rows = np.arange(len(unit))
+    unit *= np.where(unit[rows, largest] < 0, -1.0, 1.0)[:, None]
+    kept = np.ones(unit.shape, bool)
+    kept[rows, largest] = False
+    return unit[kept].reshape(-1, 3), largest.astype(np.uint32)
+
+
+def largest_restored(three: np.ndarray, largest: np.ndarray) -> np.ndarray:
+    """Inverse of ``largest_dropped``: (n, 4) float32 unit quaternions."""
+    quaternions = np.empty((len(three), 4))
+    kept = np.ones(quaternions.shape, bool)
+    rows = np.arange(len(three))
+    kept[rows, largest] = False
+    quaternions[kept] = three.ravel()
+    quaternions[rows, largest] = np.sqrt(np.maximum(0.0, 1.0 - np.einsum("ni,ni->n", three, three)))
+    return unit_quaternions(quaternions)
+
+
+def bit_field(words: np.ndarray, shift: int, bits: int) -> np.ndarray:
+    """``bits`` bits of uint32 ``words`` from ``shift`` up, as 0 ... 1 in float64."""
+    mask = (1 << bits) - 1
+    return ((words >> np.uint32(shift)) & np.uint32(mask)) / mask

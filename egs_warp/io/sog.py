@@ -1,0 +1,192 @@
+"""SOG: Gaussians as pixels of WebP images described by meta.json, in a folder or in a zip (.sog).
+
+Public description: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog (version 2, code books)
+and https://github.com/playcanvas/sogs (version 1, linear ranges). The axes are kept as they are in the file; the
+description says +y is up, but its own tool keeps the axes of the .ply it reads, so that no direction can be relied on.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from egs_warp.errors import UserError
+from egs_warp.io.raw import RawCapture, largest_restored, logits_from_bytes
+
+_SH_COUNTS = (0, 3, 8, 15)
+_LABELS_PER_ROW = 64
+_FIRST_TAG = 252
+
+
+@dataclass(frozen=True)
+class SogFiles:
+    """Where the parts of one SOG are: a folder or a zip."""
+
+    source: Path
+    """For messages."""
+    read: Callable[[str], bytes]
+    """The bytes of a file by its name in meta.json; raises ``UserError`` where it is missing or corrupted."""
+
+    def image(self, name: str) -> np.ndarray:
+        """(pixels, 4) uint8 RGBA of an image, row by row from the top, and nothing lost."""
+        return self.image_rows(name).reshape(-1, 4)
+
+    def image_rows(self, name: str) -> np.ndarray:
+        """(height, width, 4) uint8 RGBA of an image."""
+        # Imported here because only this format needs it.
+        from PIL import Image
+
+        data = self.read(name)
+        try:
+            with Image.open(io.BytesIO(data)) as image:
+                return np.asarray(image.convert("RGBA"))
+        # The decoder is handed a stranger's bytes, and its errors share no base class.
+        except Exception as error:
+            raise UserError(f"{self.source}: {name} is not a readable image; export the capture again") from error
+
+
+class SogMeta:
+    """Checked access to meta.json: every mistake becomes a ``UserError`` that names the entry."""
+
+    def __init__(self, data: bytes, source: Path) -> None:
+        self.source = source
+        try:
+            self.tree = json.loads(data)
+        except (ValueError, RecursionError) as error:
+            raise UserError(f"{source}: meta.json is not readable JSON; copy or export the capture again") from error
+
+    def entry(self, *keys: str) -> object:
+        """The value under nested ``keys``, or None."""
+        value: object = self.tree
+        for key in keys:
+            value = value.get(key) if isinstance(value, dict) else None
+        return value
+
+    def numbers(self, *keys: str, count: int) -> np.ndarray:
+        """(count,) float64, finite."""
+        value = self.entry(*keys)
+        values = value if isinstance(value, list) else [value]
+        numbers = [v for v in values if isinstance(v, int | float) and not isinstance(v, bool) and abs(v) < 1e38]
+        if not len(numbers) == len(values) == count:
+            raise self._wrong(*keys, expected=f"{count} finite numbers")
+        return np.array(numbers, dtype=np.float64)
+
+    def code_book(self, key: str) -> np.ndarray:
+        """(256,) float64. An early writer left the first entry empty; it is then continued from the others."""
+        book = self.entry(key, "codebook")
+        if isinstance(book, list) and len(book) == 256 and book[0] is None:
+            rest = SogMeta(json.dumps({key: {"codebook": book[1:]}}).encode(), self.source)
+            values = rest.numbers(key, "codebook", count=255)
+            return np.concatenate([[values[0] + (values[0] - values[-1]) / 255.0], values])
+        return self.numbers(key, "codebook", count=256)
+
+    def files(self, key: str, count: int) -> list[str]:
+        """``count`` file names."""
+        names = self.entry(key, "files")
+        if not isinstance(names, list) or len(names) != count or not all(isinstance(name, str) for name in names):
+            raise self._wrong(key, "files", expected=f"{count} file names")
+        return names
+
+    def integer(self, *keys: str) -> int:
+        """A count."""
+        value = self.entry(*keys)
+        if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+            raise self._wrong(*keys, expected="a whole number")
+        return value
+
+    def _wrong(self, *keys: str, expected: str) -> UserError:
+        return UserError(f"{self.source}: {'.'.join(keys)} in meta.json is not {expected}; export the capture again")
+
+
+def decode_sog(meta_json: bytes, files: SogFiles) -> RawCapture:
+    """Decode a SOG of version 1 or 2. Raises ``UserError`` for one that is incomplete or malformed."""
+    meta = SogMeta(meta_json, files.source)
+    version = meta.integer("version") if meta.entry("version") is not None else 1
+    if version not in (1, 2):
+        raise UserError(f"{files.source}: SOG version {version}, expected 1 or 2; export it as version 2 or as .ply")
+    count = meta.integer("count") if version == 2 else max(0, int(meta.numbers("means", "shape", count=2)[0]))
+
+    def pixels(name: str) -> np.ndarray:
+        found = files.image(name)
+        if len(found) < count:
+            raise UserError(
+                f"{files.source}: truncated: {count} Gaussians, but {name} has {len(found)} pixels; export it again"
+            )
+        return found[:count]
+
+    low, high = (pixels(name)[:, :3].astype(np.float64) for name in meta.files("means", 2))
+    mins, maxs = meta.numbers("means", "mins", count=3), meta.numbers("means", "maxs", count=3)
+    logs = mins + (maxs - mins) * ((low + 256.0 * high) / 65535.0)
+    with np.errstate(over="ignore"):
+        means = (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)
+    quaternions = pixels(*meta.files("quats", 1))
+    scales = pixels(*meta.files("scales", 1))[:, :3]
+    colours = pixels(*meta.files("sh0", 1))
+    if version == 2:
+        log_scales = meta.code_book("scales")[scales]
+        f_dc = meta.code_book("sh0")[colours[:, :3]]
+        opacity_logits = logits_from_bytes(colours[:, 3])
+    else:
+        log_scales = _lerp(meta, "scales", scales)
+        f_dc, opacity_logits = np.split(_lerp(meta, "sh0", colours), [3], axis=1)
+        opacity_logits = opacity_logits[:, 0]
+    rest = _decode_rest(meta, files, version, pixels) if meta.entry("shN") is not None else np.empty((count, 0, 3))
+    notes = ("trained with antialiasing, drawn without",) if meta.entry("antialias") is True else ()
+    return RawCapture(
+        format=f"SOG version {version}",
+        means=means,
+        rotations=_decode_quaternions(quaternions),
+        log_scales=log_scales.astype(np.float32),
+        opacity_logits=opacity_logits.astype(np.float32),
+        sh=np.concatenate([f_dc[:, None], rest], axis=1).astype(np.float32),
+        notes=notes,
+    )
+
+
+def _lerp(meta: SogMeta, key: str, values: np.ndarray) -> np.ndarray:
+    columns = values.shape[1]
+    mins, maxs = meta.numbers(key, "mins", count=columns), meta.numbers(key, "maxs", count=columns)
+    return mins + (maxs - mins) * (values / 255.0)
+
+
+def _decode_quaternions(pixels: np.ndarray) -> np.ndarray:
+    tags = pixels[:, 3].astype(np.int64) - _FIRST_TAG
+    three = (pixels[:, :3] / 255.0 * 2.0 - 1.0) / np.sqrt(2.0)
+    quaternions = largest_restored(three, np.maximum(tags, 0))
+    # Pixels that no Gaussian's rotation was written to.
+    quaternions[tags < 0] = (1.0, 0.0, 0.0, 0.0)
+    return quaternions
+
+
+def _decode_rest(meta: SogMeta, files: SogFiles, version: int, pixels: Callable[[str], np.ndarray]) -> np.ndarray:
+    """(n, K-1, 3): a palette of coefficient sets, 64 to a row of the image, and each Gaussian's place in it."""
+    centroids_name, labels_name = meta.files("shN", 2)
+    centroids = files.image_rows(centroids_name)[:, :, :3]
+    height, width = centroids.shape[:2]
+    coefficients = width // _LABELS_PER_ROW
+    if version == 2:
+        bands = meta.integer("shN", "bands")
+        coefficients = _SH_COUNTS[bands] if bands < len(_SH_COUNTS) else -1
+    if coefficients not in _SH_COUNTS or width != _LABELS_PER_ROW * coefficients:
+        raise UserError(
+            f"{files.source}: {centroids_name} is {width} pixels wide, expected 192, 512 or 960 (SH degree 1, 2 or 3); "
+            "export the capture again"
+        )
+    if version == 2:
+        values = meta.code_book("shN")
+    else:
+        low, high = meta.numbers("shN", "mins", count=1), meta.numbers("shN", "maxs", count=1)
+        values = low + (high - low) * (np.arange(256) / 255.0)
+    palette = centroids.reshape(height * _LABELS_PER_ROW, coefficients, 3)
+    label_pixels = pixels(labels_name).astype(np.int64)
+    labels = label_pixels[:, 0] + 256 * label_pixels[:, 1]
+    if len(labels) and labels.max() >= len(palette):
+        raise UserError(
+            f"{files.source}: {labels_name} points at SH set {labels.max()} of {len(palette)}; export the capture again"
+        )
+    return values.astype(np.float32)[palette[labels]]

@@ -1,0 +1,204 @@
+"""Niantic's .spz: gzip around a 16-byte header and one block of bytes for each quantity.
+
+Public description: README of https://github.com/nianticlabs/spz. Versions 1 (half-float positions), 2 (24-bit
+fixed-point positions) and 3 (smallest-three rotations) are read; 2 and 3 are written. The format defines its axes as
+right, up, back: +y is up. The axes are kept as they are in the file.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from egs_warp.errors import UserError
+from egs_warp.gaussians import GaussianCloud
+from egs_warp.io.atomic import atomic_write
+from egs_warp.io.raw import (
+    RawCapture,
+    byte,
+    bytes_from_logits,
+    largest_dropped,
+    largest_restored,
+    logits_from_bytes,
+)
+
+_MAGIC = 0x5053474E
+_HEADER = struct.Struct("<IIIBBBB")
+_COLOUR_SCALE = 0.15
+_FRACTIONAL_BITS = 12
+_HAS_EXTENSIONS = 2
+_LONGEST_EXTENSION = 1 << 20
+_SH_COUNTS = (0, 3, 8, 15, 24)
+_KEPT_SH_COUNT = 15
+# Bits kept of each higher SH number, as the reference writer does: the rest would only cost gzip size.
+_BAND1_STEP, _REST_STEP = 8, 16
+
+
+@dataclass(frozen=True)
+class _Layout:
+    version: int
+    count: int
+    sh_count: int
+    fractional_bits: int
+    flags: int
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Bytes a Gaussian takes in each block: positions, alphas, colours, scales, rotations, SH."""
+        return 6 if self.version == 1 else 9, 1, 3, 3, 4 if self.version == 3 else 3, 3 * self.sh_count
+
+    @property
+    def size(self) -> int:
+        return _HEADER.size + self.count * sum(self.widths)
+
+
+def decode_spz(data: bytes, source: Path) -> RawCapture:
+    """Decode a .spz, gzipped or not. Raises ``UserError`` for a corrupt, truncated or too new one."""
+    # Only as much is inflated as the header asks for, so that a crafted file cannot fill the memory.
+    inflate = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
+    gzipped = data[:2] == b"\x1f\x8b"
+    header = _inflated(inflate, data, _HEADER.size, source) if gzipped else data[: _HEADER.size]
+    layout = _layout(header, gzipped, source)
+    if gzipped:
+        # A byte cannot deflate to less than 1/1032 of itself: refuse a count that this file cannot hold.
+        if layout.size > 1032 * len(data) + _HEADER.size:
+            raise _truncated(source, layout, f"{len(data)} compressed")
+        body = header + _inflated(inflate, inflate.unconsumed_tail, layout.size - len(header), source)
+        # zlib compares the checksum only where it comes to the end of the stream.
+        _inflated(inflate, inflate.unconsumed_tail, _LONGEST_EXTENSION, source)
+    else:
+        body = data
+    if len(body) < layout.size:
+        raise _truncated(source, layout, str(len(body)))
+    return _decode(body, layout)
+
+
+def _inflated(inflate: zlib._Decompress, data: bytes, size: int, source: Path) -> bytes:
+    parts = []
+    try:
+        while size > 0 and not inflate.eof:
+            parts.append(inflate.decompress(data, size))
+            data = inflate.unconsumed_tail
+            size -= len(parts[-1])
+            if not parts[-1] and not data:
+                break
+    except zlib.error as error:
+        raise UserError(f"{source}: corrupted gzip data ({error}); copy or export the file again") from error
+    return b"".join(parts)
+
+
+def _truncated(source: Path, layout: _Layout, found: str) -> UserError:
+    return UserError(
+        f"{source}: truncated: {layout.count} Gaussians need {layout.size} bytes, found {found}; copy it again"
+    )
+
+
+def _layout(header: bytes, gzipped: bool, source: Path) -> _Layout:
+    if len(header) < _HEADER.size:
+        raise UserError(
+            f"{source}: truncated: .spz header of {len(header)} bytes, expected {_HEADER.size}; copy it again"
+        )
+    magic, version, count, degree, fractional_bits, flags, _ = _HEADER.unpack(header)
+    if magic != _MAGIC:
+        raise UserError(f"{source}: gzip data, but no .spz inside; unpack it first if it holds another format")
+    if version not in (1, 2, 3):
+        raise UserError(f"{source}: .spz version {version}, expected 1, 2 or 3; export it as version 3 or as .ply")
+    if degree >= len(_SH_COUNTS):
+        raise UserError(f"{source}: .spz with SH degree {degree}, expected 0 to 4; export it again")
+    return _Layout(version, count, _SH_COUNTS[degree], fractional_bits, flags)
+
+
+def _decode(body: bytes, layout: _Layout) -> RawCapture:
+    ends = _HEADER.size + layout.count * np.cumsum((0, *layout.widths))
+    raw = np.frombuffer(body, np.uint8)
+    positions, alphas, colours, scales, rotations, sh = (
+        raw[start:end].reshape(layout.count, width)
+        for start, end, width in zip(ends[:-1], ends[1:], layout.widths, strict=True)
+    )
+    if layout.version == 1:
+        means = positions.copy().view("<f2").astype(np.float32)
+    else:
+        low, middle, high = positions.reshape(-1, 3, 3).astype(np.int32).transpose(2, 0, 1)
+        # Shifting up and down again extends the sign bit.
+        fixed = ((low << 8 | middle << 16 | high << 24) >> 8).astype(np.float64)
+        means = np.ldexp(fixed, -layout.fractional_bits).astype(np.float32)
+    rest = (sh.reshape(layout.count, layout.sh_count, 3)[:, :_KEPT_SH_COUNT] - np.float32(128.0)) / np.float32(128.0)
+    f_dc = (colours / 255.0 - 0.5) / _COLOUR_SCALE
+    notes = []
+    if layout.sh_count > _KEPT_SH_COUNT:
+        notes.append("SH band 4 left out (degree 0 to 3 is drawn)")
+    if layout.flags & _HAS_EXTENSIONS:
+        notes.append("vendor extensions left out")
+    return RawCapture(
+        format=f".spz version {layout.version}",
+        means=means,
+        rotations=_quaternions(rotations, layout.version),
+        log_scales=scales.astype(np.float32) / np.float32(16.0) - np.float32(10.0),
+        opacity_logits=logits_from_bytes(alphas[:, 0]),
+        sh=np.concatenate([f_dc[:, None], rest], axis=1).astype(np.float32),
+        up=np.array([0.0, 1.0, 0.0]),
+        notes=tuple(notes),
+    )
+
+
+def _quaternions(packed: np.ndarray, version: int) -> np.ndarray:
+    if version < 3:
+        xyz = packed / 127.5 - 1.0
+        w = np.sqrt(np.maximum(0.0, 1.0 - np.einsum("ni,ni->n", xyz, xyz)))
+        return np.concatenate([w[:, None], xyz], axis=1).astype(np.float32)
+    words = packed.copy().view("<u4")[:, 0]
+    fields = np.stack([(words >> np.uint32(shift)) & np.uint32(1023) for shift in (20, 10, 0)], axis=1)
+    three = (fields & 511) / 511.0 * np.sqrt(0.5) * np.where(fields & 512, -1.0, 1.0)
+    xyzw = largest_restored(three, words >> np.uint32(30))
+    return xyzw[:, [3, 0, 1, 2]]
+
+
+def write_spz(path: Path | str, cloud: GaussianCloud, *, version: int = 3) -> None:
+    """Write ``cloud`` as a .spz of version 2 or 3. Axes are written as they are: the format's viewers take +y as up.
+
+    Lossy: positions to 2^-13 (fewer bits where the capture is so large that they do not fit), log scales to 1/32 within
+    -10 ... 5.9, opacity and colour to 1/255. Raises ``UserError`` if the file cannot be written.
+    """
+    if version not in (2, 3):
+        raise UserError(f"{path}: .spz version {version} cannot be written; choose 2 or 3")
+    means = cloud.means.numpy().astype(np.float64)
+    reach = float(np.abs(means).max())
+    bits = int(np.clip(np.floor(np.log2((2**23 - 1) / reach)), 0, _FRACTIONAL_BITS)) if reach > 0 else _FRACTIONAL_BITS
+    if reach * 2**bits > 2**23 - 1:
+        raise UserError(f"{path}: a mean lies {reach:g} units out, .spz holds {2**23 - 1}; scale the capture down")
+    fixed = np.rint(np.ldexp(means, bits)).astype(np.int32)
+    sh = cloud.sh.numpy()
+    header = _HEADER.pack(_MAGIC, version, cloud.count, cloud.sh_degree, bits, 0, 0)
+    quaternions = cloud.rotations.numpy()
+    if version == 3:
+        three, largest = largest_dropped(quaternions[:, [1, 2, 3, 0]])
+        sizes = np.rint(np.abs(three) / np.sqrt(0.5) * 511.0).clip(0, 511).astype(np.uint32)
+        fields = sizes | np.where(three < 0, np.uint32(512), np.uint32(0))
+        rotations = largest << 30 | fields[:, 0] << 20 | fields[:, 1] << 10 | fields[:, 2]
+        packed_rotations = rotations.astype("<u4").tobytes()
+    else:
+        positive = quaternions * np.where(quaternions[:, :1] < 0, -1.0, 1.0)
+        packed_rotations = byte(positive[:, 1:] * 127.5 + 127.5).tobytes()
+    blocks = (
+        fixed.astype("<i4").view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),
+        bytes_from_logits(cloud.opacity_logits.numpy()).tobytes(),
+        byte((sh[:, 0].astype(np.float64) * _COLOUR_SCALE + 0.5) * 255.0).tobytes(),
+        byte((cloud.log_scales.numpy() + 10.0) * 16.0).tobytes(),
+        packed_rotations,
+        _packed_rest(sh[:, 1:]).tobytes(),
+    )
+    deflate = zlib.compressobj(wbits=zlib.MAX_WBITS | 16)
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        for block in (header, *blocks):
+            file.write(deflate.compress(block))
+        file.write(deflate.flush())
+
+
+def _packed_rest(rest: np.ndarray) -> np.ndarray:
+    """(n, K-1, 3) uint8, on a coarser grid than a byte allows."""
+    step = np.where(np.arange(rest.shape[1]) < 3, _BAND1_STEP, _REST_STEP)[None, :, None]
+    return byte(np.rint((rest * 128.0 + 128.0) / step) * step)

@@ -1,0 +1,85 @@
+"""Streamed SOG: lod-meta.json, a tree whose leaves point into several SOGs, one or more for each level of detail.
+
+Public description: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats (streamed SOG). Level 0 is
+the finest; each leaf is read at the finest level it has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import PurePosixPath
+
+import numpy as np
+
+from egs_warp.errors import UserError
+from egs_warp.io.raw import RawCapture
+from egs_warp.io.sog import SogFiles, SogMeta, decode_sog
+
+
+def decode_streamed_sog(meta_json: bytes, files: SogFiles) -> RawCapture:
+    """Join the leaves' finest Gaussians. Raises ``UserError`` for a malformed tree or an incomplete capture."""
+    meta = SogMeta(meta_json, files.source)
+    names, tree = meta.entry("filenames"), meta.entry("tree")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or not isinstance(tree, dict):
+        raise UserError(f"{files.source}: lod-meta.json has no filenames and tree; export the capture again")
+    ranges: dict[int, list[tuple[int, int]]] = {}
+    for file, start, count in _leaves(tree, files):
+        if file >= len(names):
+            raise UserError(f"{files.source}: lod-meta.json points at file {file} of {len(names)}; export it again")
+        ranges.setdefault(file, []).append((start, start + count))
+    if not ranges:
+        raise UserError(f"{files.source}: it has no Gaussians; export it again from the tool that made it")
+    return _joined([_part(files, names[file], ranges[file]) for file in sorted(ranges)])
+
+
+def _leaves(tree: dict, files: SogFiles) -> Iterator[tuple[int, int, int]]:
+    """(file, first Gaussian, count) of each leaf at its finest level, in the tree's order."""
+    stack: list[object] = [tree]
+    while stack:
+        node = stack.pop()
+        levels = node.get("lods") if isinstance(node, dict) else None
+        children = node.get("children", []) if isinstance(node, dict) else None
+        if not isinstance(children, list) or not isinstance(levels, dict | None):
+            raise UserError(f"{files.source}: malformed tree in lod-meta.json; export the capture again")
+        stack.extend(reversed(children))
+        known = [level for level in levels or {} if level.isdecimal()]
+        if known:
+            leaf = (levels or {})[min(known, key=int)]
+            values = [leaf.get(key) for key in ("file", "offset", "count")] if isinstance(leaf, dict) else []
+            numbers = [value for value in values if isinstance(value, int) and value >= 0]
+            if len(numbers) < 3:
+                raise UserError(f"{files.source}: malformed leaf in lod-meta.json; export the capture again")
+            yield numbers[0], numbers[1], numbers[2]
+
+
+def _part(files: SogFiles, name: str, ranges: list[tuple[int, int]]) -> RawCapture:
+    folder = PurePosixPath(name).parent
+    if PurePosixPath(name).name != "meta.json":
+        raise UserError(f"{files.source}: lod-meta.json names {name!r}, expected a meta.json; export the capture again")
+    part = decode_sog(files.read(name), SogFiles(files.source, lambda file: files.read(str(folder / file))))
+    if max(end for _, end in ranges) > len(part.means):
+        raise UserError(f"{files.source}: truncated: {name} has {len(part.means)} Gaussians; export the capture again")
+    chosen = np.concatenate([np.arange(start, end) for start, end in ranges])
+    return RawCapture(
+        format=part.format,
+        means=part.means[chosen],
+        rotations=part.rotations[chosen],
+        log_scales=part.log_scales[chosen],
+        opacity_logits=part.opacity_logits[chosen],
+        sh=part.sh[chosen],
+        notes=part.notes,
+    )
+
+
+def _joined(parts: list[RawCapture]) -> RawCapture:
+    coefficients = max(part.sh.shape[1] for part in parts)
+    sh = [np.pad(part.sh, ((0, 0), (0, coefficients - part.sh.shape[1]), (0, 0))) for part in parts]
+    return RawCapture(
+        format="streamed SOG",
+        means=np.concatenate([part.means for part in parts]),
+        rotations=np.concatenate([part.rotations for part in parts]),
+        log_scales=np.concatenate([part.log_scales for part in parts]),
+        opacity_logits=np.concatenate([part.opacity_logits for part in parts]),
+        sh=np.concatenate(sh),
+        notes=("finest level of detail", *dict.fromkeys(note for part in parts for note in part.notes)),
+    )
