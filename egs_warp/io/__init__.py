@@ -5,6 +5,7 @@ from egs_warp.io.capture import Capture, read_capture
 from egs_warp.io.compressed_ply import write_compressed_ply
 from egs_warp.io.ply import write_ply
 from egs_warp.io.sequence import write_ply_sequence
+from egs_warp.io.sog_writer import write_sog
 from egs_warp.io.splat import write_splat
 from egs_warp.io.spz import write_spz
 
@@ -16,6 +17,7 @@ __all__ = [
     "write_compressed_ply",
     "write_ply",
     "write_ply_sequence",
+    "write_sog",
     "write_splat",
     "write_spz",
 ]

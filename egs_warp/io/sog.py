@@ -19,8 +19,8 @@ from egs_warp.errors import UserError
 from egs_warp.io.raw import RawCapture, largest_restored, logits_from_bytes
 
 _SH_COUNTS = (0, 3, 8, 15)
-_LABELS_PER_ROW = 64
-_FIRST_TAG = 252
+LABELS_PER_ROW = 64
+FIRST_TAG = 252
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def _lerp(meta: SogMeta, key: str, values: np.ndarray) -> np.ndarray:
 
 
 def _decode_quaternions(pixels: np.ndarray) -> np.ndarray:
-    tags = pixels[:, 3].astype(np.int64) - _FIRST_TAG
+    tags = pixels[:, 3].astype(np.int64) - FIRST_TAG
     three = (pixels[:, :3] / 255.0 * 2.0 - 1.0) / np.sqrt(2.0)
     quaternions = largest_restored(three, np.maximum(tags, 0))
     # Pixels that no Gaussian's rotation was written to.
@@ -168,11 +168,11 @@ def _decode_rest(meta: SogMeta, files: SogFiles, version: int, pixels: Callable[
     centroids_name, labels_name = meta.files("shN", 2)
     centroids = files.image_rows(centroids_name)[:, :, :3]
     height, width = centroids.shape[:2]
-    coefficients = width // _LABELS_PER_ROW
+    coefficients = width // LABELS_PER_ROW
     if version == 2:
         bands = meta.integer("shN", "bands")
         coefficients = _SH_COUNTS[bands] if bands < len(_SH_COUNTS) else -1
-    if coefficients not in _SH_COUNTS or width != _LABELS_PER_ROW * coefficients:
+    if coefficients not in _SH_COUNTS or width != LABELS_PER_ROW * coefficients:
         raise UserError(
             f"{files.source}: {centroids_name} is {width} pixels wide, expected 192, 512 or 960 (SH degree 1, 2 or 3); "
             "export the capture again"
@@ -182,7 +182,7 @@ def _decode_rest(meta: SogMeta, files: SogFiles, version: int, pixels: Callable[
     else:
         low, high = meta.numbers("shN", "mins", count=1), meta.numbers("shN", "maxs", count=1)
         values = low + (high - low) * (np.arange(256) / 255.0)
-    palette = centroids.reshape(height * _LABELS_PER_ROW, coefficients, 3)
+    palette = centroids.reshape(height * LABELS_PER_ROW, coefficients, 3)
     label_pixels = pixels(labels_name).astype(np.int64)
     labels = label_pixels[:, 0] + 256 * label_pixels[:, 1]
     if len(labels) and labels.max() >= len(palette):
