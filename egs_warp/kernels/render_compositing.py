@@ -2,15 +2,9 @@
 
 import warp as wp
 
-from egs_warp.kernels.render_projection import ALPHA_CUT, LOG_255
-from egs_warp.kernels.render_tiles import TILE
+from egs_warp.kernels.render_ellipse import ALPHA_CUT, ALPHA_LIMIT, LOG_255, TILE, TILE_PIXELS, TRANSMITTANCE_STOP
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
-
-ALPHA_LIMIT = wp.constant(wp.float32(0.999))
-TRANSMITTANCE_STOP = wp.constant(wp.float32(1.0e-4))
-TILE_PIXELS = wp.constant(256)
-
 
 @wp.func
 def store_pixel(

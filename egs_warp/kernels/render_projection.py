@@ -2,14 +2,9 @@
 
 import warp as wp
 
+from egs_warp.kernels.render_ellipse import LOG_255, LOW_PASS, tile_columns, tile_rows
+
 wp.set_module_options({"enable_backward": False})
-
-LOW_PASS = wp.constant(wp.float32(0.3))
-"""Variance in square pixels added to every screen-space covariance."""
-ALPHA_CUT = wp.constant(wp.float32(1.0 / 255.0))
-"""A splat does not touch pixels where its alpha would be smaller."""
-LOG_255 = wp.constant(wp.float32(5.541263545158426))
-
 
 @wp.struct
 class View:
@@ -121,10 +116,10 @@ def project_kernel(
     ellipse_out: wp.array[wp.vec4],
     falloff_out: wp.array[wp.vec2],
     colour_depth_out: wp.array[wp.vec4],
-    depth_key_out: wp.array[wp.float32],
-    first_bad_out: wp.array[wp.int32],
+    tile_count_out: wp.array[wp.int64],
+    first_bad_out: wp.array[wp.int64],
 ):
-    """Screen ellipse, falloff and colour of every Gaussian; a Gaussian that cannot show gets depth key +inf.
+    """Screen ellipse, falloff and colour of every Gaussian; a Gaussian that cannot show reaches no tile.
 
     The ellipse is kept in its Cholesky form: with u = dx + shear dy, -ln(alpha / opacity) = a u^2 + v dy^2. Its terms
     are all
@@ -135,19 +130,19 @@ def project_kernel(
     q = rotations[g]
     log_scale = log_scales[g]
     logit = opacity_logits[g]
-    depth_key_out[g] = wp.inf
+    tile_count_out[g] = wp.int64(0)
     if not wp.isfinite(mean):
-        wp.atomic_min(first_bad_out, 0, g)
+        wp.atomic_min(first_bad_out, 0, wp.int64(g))
         return
     if not wp.isfinite(q):
-        wp.atomic_min(first_bad_out, 1, g)
+        wp.atomic_min(first_bad_out, 1, wp.int64(g))
         return
     # -inf is a legal logarithm of a flat Gaussian's scale, but the file readers never make one.
     if not wp.isfinite(log_scale):
-        wp.atomic_min(first_bad_out, 2, g)
+        wp.atomic_min(first_bad_out, 2, wp.int64(g))
         return
     if not wp.isfinite(logit):
-        wp.atomic_min(first_bad_out, 3, g)
+        wp.atomic_min(first_bad_out, 3, wp.int64(g))
         return
     p = view.rotation * mean + view.translation
     if p[2] < view.near or p[2] > view.far:
@@ -178,13 +173,22 @@ def project_kernel(
         return
     if x - reach_x > wp.float32(view.width) - 0.5 or y - reach_y > wp.float32(view.height) - 0.5:
         return
+    ellipse = wp.vec4(x, y, 0.5 * var_yy / determinant, -var_xy / var_yy)
+    falloff = wp.vec2(0.5 / var_yy, log_opacity)
+    rows = tile_rows(ellipse, falloff, view.height)
+    tiles = wp.int32(0)
+    for row in range(rows[0], rows[1] + 1):
+        span = tile_columns(ellipse, falloff, row, view.width, view.height)
+        tiles += span[1] - span[0] + 1
+    if tiles == 0:
+        return
     colour = sh_sum(sh, g, sh.shape[1], wp.normalize(mean - view.centre))
     if not wp.isfinite(colour):
-        wp.atomic_min(first_bad_out, 4, g)
+        wp.atomic_min(first_bad_out, 4, wp.int64(g))
         return
-    ellipse_out[g] = wp.vec4(x, y, 0.5 * var_yy / determinant, -var_xy / var_yy)
-    falloff_out[g] = wp.vec2(0.5 / var_yy, log_opacity)
+    tile_count_out[g] = wp.int64(tiles)
+    ellipse_out[g] = ellipse
+    falloff_out[g] = falloff
     colour_depth_out[g] = wp.vec4(
         wp.max(colour[0] + 0.5, 0.0), wp.max(colour[1] + 0.5, 0.0), wp.max(colour[2] + 0.5, 0.0), p[2]
     )
-    depth_key_out[g] = p[2]

@@ -18,7 +18,7 @@ _ATTRIBUTES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 
 @dataclass(frozen=True)
 class ProjectedGaussians:
-    """Every Gaussian on the screen; entries of Gaussians that cannot show are undefined but for ``depth_key``."""
+    """Every Gaussian on the screen; entries of Gaussians that reach no tile are undefined."""
 
     ellipse: wp.array
     """(n,) vec4: centre x, y in pixels, then a and shear of -ln(alpha / opacity) = a (dx + shear dy)^2 + v dy^2."""
@@ -26,17 +26,10 @@ class ProjectedGaussians:
     """(n,) vec2: v, ln(opacity)."""
     colour_depth: wp.array
     """(n,) vec4: red, green, blue (display-referred, at least 0) and z-depth."""
-    depth_key: wp.array
-    """(n,) float32: z-depth, +inf where the Gaussian cannot show."""
-    first_bad: wp.array
-    """(5,) int32: first Gaussian with a non-finite mean, rotation, scale, opacity and colour; n where there is none."""
-
-    def check(self) -> None:
-        """Raise ``UserError`` that names the first non-finite input, if there is one."""
-        count = self.depth_key.shape[0]
-        for attribute, first in zip(_ATTRIBUTES, self.first_bad.numpy(), strict=True):
-            if first < count:
-                raise UserError(f"render: {attribute} of Gaussian {first} is not finite; repair or remove it")
+    slot_end: wp.array
+    """(n,) int64: number of tiles reached by the Gaussians up to and including this one."""
+    slot_count: int
+    """Number of (Gaussian, tile) pairs."""
 
 
 def view_from_camera(camera: Camera) -> View:
@@ -66,29 +59,34 @@ def view_from_camera(camera: Camera) -> View:
 
 
 def project(cloud: GaussianCloud, view: View, *, antialiased: bool, threads: int) -> ProjectedGaussians:
-    """Project every Gaussian of ``cloud``; those outside the view, or fainter than 1/255 everywhere, get depth key
-    +inf.
+    """Project every Gaussian of ``cloud``; those outside the view, or fainter than 1/255 everywhere, reach no tile.
+
+    Raises ``UserError`` that names the first Gaussian with a non-finite value, if there is one.
     """
     device, count = cloud.device, cloud.count
-    projected = ProjectedGaussians(
-        ellipse=wp.empty(count, dtype=wp.vec4, device=device),
-        falloff=wp.empty(count, dtype=wp.vec2, device=device),
-        colour_depth=wp.empty(count, dtype=wp.vec4, device=device),
-        depth_key=wp.empty(count, dtype=wp.float32, device=device),
-        first_bad=wp.full(5, count, dtype=wp.int32, device=device),
-    )
+    ellipse = wp.empty(count, dtype=wp.vec4, device=device)
+    falloff = wp.empty(count, dtype=wp.vec2, device=device)
+    colour_depth = wp.empty(count, dtype=wp.vec4, device=device)
+    tile_count = wp.empty(count, dtype=wp.int64, device=device)
+    # The first non-finite Gaussian by attribute, then the number of slots: one read-back for all.
+    findings = wp.full(len(_ATTRIBUTES) + 1, count, dtype=wp.int64, device=device)
     launch_ranges(
         project_kernel,
         count,
         inputs=[view, int(antialiased), *(getattr(cloud, name) for name in _ATTRIBUTES)],
-        outputs=[
-            projected.ellipse,
-            projected.falloff,
-            projected.colour_depth,
-            projected.depth_key,
-            projected.first_bad,
-        ],
+        outputs=[ellipse, falloff, colour_depth, tile_count, findings],
         device=device,
         threads=threads,
     )
-    return projected
+    wp.utils.array_scan(tile_count, tile_count, inclusive=True)
+    wp.copy(findings, tile_count, dest_offset=len(_ATTRIBUTES), src_offset=count - 1, count=1)
+    *first_bad, slot_count = (int(value) for value in findings.numpy())
+    for attribute, first in zip(_ATTRIBUTES, first_bad, strict=True):
+        if first < count:
+            raise UserError(f"render: {attribute} of Gaussian {first} is not finite; repair or remove it")
+    if slot_count >= 2**31:
+        raise UserError(
+            f"render: {count} Gaussians cover {slot_count} tiles of {view.width} x {view.height} pixels, more than 2^31;"
+            " render a smaller image or fewer Gaussians"
+        )
+    return ProjectedGaussians(ellipse, falloff, colour_depth, tile_count, slot_count)

@@ -35,7 +35,6 @@ def render(
     view = view_from_camera(camera)
     behind = _background_array(background, camera, cloud.device)
     projected = project(cloud, view, antialiased=antialiased, threads=threads)
-    projected.check()
     lists = build_tile_lists(projected, view, threads=threads)
     return composite(projected, lists, view, background=behind, threads=threads)
 

@@ -1,0 +1,50 @@
+"""Screen ellipses: constants of the splatting model and the exact ellipse-tile test."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+LOW_PASS = wp.constant(wp.float32(0.3))
+"""Variance in square pixels added to every screen-space covariance."""
+ALPHA_CUT = wp.constant(wp.float32(1.0 / 255.0))
+"""A splat does not touch pixels where its alpha would be smaller."""
+LOG_255 = wp.constant(wp.float32(5.541263545158426))
+ALPHA_LIMIT = wp.constant(wp.float32(0.999))
+"""Largest alpha of one splat; above it no gradient flows."""
+TRANSMITTANCE_STOP = wp.constant(wp.float32(1.0e-4))
+"""A splat that would bring the transmittance here or lower is not drawn, and ends the pixel."""
+TILE = wp.constant(16)
+"""Side of a square tile in pixels."""
+TILE_PIXELS = wp.constant(256)
+
+
+@wp.func
+def tile_rows(ellipse: wp.vec4, falloff: wp.vec2, height: wp.int32) -> wp.vec2i:
+    """First and last tile row with a pixel centre inside the ellipse's height; first > last if none."""
+    reach = wp.sqrt((falloff[1] + LOG_255) / falloff[0])
+    first = wp.int32(wp.ceil(wp.max(ellipse[1] - reach - 0.5, 0.0)))
+    last = wp.int32(wp.floor(wp.min(ellipse[1] + reach - 0.5, wp.float32(height - 1))))
+    if first > last:
+        return wp.vec2i(0, -1)
+    return wp.vec2i(first / TILE, last / TILE)
+
+
+@wp.func
+def tile_columns(ellipse: wp.vec4, falloff: wp.vec2, row: wp.int32, width: wp.int32, height: wp.int32) -> wp.vec2i:
+    """First and last tile column that the ellipse reaches within a tile row; exact, because the ellipse is convex."""
+    cut = falloff[1] + LOG_255
+    top = wp.float32(row * TILE) + 0.5 - ellipse[1]
+    bottom = wp.float32(wp.min(row * TILE + TILE, height)) - 0.5 - ellipse[1]
+    # The ellipse a (dx + shear dy)^2 + v dy^2 = cut has its leftmost and rightmost points at dy = -+ tip.
+    v = falloff[0]
+    shear = ellipse[3]
+    tip = -shear * wp.sqrt(cut * ellipse[2] / (v * (v + ellipse[2] * shear * shear)))
+    dy_right = wp.clamp(tip, top, bottom)
+    dy_left = wp.clamp(-tip, top, bottom)
+    right = ellipse[0] - shear * dy_right + wp.sqrt(wp.max(cut - v * dy_right * dy_right, 0.0) / ellipse[2])
+    left = ellipse[0] - shear * dy_left - wp.sqrt(wp.max(cut - v * dy_left * dy_left, 0.0) / ellipse[2])
+    first = wp.int32(wp.ceil(wp.max(left - 0.5, 0.0)))
+    last = wp.int32(wp.floor(wp.min(right - 0.5, wp.float32(width - 1))))
+    if first > last:
+        return wp.vec2i(0, -1)
+    return wp.vec2i(first / TILE, last / TILE)
