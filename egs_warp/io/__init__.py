@@ -1,6 +1,7 @@
 """Reading and writing: captures and camera poses."""
 
 from egs_warp.io.atomic import atomic_write, writable_folder
+from egs_warp.io.cameras import PosedImage, read_cameras
 from egs_warp.io.capture import Capture, read_capture
 from egs_warp.io.compressed_ply import write_compressed_ply
 from egs_warp.io.ply import write_ply
@@ -11,7 +12,9 @@ from egs_warp.io.spz import write_spz
 
 __all__ = [
     "Capture",
+    "PosedImage",
     "atomic_write",
+    "read_cameras",
     "read_capture",
     "writable_folder",
     "write_compressed_ply",

@@ -75,8 +75,8 @@ def write_sog(path: Path | str, cloud: GaussianCloud, *, keep_order: bool = Fals
 def _code_book(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(256,) increasing values that represent ``values`` with little squared error, and the index of each as uint8.
 
-    Lloyd's algorithm on the line, from the quantiles and as many evenly spaced values: the latter keep outliers, such as
-    the few very large Gaussians, in their place. Up to 256 different values are kept as they are.
+    Lloyd's algorithm on the line, from the quantiles and as many evenly spaced values: the latter keep outliers, such
+    as a few very large Gaussians, in place. Up to 256 different values are kept as they are.
     """
     samples = np.sort(values.ravel()[:: -(-values.size // _BOOK_SAMPLES)].astype(np.float64))
     different = np.unique(values)

@@ -1,0 +1,228 @@
+"""Camera poses of a capture's photos, in the OpenCV axes and pixel centres of ``Camera``."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from egs_warp.camera import Camera
+from egs_warp.errors import UserError
+from egs_warp.io.colmap import read_colmap_model
+
+_IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".webp")
+_DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
+_JSON_NAMES = ("cameras.json", "transforms.json", "transforms_train.json")
+_COLMAP_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0")
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """One photo and where it was taken from."""
+
+    name: str
+    camera: Camera
+    image: Path | None
+    """The photo's file; None where it is not beside the poses."""
+
+
+def read_cameras(path: Path | str) -> list[PosedImage]:
+    """Read INRIA ``cameras.json``, NeRF-synthetic or nerfstudio ``transforms.json``, or a COLMAP sparse model.
+
+    ``path`` is the .json, the folder of a COLMAP model (text or binary), or a folder that holds one of these. Poses are
+    kept in the file's world frame; nerfstudio's ``applied_transform`` is not undone. Raises ``UserError`` for missing
+    or malformed files and for cameras with lens distortion.
+    """
+    source = Path(path)
+    if source.is_dir():
+        for folder in (source / name for name in _COLMAP_FOLDERS):
+            if any((folder / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
+                return _from_colmap(folder)
+        found = [source / name for name in _JSON_NAMES if (source / name).is_file()]
+        if not found:
+            raise UserError(f"{source}: no camera poses; give a COLMAP model, a cameras.json or a transforms.json")
+        source = found[0]
+    try:
+        tree = json.loads(source.read_bytes())
+    except FileNotFoundError as error:
+        raise UserError(f"{source}: no such file or folder; check the path") from error
+    except OSError as error:
+        raise UserError(f"{source}: cannot be read ({error.strerror}); check the path and its permissions") from error
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{source}: not readable JSON; give a cameras.json or a transforms.json") from error
+    if isinstance(tree, list):
+        posed = [_inria(source, number, entry) for number, entry in enumerate(tree)]
+    elif isinstance(tree, dict) and isinstance(tree.get("frames"), list):
+        posed = [_transform(source, number, tree, entry) for number, entry in enumerate(tree["frames"])]
+    else:
+        raise UserError(f"{source}: neither a list of cameras nor frames; give a cameras.json or a transforms.json")
+    if not posed:
+        raise UserError(f"{source}: it has no cameras; export the poses again")
+    return posed
+
+
+def _from_colmap(folder: Path) -> list[PosedImage]:
+    posed = []
+    for view in read_colmap_model(folder):
+        w, x, y, z = view.quaternion / np.linalg.norm(view.quaternion)
+        rotation = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        camera = Camera(
+            width=view.width,
+            height=view.height,
+            fx=view.fx,
+            fy=view.fy,
+            cx=view.cx,
+            cy=view.cy,
+            rotation=rotation,
+            translation=view.translation,
+        )
+        # COLMAP keeps the photos' folder to itself; these are the usual places around sparse/0.
+        places = [parent / "images" for parent in (folder, folder.parent, folder.parent.parent)]
+        image = next((place / view.name for place in places if os.path.isfile(place / view.name)), None)
+        posed.append(PosedImage(view.name, camera, image))
+    return posed
+
+
+def _inria(source: Path, number: int, entry: object) -> PosedImage:
+    """``position`` and ``rotation`` are camera to world, in OpenCV axes."""
+    record = _Record(source, f"camera {number}", entry)
+    name = record.text("img_name")
+    width, height = record.size("width"), record.size("height")
+    rotation = record.rotation(record.numbers("rotation", (3, 3))).T
+    camera = Camera(
+        width=width,
+        height=height,
+        fx=record.focal("fx"),
+        fy=record.focal("fy"),
+        cx=width / 2.0,
+        cy=height / 2.0,
+        rotation=rotation,
+        translation=-rotation @ record.numbers("position", (3,)),
+    )
+    return PosedImage(name, camera, _find_image(source.parent / "images" / name))
+
+
+def _transform(source: Path, number: int, shared: dict, entry: object) -> PosedImage:
+    """``transform_matrix`` is camera to world, y up and z backwards; intrinsics stand in the frame or are shared."""
+    own = entry if isinstance(entry, dict) else {}
+    record = _Record(source, f"frame {number}", {**shared, **own})
+    name = record.text("file_path")
+    image = _find_image(source.parent / name)
+    model = record.fields.get("camera_model", "PINHOLE")
+    bent = [key for key in _DISTORTIONS if record.fields.get(key)]
+    if model not in ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV") or bent:
+        what = ", ".join(bent) or model
+        raise UserError(f"{source}: frame {number} has lens distortion ({what}); undistort the photos first")
+    if "w" in record.fields:
+        width, height = record.size("w"), record.size("h")
+    else:
+        width, height = _image_size(source, number, name, image)
+    if "fl_x" in record.fields:
+        fx = record.focal("fl_x")
+    else:
+        fx = 0.5 * width / np.tan(0.5 * record.angle("camera_angle_x"))
+    if "fl_y" in record.fields:
+        fy = record.focal("fl_y")
+    elif "camera_angle_y" in record.fields:
+        fy = 0.5 * height / np.tan(0.5 * record.angle("camera_angle_y"))
+    else:
+        fy = fx
+    matrix = record.numbers("transform_matrix", (4, 4))
+    rotation = np.diag([1.0, -1.0, -1.0]) @ record.rotation(matrix[:3, :3]).T
+    camera = Camera(
+        width=width,
+        height=height,
+        fx=float(fx),
+        fy=float(fy),
+        cx=float(record.numbers("cx", ())) if "cx" in record.fields else width / 2.0,
+        cy=float(record.numbers("cy", ())) if "cy" in record.fields else height / 2.0,
+        rotation=rotation,
+        translation=-rotation @ matrix[:3, 3],
+    )
+    return PosedImage(name, camera, image)
+
+
+def _find_image(path: Path) -> Path | None:
+    # os.path answers False where Path.is_file raises: names too long or not of this world.
+    return next((Path(f"{path}{suffix}") for suffix in _IMAGE_SUFFIXES if os.path.isfile(f"{path}{suffix}")), None)
+
+
+def _image_size(source: Path, number: int, name: str, image: Path | None) -> tuple[int, int]:
+    from PIL import Image
+
+    if image is None:
+        raise UserError(f"{source}: frame {number} has no w and h, and its photo {name} is missing; add either")
+    try:
+        with Image.open(image) as opened:
+            return opened.size
+    # The decoder is handed a stranger's bytes, and its errors share no base class.
+    except Exception as error:
+        raise UserError(f"{image}: not a readable image; copy it again") from error
+
+
+class _Record:
+    """Checked access to one camera's fields: every mistake becomes a ``UserError`` that names camera and field."""
+
+    def __init__(self, source: Path, where: str, fields: object) -> None:
+        self.source = source
+        self.where = where
+        if not isinstance(fields, dict):
+            raise UserError(f"{source}: {where} is not a record of fields; export the poses again")
+        self.fields: dict = fields
+
+    def numbers(self, key: str, shape: tuple[int, ...]) -> np.ndarray:
+        """Array of ``shape``, float64, finite."""
+        try:
+            values = np.array(self.fields.get(key), dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            values = np.array(np.nan)
+        if values.shape != shape or not np.isfinite(values).all():
+            count = int(np.prod(shape))
+            raise self._wrong(key, "a finite number" if count == 1 else f"{count} finite numbers")
+        return values
+
+    def focal(self, key: str) -> float:
+        """A length in pixels."""
+        value = float(self.numbers(key, ()))
+        if value <= 0:
+            raise self._wrong(key, "a positive number")
+        return value
+
+    def angle(self, key: str) -> float:
+        """A field of view in radians."""
+        value = float(self.numbers(key, ()))
+        if not 0 < value < np.pi:
+            raise self._wrong(key, "an angle between 0 and pi")
+        return value
+
+    def size(self, key: str) -> int:
+        """A number of pixels."""
+        value = float(self.numbers(key, ()))
+        if value < 1 or value != int(value):
+            raise self._wrong(key, "a number of pixels")
+        return int(value)
+
+    def text(self, key: str) -> str:
+        """A name."""
+        value = self.fields.get(key)
+        if not isinstance(value, str) or not value or "\0" in value:
+            raise self._wrong(key, "a name")
+        return value
+
+    def rotation(self, matrix: np.ndarray) -> np.ndarray:
+        """``matrix`` (3, 3), if it is a rotation."""
+        if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-3) or np.linalg.det(matrix) < 0:
+            raise UserError(f"{self.source}: {self.where}: the pose is not a rotation; export the poses again")
+        return matrix
+
+    def _wrong(self, key: str, expected: str) -> UserError:
+        return UserError(f"{self.source}: {self.where}: {key} is not {expected}; export the poses again")
