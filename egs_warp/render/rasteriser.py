@@ -33,13 +33,14 @@ def render(
     """
     threads = threads or available_threads()
     view = view_from_camera(camera)
-    behind = _background_array(background, camera, cloud.device)
+    behind = background_array(background, camera, cloud.device)
     projected = project(cloud, view, antialiased=antialiased, threads=threads)
     lists = build_tile_lists(projected, view, threads=threads)
     return composite(projected, lists, view, background=behind, threads=threads)
 
 
-def _background_array(background: object, camera: Camera, device: wp.Device) -> wp.array:
+def background_array(background: object, camera: Camera, device: wp.Device) -> wp.array:
+    """(1,) or (H * W,) vec3 from a colour or an image (H, W, 3). Raises ``UserError`` for anything else."""
     shape = (camera.height, camera.width)
     if isinstance(background, wp.array) and background.dtype == wp.vec3 and background.shape == shape:
         return background.to(device).contiguous().flatten()

@@ -1,0 +1,171 @@
+"""The renderer as a function of torch tensors, with gradients. The only module of ``render`` that imports torch."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+import warp as wp
+
+from egs_warp.camera import Camera
+from egs_warp.errors import UserError
+from egs_warp.gaussians import GaussianCloud
+from egs_warp.render.backward import backward
+from egs_warp.render.compositing import RenderedImage, composite
+from egs_warp.render.projection import ProjectedGaussians, project, view_from_camera
+from egs_warp.render.rasteriser import background_array
+from egs_warp.render.threads import available_threads
+from egs_warp.render.tiles import TileLists, build_tile_lists
+
+
+@dataclass(frozen=True)
+class TorchImage:
+    """One differentiable picture; the tensors share memory with the renderer's arrays."""
+
+    colour: torch.Tensor
+    """(H, W, 3) float32."""
+    alpha: torch.Tensor
+    """(H, W) float32."""
+    depth: torch.Tensor
+    """(H, W) float32, expected z-depth divided by alpha."""
+    screen: torch.Tensor
+    """(n, 2) float32 zeros whose ``grad`` receives the gradient by the screen positions, in pixels."""
+    visible: torch.Tensor
+    """(n,) bool: Gaussians that reach a tile."""
+
+
+def render_torch(
+    means: torch.Tensor,
+    rotations: torch.Tensor,
+    log_scales: torch.Tensor,
+    opacity_logits: torch.Tensor,
+    sh: torch.Tensor,
+    camera: Camera,
+    *,
+    rotation: torch.Tensor | None = None,
+    translation: torch.Tensor | None = None,
+    background: Any = (1.0, 1.0, 1.0),
+    antialiased: bool = False,
+    threads: int | None = None,
+) -> TorchImage:
+    """Picture of Gaussians given as float32 tensors (n, 3), (n, 4), (n, 3), (n,), (n, K, 3), all on one device.
+
+    Gradients flow to all five, and to the camera's pose where ``rotation`` (3, 3) and ``translation`` (3,) are given
+    (they then replace the camera's; the gradient by ``rotation`` is by its nine entries, taken as free). On CUDA the
+    work is queued on torch's current stream. Raises ``UserError`` as ``egs_warp.render.render`` does.
+    """
+    tensors = {
+        "means": (means, (len(means), 3)),
+        "rotations": (rotations, (len(means), 4)),
+        "log_scales": (log_scales, (len(means), 3)),
+        "opacity_logits": (opacity_logits, (len(means),)),
+        "sh": (sh, (len(means), sh.shape[1], 3)),
+    }
+    for name, (tensor, shape) in tensors.items():
+        if tuple(tensor.shape) != shape or tensor.dtype != torch.float32 or tensor.device != means.device:
+            raise UserError(
+                f"render: {name} is {tuple(tensor.shape)} {tensor.dtype} on {tensor.device},"
+                f" expected {shape} float32 on {means.device}"
+            )
+    if (rotation is None) != (translation is None):
+        raise UserError("render: give the pose's rotation and translation together, or neither")
+    wanted = any(tensor.requires_grad for tensor, _ in tensors.values()) and torch.is_grad_enabled()
+    screen = torch.zeros((len(means), 2), device=means.device, requires_grad=wanted)
+    options = _Options(camera, background, antialiased, threads or available_threads())
+    colour, alpha, depth, visible = _Render.apply(
+        *(means, rotations, log_scales, opacity_logits, sh, rotation, translation, screen, options)
+    )
+    return TorchImage(colour, alpha, depth, screen, visible)
+
+
+@dataclass(frozen=True)
+class _Options:
+    camera: Camera
+    background: Any
+    antialiased: bool
+    threads: int
+
+
+@dataclass(frozen=True)
+class _Forward:
+    """What the backward pass needs of the forward pass."""
+
+    cloud: GaussianCloud
+    view: Any
+    projected: ProjectedGaussians
+    lists: TileLists
+    image: RenderedImage
+
+
+def _torch_stream(device: torch.device) -> AbstractContextManager[Any]:
+    if device.type != "cuda":
+        return nullcontext()
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
+
+
+class _Render(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> tuple[torch.Tensor, ...]:
+        means, rotations, log_scales, opacity_logits, sh, rotation, translation, _screen, options = arguments
+        camera = options.camera
+        if rotation is not None:
+            camera = replace(
+                camera,
+                rotation=rotation.detach().double().cpu().numpy(),
+                translation=translation.detach().double().cpu().numpy(),
+            )
+        with _torch_stream(means.device):
+            cloud = GaussianCloud(
+                means=wp.from_torch(means.detach().contiguous(), dtype=wp.vec3),
+                rotations=wp.from_torch(rotations.detach().contiguous(), dtype=wp.vec4),
+                log_scales=wp.from_torch(log_scales.detach().contiguous(), dtype=wp.vec3),
+                opacity_logits=wp.from_torch(opacity_logits.detach().contiguous(), dtype=wp.float32),
+                sh=wp.from_torch(sh.detach().contiguous(), dtype=wp.vec3),
+            )
+            view = view_from_camera(camera)
+            threads = options.threads
+            projected = project(cloud, view, antialiased=options.antialiased, threads=threads)
+            lists = build_tile_lists(projected, view, threads=threads)
+            behind = background_array(options.background, camera, cloud.device)
+            image = composite(projected, lists, view, background=behind, threads=threads)
+            ctx.forward_pass = _Forward(cloud, view, projected, lists, image)
+            ctx.options = options
+            ctx.want_pose = rotation is not None and (ctx.needs_input_grad[5] or ctx.needs_input_grad[6])
+            ctx.set_materialize_grads(False)
+            visible = torch.diff(wp.to_torch(projected.slot_end), prepend=torch.zeros_like(means[:1, 0]).long()) > 0
+            ctx.mark_non_differentiable(visible)
+            return wp.to_torch(image.colour), wp.to_torch(image.alpha), wp.to_torch(image.depth), visible
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *pixel_gradients: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
+        done: _Forward = ctx.forward_pass
+        device = wp.device_to_torch(done.cloud.device)
+        with _torch_stream(torch.device(device)):
+            by_pixel = []
+            for gradient, dtype, array in zip(
+                pixel_gradients[:3],
+                (wp.vec3, wp.float32, wp.float32),
+                (done.image.colour, done.image.alpha, done.image.depth),
+                strict=True,
+            ):
+                if gradient is None:
+                    by_pixel.append(wp.zeros(array.size, dtype=dtype, device=done.cloud.device))
+                else:
+                    by_pixel.append(wp.from_torch(gradient.detach().contiguous(), dtype=dtype).flatten())
+            gradients = backward(
+                *(done.cloud, done.view, done.projected, done.lists, done.image),
+                colour_gradient=by_pixel[0],
+                alpha_gradient=by_pixel[1],
+                depth_gradient=by_pixel[2],
+                antialiased=ctx.options.antialiased,
+                want_pose=ctx.want_pose,
+                threads=ctx.options.threads,
+            )
+            names = ("means", "rotations", "log_scales", "opacity_logits", "sh", "pose_rotation", "pose_translation")
+            tensors = [wp.to_torch(getattr(gradients, name)) for name in (*names, "screen")]
+            for index in (5, 6):
+                tensors[index] = tensors[index].sum(dim=0) if ctx.want_pose else None
+            return (*tensors, None)
