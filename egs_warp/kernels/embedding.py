@@ -1,0 +1,183 @@
+"""Locate points in a rest cage (Eq. 2) and lay out the seven points of every Gaussian (Eq. 3)."""
+
+import warp as wp
+
+from egs_warp.precision import Mat33, Vec3, Vec4, real
+
+wp.set_module_options({"enable_backward": False})
+
+# A point on a shared face belongs to both tetrahedra; rounding must not decide which.
+INSIDE_TOLERANCE = wp.constant(wp.float64(1.0e-10))
+DISTANCE_TOLERANCE = wp.constant(wp.float64(1.0e-9))
+
+
+@wp.func
+def barycentric_weights(corner: Vec3, inverse_edges: Mat33, point: Vec3) -> Vec4:
+    """Weights of ``point`` on a tetrahedron's corners (Eq. 2), of sum 1; ``inverse_edges`` inverts [x1-x0, x2-x0, x3-x0]."""
+    w = inverse_edges * (point - corner)
+    return Vec4(real(1.0) - w[0] - w[1] - w[2], w[0], w[1], w[2])
+
+
+@wp.func
+def least_weight(weights: Vec4) -> real:
+    return wp.min(wp.min(weights[0], weights[1]), wp.min(weights[2], weights[3]))
+
+
+@wp.func
+def closest_on_triangle(a: Vec3, b: Vec3, c: Vec3, point: Vec3) -> Vec3:
+    """Closest point of a triangle (Ericson, Real-Time Collision Detection, 5.1.5: by Voronoi regions)."""
+    ab = b - a
+    ac = c - a
+    ap = point - a
+    d1 = wp.dot(ab, ap)
+    d2 = wp.dot(ac, ap)
+    if d1 <= real(0.0) and d2 <= real(0.0):
+        return a
+    bp = point - b
+    d3 = wp.dot(ab, bp)
+    d4 = wp.dot(ac, bp)
+    if d3 >= real(0.0) and d4 <= d3:
+        return b
+    vc = d1 * d4 - d3 * d2
+    if vc <= real(0.0) and d1 >= real(0.0) and d3 <= real(0.0):
+        return a + ab * (d1 / (d1 - d3))
+    cp = point - c
+    d5 = wp.dot(ab, cp)
+    d6 = wp.dot(ac, cp)
+    if d6 >= real(0.0) and d5 <= d6:
+        return c
+    vb = d5 * d2 - d1 * d6
+    if vb <= real(0.0) and d2 >= real(0.0) and d6 <= real(0.0):
+        return a + ac * (d2 / (d2 - d6))
+    va = d3 * d6 - d5 * d4
+    if va <= real(0.0) and d4 - d3 >= real(0.0) and d5 - d6 >= real(0.0):
+        return b + (c - b) * ((d4 - d3) / ((d4 - d3) + (d5 - d6)))
+    total = va + vb + vc
+    return a + ab * (vb / total) + ac * (vc / total)
+
+
+@wp.func
+def distance_to_tet(x0: Vec3, x1: Vec3, x2: Vec3, x3: Vec3, weights: Vec4, point: Vec3) -> real:
+    """Distance from a point outside a tetrahedron; only faces that the point lies beyond can be nearest."""
+    nearest = real(1.0e300)
+    if weights[0] < real(0.0):
+        nearest = wp.min(nearest, wp.length(point - closest_on_triangle(x1, x2, x3, point)))
+    if weights[1] < real(0.0):
+        nearest = wp.min(nearest, wp.length(point - closest_on_triangle(x0, x2, x3, point)))
+    if weights[2] < real(0.0):
+        nearest = wp.min(nearest, wp.length(point - closest_on_triangle(x0, x1, x3, point)))
+    if weights[3] < real(0.0):
+        nearest = wp.min(nearest, wp.length(point - closest_on_triangle(x0, x1, x2, point)))
+    return nearest
+
+
+@wp.func
+def single(v: Vec3) -> wp.vec3:
+    return wp.vec3(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
+
+
+@wp.func
+def distance_to_box(lower: wp.vec3, upper: wp.vec3, point: wp.vec3) -> wp.float32:
+    outside = wp.max(wp.max(lower - point, point - upper), wp.vec3(0.0))
+    return wp.length(outside)
+
+
+@wp.kernel
+def locate_points_kernel(
+    first_row: wp.int32,
+    # In:
+    points: wp.array[Vec3],
+    origin: Vec3,
+    extent: real,
+    tets: wp.array[wp.vec4i],
+    nodes: wp.array[Vec3],
+    inverse_edges: wp.array[Mat33],
+    box_lowers: wp.array[wp.vec3],
+    box_uppers: wp.array[wp.vec3],
+    boxes: wp.uint64,
+    surface: wp.uint64,
+    # Out:
+    tets_out: wp.array[wp.int32],
+    nodes_out: wp.array[wp.vec4i],
+    weights_out: wp.array[Vec4],
+    inside_out: wp.array[wp.bool],
+):
+    """Containing tetrahedron of each point, or the nearest one, with barycentric weights (Eq. 2).
+
+    ``nodes`` and all boxes are relative to ``origin``. Among several tetrahedra that contain the point, the lowest index
+    is taken. Among several that are equally near (the point faces a shared edge or node), the one from which the weights
+    extrapolate least, then the lowest index.
+    """
+    row = first_row + wp.tid()
+    point = points[row] - origin
+    coarse = single(point)
+
+    best = wp.int32(-1)
+    candidate = wp.int32(0)
+    query = wp.bvh_query_aabb(boxes, coarse, coarse)
+    while wp.bvh_query_next(query, candidate):
+        if best < 0 or candidate < best:
+            weights = barycentric_weights(nodes[tets[candidate][0]], inverse_edges[candidate], point)
+            if least_weight(weights) >= -INSIDE_TOLERANCE:
+                best = candidate
+    inside_out[row] = best >= 0
+
+    if best < 0:
+        # The float32 distance to the surface bounds the search; slack covers its rounding.
+        slack = 1.0e-5 * (wp.length(coarse) + wp.float32(extent))
+        radius = wp.length(coarse) + 2.0 * wp.float32(extent)
+        on_surface = wp.mesh_query_point_no_sign(surface, coarse, radius)
+        if on_surface.result:
+            nearest_surface = wp.mesh_eval_position(surface, on_surface.face, on_surface.u, on_surface.v)
+            radius = wp.length(nearest_surface - coarse)
+        radius = radius + slack
+        reach = wp.vec3(radius)
+
+        nearest = real(1.0e300)
+        query = wp.bvh_query_aabb(boxes, coarse - reach, coarse + reach)
+        while wp.bvh_query_next(query, candidate):
+            if distance_to_box(box_lowers[candidate], box_uppers[candidate], coarse) <= radius:
+                corners = tets[candidate]
+                x0 = nodes[corners[0]]
+                weights = barycentric_weights(x0, inverse_edges[candidate], point)
+                distance = distance_to_tet(x0, nodes[corners[1]], nodes[corners[2]], nodes[corners[3]], weights, point)
+                if distance < nearest:
+                    nearest = distance
+                    radius = wp.min(radius, wp.float32(distance) + slack)
+
+        limit = nearest * (real(1.0) + DISTANCE_TOLERANCE) + DISTANCE_TOLERANCE * extent
+        reach = wp.vec3(radius)
+        least = real(-1.0e300)
+        query = wp.bvh_query_aabb(boxes, coarse - reach, coarse + reach)
+        while wp.bvh_query_next(query, candidate):
+            if distance_to_box(box_lowers[candidate], box_uppers[candidate], coarse) <= radius:
+                corners = tets[candidate]
+                x0 = nodes[corners[0]]
+                weights = barycentric_weights(x0, inverse_edges[candidate], point)
+                distance = distance_to_tet(x0, nodes[corners[1]], nodes[corners[2]], nodes[corners[3]], weights, point)
+                low = least_weight(weights)
+                if distance <= limit and (low > least or (low == least and candidate < best)):
+                    least = low
+                    best = candidate
+
+    corners = tets[best]
+    tets_out[row] = best
+    nodes_out[row] = corners
+    weights_out[row] = barycentric_weights(nodes[corners[0]], inverse_edges[best], point)
+
+
+@wp.kernel
+def interpolate_points_kernel(
+    first_row: wp.int32,
+    # In:
+    nodes: wp.array[wp.vec4i],
+    weights: wp.array[Vec4],
+    positions: wp.array[Vec3],
+    # Out:
+    points_out: wp.array[Vec3],
+):
+    """Position of each embedded point (Eq. 2) for node positions ``positions``."""
+    row = first_row + wp.tid()
+    n = nodes[row]
+    w = weights[row]
+    points_out[row] = w[0] * positions[n[0]] + w[1] * positions[n[1]] + w[2] * positions[n[2]] + w[3] * positions[n[3]]
