@@ -78,7 +78,7 @@ def logits_from_bytes(alphas: np.ndarray) -> np.ndarray:
 
 def bytes_from_logits(logits: np.ndarray) -> np.ndarray:
     """Opacities as uint8, 255 for 1."""
-    return byte(255.0 / (1.0 + np.exp(-logits.astype(np.float64))))
+    return byte(255.0 / (1.0 + np.exp(-np.clip(logits.astype(np.float64), -100.0, 100.0))))
 
 
 def byte(values: np.ndarray) -> np.ndarray:

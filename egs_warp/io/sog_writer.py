@@ -146,5 +146,5 @@ def _webp(pixels: np.ndarray) -> bytes:
 
     data = io.BytesIO()
     # Without exact the encoder drops the colours of pixels whose fourth channel is 0.
-    Image.fromarray(pixels, "RGBA").save(data, "WEBP", lossless=True, exact=True, quality=80, method=2)
+    Image.fromarray(pixels).save(data, "WEBP", lossless=True, exact=True, quality=80, method=2)
     return data.getvalue()
