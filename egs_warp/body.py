@@ -84,7 +84,7 @@ def make_body(
     mesh: TetMesh,
     plane: Plane,
     *,
-    sag: float = 0.03,
+    sag: float = 0.05,
     poisson_ratio: float = 0.4,
     density: float = 1000.0,
     damping_ratio: float = 0.05,

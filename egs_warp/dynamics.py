@@ -136,8 +136,16 @@ class ImplicitStep:
                 return
         raise FloatingPointError("the projected Hessian is not positive definite")
 
-    def minimise(self, force: np.ndarray, start: np.ndarray, penalty: PenaltyTerms | None = None) -> NewtonResult:
+    def minimise(
+        self,
+        force: np.ndarray,
+        start: np.ndarray,
+        penalty: PenaltyTerms | None = None,
+        *,
+        tolerance: float | None = None,
+    ) -> NewtonResult:
         """Newton with a line search that stays feasible (J > 0), from ``start`` (N, 3) under ``force`` (N, 3) newtons."""
+        tolerance = self.tolerance if tolerance is None else tolerance
 
         def phi(v: np.ndarray) -> float:
             value = self.energy(v, force)
@@ -156,7 +164,7 @@ class ImplicitStep:
         gradient = slope(velocities)
         residual = float(np.linalg.norm(gradient)) / unit
         for iteration in range(self.iteration_limit):
-            if residual <= self.tolerance:
+            if residual <= tolerance:
                 return NewtonResult(velocities, NewtonStatus.CONVERGED, iteration, residual)
             self.newton_iterations += 1
             self.factor(velocities, penalty)
@@ -176,12 +184,12 @@ class ImplicitStep:
                         break
                 length *= 0.5
                 if length < 1e-9:
-                    accepted = residual <= 10.0 * self.tolerance
+                    accepted = residual <= 10.0 * tolerance
                     status = NewtonStatus.CONVERGED if accepted else NewtonStatus.STALLED
                     return NewtonResult(velocities, status, iteration, residual)
             velocities, value, gradient = trial, trial_value, trial_gradient
             residual = float(np.linalg.norm(gradient)) / unit
-        status = NewtonStatus.CONVERGED if residual <= self.tolerance else NewtonStatus.ITERATION_LIMIT
+        status = NewtonStatus.CONVERGED if residual <= tolerance else NewtonStatus.ITERATION_LIMIT
         return NewtonResult(velocities, status, self.iteration_limit, residual)
 
 

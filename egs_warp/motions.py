@@ -1,0 +1,204 @@
+"""Motions as closed-loop state machines that write objectives from the measured state (DESIGN 9)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from egs_warp.body import BodyState, SoftBody
+from egs_warp.locomotion import StepReport
+from egs_warp.objectives import Objective, SpinObjective
+from egs_warp.stance import Ground, Measurement, PoseFamily, Weights
+
+
+class JumpPhase(Enum):
+    """Phases of a jump in their order."""
+
+    SETTLE = "settle"
+    CROUCH = "crouch"
+    THRUST = "thrust"
+    FLIGHT = "flight"
+    LAND = "land"
+    REST = "rest"
+
+
+@dataclass(frozen=True)
+class JumpTarget:
+    """What is asked, in metres."""
+
+    distance: float
+    height: float
+
+
+@dataclass(frozen=True)
+class JumpPlan:
+    """Numbers a jump is planned with; metres, seconds, m/s."""
+
+    crouch_depth: float
+    extension: float
+    crouch_time: float
+    thrust_time: float
+    flight_time: float
+    speed_up: float
+    speed_forward: float
+    landing_rate: float
+    """1/s of the critically damped landing."""
+
+
+def plan_jump(target: JumpTarget, *, height: float, gravity: float, step: float) -> JumpPlan:
+    """Stroke, times and take-off velocity for a jump of ``target`` by a body of ``height`` H (DESIGN 9)."""
+    time_unit = np.sqrt(height / gravity)
+    extension = min(0.04 * height, 0.25 * target.height)
+    rise = target.height - extension
+    speed_up = np.sqrt(2.0 * gravity * rise) + 0.5 * gravity * step
+    acceleration = 1.6 * gravity
+    stroke = max(speed_up**2 / (2.0 * acceleration), extension + 0.02 * height)
+    thrust_time = 2.0 * stroke / speed_up
+    flight_time = 2.0 * np.sqrt(2.0 * rise / gravity)
+    landing_rate = 4.0 / time_unit
+    speed_forward = target.distance / (flight_time + 1.0 / landing_rate + 0.5 * thrust_time)
+    return JumpPlan(
+        crouch_depth=stroke - extension,
+        extension=extension,
+        crouch_time=1.1 * time_unit,
+        thrust_time=thrust_time,
+        flight_time=flight_time,
+        speed_up=speed_up,
+        speed_forward=speed_forward,
+        landing_rate=landing_rate,
+    )
+
+
+class Jump:
+    """Settle, crouch, thrust until the measured speed suffices, fly, land, come to rest."""
+
+    def __init__(
+        self,
+        body: SoftBody,
+        ground: Ground,
+        standing: np.ndarray,
+        target: JumpTarget,
+        *,
+        step: float,
+        weights: Weights | None = None,
+    ) -> None:
+        self.body, self.ground, self.target = body, ground, target
+        self.weights = weights or Weights()
+        self.pose = PoseFamily(body, ground, standing)
+        self.gravity = float(np.linalg.norm(body.gravity))
+        self.plan = plan_jump(target, height=body.height, gravity=self.gravity, step=step)
+        self.phase = JumpPhase.SETTLE
+        self._entered = 0.0
+        local = ground.local(standing)
+        self._start_com = body.centre_of_mass(local)
+        self._start_base = self._start_com[:2] + self.pose.base_offset
+        self._goal_base = self._start_base + [target.distance, 0.0]
+        self._pose = np.eye(3)
+        self._time_unit = float(np.sqrt(body.height / self.gravity))
+        self._flew = False
+
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
+        """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
+        seen = self.pose.measure(state, report)
+        self._advance_phase(seen, state.time, dt)
+        elapsed = state.time - self._entered + dt
+        if self.phase is JumpPhase.FLIGHT:
+            return self._fly(state, seen, dt)
+        if self.phase in (JumpPhase.SETTLE, JumpPhase.CROUCH, JumpPhase.THRUST):
+            position, velocity = self._stance_reference(elapsed)
+            rate = 6.0 / self._time_unit
+            com_velocity = velocity + rate * (position - velocity * dt - seen.com)
+            if self.phase is JumpPhase.THRUST:
+                com_velocity[2] = min(com_velocity[2], self._sufficient_speed(seen, dt))
+            return self._stand(state, com_velocity, position, self._start_base, dt)
+        return self._land(state, seen, dt)
+
+    def _advance_phase(self, seen: Measurement, time: float, dt: float) -> None:
+        elapsed, plan = time - self._entered, self.plan
+        following = {
+            JumpPhase.SETTLE: elapsed >= 0.3 * self._time_unit,
+            JumpPhase.CROUCH: elapsed >= plan.crouch_time,
+            JumpPhase.THRUST: self._risen(seen, dt) or elapsed > 3.0 * plan.thrust_time,
+            JumpPhase.FLIGHT: self._flew and seen.touching or elapsed > 3.0 * plan.flight_time,
+            JumpPhase.LAND: elapsed >= 5.0 * self._time_unit,
+            JumpPhase.REST: False,
+        }
+        if self.phase is JumpPhase.FLIGHT and not seen.touching:
+            self._flew = True
+        if following[self.phase]:
+            self.phase = list(JumpPhase)[list(JumpPhase).index(self.phase) + 1]
+            self._entered = time
+
+    def _sufficient_speed(self, seen: Measurement, dt: float) -> float:
+        """Speed up, m/s, at the end of this step from which free flight reaches the asked height."""
+        rise = self._start_com[2] + self.target.height - seen.com[2]
+        step_gain = self.gravity * dt  # v dt + (v - g dt/2)^2 / 2g = rise, solved for v
+        return float(max(-0.5 * step_gain + np.sqrt(max(2.0 * self.gravity * rise, 0.0)), 0.0))
+
+    def _risen(self, seen: Measurement, dt: float) -> bool:
+        """Whether the centre of mass, in free flight from here, would reach the asked height."""
+        speed = max(seen.velocity[2] - 0.5 * self.gravity * dt, 0.0)
+        apex = seen.com[2] + speed**2 / (2.0 * self.gravity)
+        return bool(apex >= self._start_com[2] + 0.9 * self.target.height)
+
+    def _stance_reference(self, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
+        """Position and velocity (3,) of the centre of mass, ground coordinates, ``elapsed`` seconds into the phase."""
+        plan, start = self.plan, self._start_com
+        if self.phase is JumpPhase.SETTLE:
+            return start, np.zeros(3)
+        down = np.array([0.0, 0.0, -plan.crouch_depth])
+        if self.phase is JumpPhase.CROUCH:
+            s = min(elapsed / plan.crouch_time, 1.0)
+            blend, slope = s * s * (3 - 2 * s), 6 * s * (1 - s) / plan.crouch_time
+            return start + blend * down, slope * down
+        take_off = np.array([plan.speed_forward, 0.0, plan.speed_up])
+        return start + down + 0.5 * take_off * elapsed**2 / plan.thrust_time, take_off * elapsed / plan.thrust_time
+
+    def _stand(self, state: BodyState, com_velocity, position, base, dt: float) -> list[Objective | SpinObjective]:
+        pose = self.pose.over_base(position, base)
+        spin = self.pose.turn_towards(state, pose) * 4.0 / self._time_unit
+        if self.phase is JumpPhase.THRUST:
+            landing = self.pose.over_base(self._landing_com(position), self._goal_base)
+            spin = self.pose.turn_towards(state, landing) / self.plan.flight_time
+        return self._write(state, com_velocity, pose, spin, dt)
+
+    def _landing_com(self, position: np.ndarray) -> np.ndarray:
+        lag = self.plan.speed_forward / self.plan.landing_rate
+        return np.array([self._goal_base[0] - self.pose.base_offset[0] - lag, position[1], self._start_com[2]])
+
+    def _fly(self, state: BodyState, seen: Measurement, dt: float) -> list[Objective | SpinObjective]:
+        drop = max(seen.com[2] - self._start_com[2], 0.0)
+        speed = seen.velocity[2]
+        left = (speed + np.sqrt(max(speed**2 + 2.0 * self.gravity * drop, 0.0))) / self.gravity
+        left = max(left, dt)
+        touch_down = seen.com + np.array([*(seen.velocity[:2] * left), 0.0])
+        touch_down[2] = self._start_com[2]
+        pose = self.pose.over_base(touch_down, self._goal_base)
+        velocity = seen.velocity - np.array([0.0, 0.0, self.gravity * dt])
+        spin = self.pose.turn_towards(state, pose) / left
+        return self._write(state, velocity, pose, spin, dt)
+
+    def _land(self, state: BodyState, seen: Measurement, dt: float) -> list[Objective | SpinObjective]:
+        rate = self.plan.landing_rate
+        goal = np.array([*(seen.base - self.pose.base_offset), self._start_com[2]])
+        acceleration = rate**2 * (goal - seen.com) - 2.0 * rate * seen.velocity
+        acceleration[2] = max(acceleration[2], -0.8 * self.gravity)
+        velocity = seen.velocity + dt * acceleration
+        return self._stand(state, velocity, seen.com + dt * velocity, seen.base, dt)
+
+    def _write(self, state: BodyState, com_velocity, pose, spin, dt: float) -> list[Objective | SpinObjective]:
+        rate = (pose - self._pose) / dt
+        if np.abs(rate).max() > 5.0 / self._time_unit:
+            rate = np.zeros((3, 3))
+        self._pose = pose
+        return self.pose.objectives(
+            state,
+            com_velocity=com_velocity,
+            pose=pose,
+            pose_rate=rate,
+            spin=spin,
+            follow=6.0 / self._time_unit,
+            weights=self.weights,
+        )

@@ -1,0 +1,151 @@
+"""Measured quantities of a body and the family of poses that motions steer through."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from egs_warp.body import BodyState, SoftBody
+from egs_warp.locomotion import StepReport
+from egs_warp.objectives import Objective, SpinObjective, centre_of_mass_velocity, node_velocities
+from egs_warp.plane import Plane
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights of a motion's objectives; speeds are compared in sqrt(g H)."""
+
+    com: float = 1.0
+    spin: float = 1.0
+    pose: float = 0.02
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """The body as the controller sees it, in the frame of the ground: x forward, y left, z up."""
+
+    com: np.ndarray
+    """(3,) metres, relative to the ground frame's origin."""
+    velocity: np.ndarray
+    """(3,) m/s."""
+    base: np.ndarray
+    """(2,) metres: centre of the feet (nodes near the sole at rest)."""
+    sole_height: float
+    """Metres: lowest contact point above the plane."""
+    touching: bool
+    """Whether a contact force acts."""
+    heading: float
+    """Radians about z, from the start."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A right-handed frame on the plane: rows of ``axes`` are forward, left and up."""
+
+    axes: np.ndarray
+    """(3, 3)."""
+    origin: np.ndarray
+    """(3,) metres, on the plane."""
+
+    @classmethod
+    def on(cls, plane: Plane, forward: np.ndarray, below: np.ndarray) -> Ground:
+        """Frame with its origin on the plane under the point ``below``; ``forward`` is made horizontal."""
+        flat = forward - (forward @ plane.normal) * plane.normal
+        flat /= np.linalg.norm(flat)
+        axes = np.stack([flat, np.cross(plane.normal, flat), plane.normal])
+        return cls(axes, below - plane.heights(below) * plane.normal)
+
+    def local(self, points: np.ndarray) -> np.ndarray:
+        """World points (..., 3) to ground coordinates."""
+        return (points - self.origin) @ self.axes.T
+
+
+class PoseFamily:
+    """Affine poses of the rest shape, A = stretch along up, bulge across it, shear by the lean (DESIGN 9)."""
+
+    def __init__(self, body: SoftBody, ground: Ground, standing: np.ndarray) -> None:
+        self.body, self.ground = body, ground
+        local = ground.local(standing)
+        self._arms = (local - body.centre_of_mass(local)) @ ground.axes
+        self.standing_height = float(body.centre_of_mass(local)[2])
+        sole = local[:, 2] < local[:, 2].min() + 0.06 * body.height
+        self._sole = sole
+        self._sole_mass = body.node_mass * sole
+        self._standing = standing
+        self.base_offset = self._base(local) - body.centre_of_mass(local)[:2]
+
+    def _base(self, local: np.ndarray) -> np.ndarray:
+        return (self._sole_mass @ local / self._sole_mass.sum())[:2]
+
+    def measure(self, state: BodyState, report: StepReport | None) -> Measurement:
+        """What the controller sees."""
+        local = self.ground.local(state.positions)
+        forces = report.forces[:, 0].sum() if report is not None else self.body.weight
+        turn = self.ground.axes @ self.rotation(state.positions) @ self.ground.axes.T
+        return Measurement(
+            com=self.body.centre_of_mass(local),
+            velocity=self.ground.axes @ self.body.centre_of_mass(state.velocities),
+            base=self._base(local),
+            sole_height=report.min_gap if report is not None else 0.0,
+            touching=bool(forces > 1e-6 * self.body.weight),
+            heading=float(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])),
+        )
+
+    def rotation(self, positions: np.ndarray) -> np.ndarray:
+        """(3, 3) best-fit rotation from the standing pose, world axes."""
+        arms = positions - self.body.centre_of_mass(positions)
+        u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", self.body.node_mass, arms, self._arms))
+        return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+
+    def affine(self, stretch: float, lean: np.ndarray, heading: float = 0.0) -> np.ndarray:
+        """(3, 3) world matrix: ``stretch`` along up, half the volume kept by bulging, sheared by ``lean`` (2,), then turned."""
+        bulge = stretch**-0.25
+        local = np.diag([bulge, bulge, stretch])
+        local[:2, 2] = lean
+        local = Rotation.from_rotvec([0.0, 0.0, heading]).as_matrix() @ local
+        return self.ground.axes.T @ local @ self.ground.axes
+
+    def over_base(self, com: np.ndarray, base: np.ndarray, heading: float = 0.0) -> np.ndarray:
+        """(3, 3) the pose whose sole is flat at ``base`` (2,) while the centre of mass is at ``com`` (3,), ground coordinates."""
+        turned = Rotation.from_rotvec([0.0, 0.0, heading]).as_matrix()[:2, :2] @ self.base_offset
+        lean = (com[:2] - base + turned) / self.standing_height
+        lean = lean * min(1.0, 0.5 / max(float(np.linalg.norm(lean)), 1e-9))
+        stretch = float(np.clip(com[2] / self.standing_height, 0.6, 1.25))
+        return self.affine(stretch, lean, heading)
+
+    def objectives(
+        self,
+        state: BodyState,
+        *,
+        com_velocity: np.ndarray,
+        pose: np.ndarray,
+        pose_rate: np.ndarray,
+        spin: np.ndarray,
+        follow: float,
+        weights: Weights,
+    ) -> list[Objective | SpinObjective]:
+        """Objectives for a step: centre-of-mass velocity (3,) in ground axes, angular velocity ``spin`` (3,) in world axes, and a pose.
+
+        ``pose`` (3, 3) is approached at rate ``follow`` (1/s) on top of its own ``pose_rate`` (3, 3).
+        """
+        body = self.body
+        com = body.centre_of_mass(state.positions)
+        arms = state.positions - com
+        velocity = self.ground.axes.T @ com_velocity
+        wanted = self._arms @ pose.T
+        pose_velocity = velocity + self._arms @ pose_rate.T + follow * (wanted - arms)
+        momentum = body.inertia(state.positions) @ spin
+        return [
+            centre_of_mass_velocity(body, velocity, weights.com),
+            SpinObjective(momentum, weights.spin),
+            node_velocities(body, pose_velocity, weights.pose),
+        ]
+
+    def turn_towards(self, state: BodyState, pose: np.ndarray) -> np.ndarray:
+        """(3,) rotation vector, world axes, from the measured best-fit rotation to that of ``pose``."""
+        spread = np.einsum("n,ni,nj->ij", self.body.node_mass, self._arms @ pose.T, self._arms)
+        u, _, vt = np.linalg.svd(spread)
+        wanted = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+        return Rotation.from_matrix(wanted @ self.rotation(state.positions).T).as_rotvec()
