@@ -9,7 +9,7 @@ import warp as wp
 from egs_warp.camera import Camera
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
-from egs_warp.render import render
+from egs_warp.render import render, render_views
 from tests.render_twin import render_twin, rotation_matrices, sh_basis
 
 EYE = np.array([0.3, -0.4, -3.0])
@@ -135,6 +135,34 @@ def test_near_and_far_planes(device: str) -> None:
     assert_same(image, render_twin(values, camera))
     depth = image.depth.numpy()[image.alpha.numpy() > 0.01]
     assert 2.6 <= depth.min() < depth.max() <= 3.4
+
+
+def test_median_depth_and_normal(device: str) -> None:
+    values = random_scene(200, seed=11)
+    camera = camera_of()
+    image = render(cloud_of(values, device), camera, geometry=True)
+    twin = render_twin(values, camera)
+    assert np.abs(image.normal.numpy() - twin["normal"]).mean() < 1e-5
+    # A rounding in the transmittance can move the median to the next splat in a few pixels.
+    assert (np.abs(image.median_depth.numpy() - twin["median_depth"]) > 1e-4).mean() < 2e-3
+    assert (image.median_depth.numpy() > 0).mean() > 0.2
+
+
+def test_several_cameras_and_what_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    cloud = cloud_of(random_scene(50))
+    cameras = [camera_of(20, 30), camera_of(40, 10)]
+    images = render_views(cloud, cameras, background=(0, 0, 0))
+    for camera, image in zip(cameras, images, strict=True):
+        assert np.array_equal(image.colour.numpy(), render(cloud, camera, background=(0, 0, 0)).colour.numpy())
+
+    def no_memory(*_: object, **__: object) -> None:
+        raise RuntimeError("Failed to allocate 123 bytes on device 'cpu'")
+
+    monkeypatch.setattr("egs_warp.render.rasteriser.build_tile_lists", no_memory)
+    with pytest.raises(
+        UserError, match=r"^render: 50 Gaussians at 20 x 30 do not fit into the memory of cpu; render a"
+    ):
+        render(cloud, cameras[0])
 
 
 def test_rotating_the_object_equals_rotating_the_camera(device: str) -> None:

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.render_twin import render_twin
 
 from egs_warp.camera import Camera
 from egs_warp.errors import UserError
+from tests.render_twin import render_twin
 
 torch = pytest.importorskip("torch")
 from egs_warp.render.autograd import render_torch  # noqa: E402

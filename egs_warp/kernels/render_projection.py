@@ -6,6 +6,7 @@ from egs_warp.kernels.render_ellipse import LOG_255, LOW_PASS, tile_columns, til
 
 wp.set_module_options({"enable_backward": False})
 
+
 @wp.struct
 class View:
     """One pinhole camera in single precision."""

@@ -15,7 +15,7 @@ from egs_warp.gaussians import GaussianCloud
 from egs_warp.render.backward import backward
 from egs_warp.render.compositing import RenderedImage, composite
 from egs_warp.render.projection import ProjectedGaussians, project, view_from_camera
-from egs_warp.render.rasteriser import background_array
+from egs_warp.render.rasteriser import background_array, refusing_what_does_not_fit
 from egs_warp.render.threads import available_threads
 from egs_warp.render.tiles import TileLists, build_tile_lists
 
@@ -126,10 +126,11 @@ class _Render(torch.autograd.Function):
             )
             view = view_from_camera(camera)
             threads = options.threads
-            projected = project(cloud, view, antialiased=options.antialiased, threads=threads)
-            lists = build_tile_lists(projected, view, threads=threads)
-            behind = background_array(options.background, camera, cloud.device)
-            image = composite(projected, lists, view, background=behind, threads=threads)
+            with refusing_what_does_not_fit(cloud, camera):
+                projected = project(cloud, view, antialiased=options.antialiased, threads=threads)
+                lists = build_tile_lists(projected, view, threads=threads)
+                behind = background_array(options.background, camera, cloud.device)
+                image = composite(projected, lists, view, background=behind, threads=threads)
             ctx.forward_pass = _Forward(cloud, view, projected, lists, image)
             ctx.options = options
             ctx.want_pose = rotation is not None and (ctx.needs_input_grad[5] or ctx.needs_input_grad[6])

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
 
-from egs_warp.kernels.render_compositing import composite_pixel_kernel, composite_tile_kernel
+from egs_warp.gaussians import GaussianCloud
+from egs_warp.kernels.render_compositing import (
+    composite_geometry_kernel,
+    composite_tile_kernel,
+    splat_normals_kernel,
+)
 from egs_warp.kernels.render_projection import View
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.threads import launch_ranges
@@ -24,6 +29,10 @@ class RenderedImage:
     """(H, W) float32, 0 to 1: one minus the light that the background sends through."""
     depth: wp.array
     """(H, W) float32: alpha-weighted mean z-depth divided by alpha, scene units; 0 where alpha is 0."""
+    median_depth: wp.array | None = None
+    """(H, W) float32: z-depth of the splat that stops half of the light, 0 where none does; only if asked for."""
+    normal: wp.array | None = None
+    """(H, W) vec3 in camera axes: blended thinnest axis of each splat, on the camera's side; only if asked for."""
 
     def colour_srgb8(self) -> np.ndarray:
         """(H, W, 3) uint8 on the host, ready for PNG or video: clipped and quantised; SH colours are sRGB already."""
@@ -51,8 +60,11 @@ def composite(
     ]
     outputs = [colour, alpha, depth]
     if device.is_cuda:
+        # Imported here because this module holds CUDA code that a CPU cannot compile.
+        from egs_warp.kernels.render_cuda import composite_block_kernel
+
         wp.launch(
-            composite_pixel_kernel,
+            composite_block_kernel,
             dim=lists.tile_count * 256,
             inputs=inputs,
             outputs=outputs,
@@ -71,3 +83,41 @@ def composite(
         )
     shape = (height, width)
     return RenderedImage(colour.reshape(shape), alpha.reshape(shape), depth.reshape(shape))
+
+
+def add_geometry(
+    image: RenderedImage,
+    cloud: GaussianCloud,
+    projected: ProjectedGaussians,
+    lists: TileLists,
+    view: View,
+    *,
+    threads: int,
+) -> RenderedImage:
+    """``image`` with median depth and normals."""
+    device = cloud.device
+    width, height = int(view.width), int(view.height)
+    splat_normals = wp.empty(cloud.count, dtype=wp.vec3, device=device)
+    launch_ranges(
+        splat_normals_kernel,
+        cloud.count,
+        inputs=[view, cloud.means, cloud.rotations, cloud.log_scales],
+        outputs=[splat_normals],
+        device=device,
+        threads=threads,
+    )
+    median_depth = wp.empty(width * height, dtype=wp.float32, device=device)
+    normal = wp.empty(width * height, dtype=wp.vec3, device=device)
+    launch_ranges(
+        composite_geometry_kernel,
+        lists.tile_count * 256,
+        inputs=[
+            *(width, height, lists.tile_start, lists.gaussian_from_intersection),
+            *(projected.ellipse, projected.falloff, projected.colour_depth, splat_normals),
+        ],
+        outputs=[median_depth, normal],
+        device=device,
+        threads=threads,
+    )
+    shape = (height, width)
+    return replace(image, median_depth=median_depth.reshape(shape), normal=normal.reshape(shape))

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
 import numpy as np
 import warp as wp
 
 from egs_warp.camera import Camera
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
-from egs_warp.render.compositing import RenderedImage, composite
+from egs_warp.render.compositing import RenderedImage, add_geometry, composite
 from egs_warp.render.projection import project, view_from_camera
 from egs_warp.render.threads import available_threads
 from egs_warp.render.tiles import build_tile_lists
@@ -20,23 +25,48 @@ def render(
     *,
     background: tuple[float, float, float] | np.ndarray | wp.array = (1.0, 1.0, 1.0),
     antialiased: bool = False,
+    geometry: bool = False,
     threads: int | None = None,
 ) -> RenderedImage:
     """Picture of ``cloud`` through ``camera``, on the device of the cloud.
 
     ``background`` is one colour, or an image (H, W, 3) of this camera's size. ``antialiased`` dims each splat by what
     the 0.3 px
-    low-pass adds to its area. ``threads`` (a CPU only) defaults to the available cores; the picture does not depend
+    low-pass adds to its area. ``geometry`` adds
+    median depth and normals. ``threads`` (a CPU only) defaults to the available cores; the picture does not depend
     on it.
     Raises ``UserError`` for non-finite Gaussians, which it names, for an impossible camera and for a background of
     another size.
     """
     threads = threads or available_threads()
     view = view_from_camera(camera)
-    behind = background_array(background, camera, cloud.device)
-    projected = project(cloud, view, antialiased=antialiased, threads=threads)
-    lists = build_tile_lists(projected, view, threads=threads)
-    return composite(projected, lists, view, background=behind, threads=threads)
+    with refusing_what_does_not_fit(cloud, camera):
+        behind = background_array(background, camera, cloud.device)
+        projected = project(cloud, view, antialiased=antialiased, threads=threads)
+        lists = build_tile_lists(projected, view, threads=threads)
+        image = composite(projected, lists, view, background=behind, threads=threads)
+        if geometry:
+            image = add_geometry(image, cloud, projected, lists, view, threads=threads)
+    return image
+
+
+def render_views(cloud: GaussianCloud, cameras: Sequence[Camera], **options: Any) -> list[RenderedImage]:
+    """One picture of ``cloud`` for each camera; the options are those of ``render``."""
+    return [render(cloud, camera, **options) for camera in cameras]
+
+
+@contextmanager
+def refusing_what_does_not_fit(cloud: GaussianCloud, camera: Camera) -> Iterator[None]:
+    """Turn a failed allocation into a ``UserError`` that says how much there was to render."""
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        if isinstance(error, RuntimeError) and not re.search("alloc|out of memory", str(error), re.IGNORECASE):
+            raise
+        raise UserError(
+            f"render: {cloud.count} Gaussians at {camera.width} x {camera.height} do not fit into the memory of"
+            f" {cloud.device}; render a smaller image, fewer Gaussians, or on another device"
+        ) from error
 
 
 def background_array(background: object, camera: Camera, device: wp.Device) -> wp.array:

@@ -1,0 +1,387 @@
+"""Compositing on CUDA: one block of 256 threads for a tile, one warp for each of its 8 x 4 pixel parts.
+
+Splats pass through shared memory in batches. The thread that loads a splat also finds which of the eight parts its
+ellipse reaches, and each warp then visits only its own. CUDA C++ because Warp's tile functions offer neither ballots
+nor per-warp control flow; Warp compiles it at run time like every other kernel.
+"""
+
+import warp as wp
+
+from egs_warp.kernels.render_ellipse import TILE, TILE_PIXELS
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+# log2(255), and alpha = exp2(log2 opacity - a u^2 - v dy^2) with a and v in units of log2 e.
+_SHARED = """
+    constexpr float LOG2_E = 1.4426950408889634f;
+    constexpr float LOG2_255 = 7.994353436858858f;
+    constexpr float CUT = 1.0f / 255.0f;
+    constexpr float LIMIT = 0.999f;
+    constexpr float STOP = 1.0e-4f;
+    // Which of the eight parts (two columns by four rows of 8 x 4 pixels) does an ellipse reach?
+    auto parts_of = [](float mx, float my, float a, float shear, float v, float cut) -> unsigned {
+        // mx, my relative to the first pixel centre of the tile.
+        unsigned mask = 0;
+        float tip = shear * sqrtf(cut * a / (v * (v + a * shear * shear)));
+        float inv_a = 1.0f / a;
+        #pragma unroll
+        for (int row = 0; row < 4; ++row) {
+            float top = 4.0f * row - my, bottom = top + 3.0f;
+            float nearest = fminf(fmaxf(0.0f, top), bottom);
+            if (v * nearest * nearest <= cut) {
+                float dr = fminf(fmaxf(-tip, top), bottom), dl = fminf(fmaxf(tip, top), bottom);
+                float right = mx - shear * dr + sqrtf(fmaxf(cut - v * dr * dr, 0.0f) * inv_a) + 1.0e-3f;
+                float left = mx - shear * dl - sqrtf(fmaxf(cut - v * dl * dl, 0.0f) * inv_a) - 1.0e-3f;
+                if (left <= 7.0f && right >= 0.0f) mask |= 1u << (2 * row);
+                if (left <= 15.0f && right >= 8.0f) mask |= 2u << (2 * row);
+            }
+        }
+        return mask;
+    };
+"""
+
+_FORWARD = (
+    _SHARED
+    + """
+    __shared__ float4 s_shape[256];
+    __shared__ float4 s_colour[256];
+    __shared__ float2 s_falloff[256];
+    __shared__ unsigned char s_parts[256];
+    const int thread = threadIdx.x, lane = thread & 31, part = thread >> 5;
+    const float px = (float)((part & 1) * 8 + (lane & 7)), py = (float)((part >> 1) * 4 + (lane >> 3));
+    const bool inside = left + (int)px < width && top + (int)py < height;
+    const float4* shapes = (const float4*)ellipse.data;
+    const float2* falloffs = (const float2*)falloff.data;
+    const float4* colours = (const float4*)colour_depth.data;
+    float passing = 1.0f, r = 0.0f, g = 0.0f, b = 0.0f, d = 0.0f;
+    bool open = inside;
+    for (int base = start; base < end; base += 256) {
+        if (__syncthreads_count(open) == 0) break;
+        const int mine = base + thread;
+        unsigned parts = 0;
+        if (mine < end) {
+            const int id = gaussians.data[mine];
+            float4 shape = __ldg(shapes + id);
+            const float2 f = __ldg(falloffs + id);
+            s_colour[thread] = __ldg(colours + id);
+            shape.x -= (float)left + 0.5f;
+            shape.y -= (float)top + 0.5f;
+            shape.z *= LOG2_E;
+            const float v = f.x * LOG2_E, log_opacity = f.y * LOG2_E;
+            parts = parts_of(shape.x, shape.y, shape.z, shape.w, v, log_opacity + LOG2_255);
+            s_shape[thread] = shape;
+            s_falloff[thread] = make_float2(v, log_opacity);
+        }
+        s_parts[thread] = (unsigned char)parts;
+        __syncthreads();
+        const int batch = min(256, end - base);
+        for (int group = 0; group < batch; group += 32) {
+            if (!__any_sync(0xffffffffu, open)) break;
+            unsigned mine_here = __ballot_sync(0xffffffffu, (s_parts[group + lane] >> part) & 1u);
+            while (mine_here) {
+                const int k = group + __ffs(mine_here) - 1;
+                mine_here &= mine_here - 1;
+                const float4 shape = s_shape[k];
+                const float2 f = s_falloff[k];
+                const float dy = py - shape.y;
+                const float u = fmaf(shape.w, dy, px - shape.x);
+                const float power = f.y - f.x * dy * dy - shape.z * u * u;
+                if (open && power > -LOG2_255 - 1.0e-3f) {
+                    const float alpha = fminf(exp2f(power), LIMIT);
+                    const float after = passing * (1.0f - alpha);
+                    if (alpha >= CUT) {
+                        if (after <= STOP) {
+                            open = false;
+                        } else {
+                            const float weight = passing * alpha;
+                            const float4 c = s_colour[k];
+                            r = fmaf(weight, c.x, r);
+                            g = fmaf(weight, c.y, g);
+                            b = fmaf(weight, c.z, b);
+                            d = fmaf(weight, c.w, d);
+                            passing = after;
+                        }
+                    }
+                }
+            }
+        }
+    }
+    if (inside) {
+        const int pixel = (top + (int)py) * width + left + (int)px;
+        const wp::vec3 behind = background.data[background.shape[0] == 1 ? 0 : pixel];
+        const float opaque = 1.0f - passing;
+        colour.data[pixel] =
+            wp::vec3(fmaf(passing, behind[0], r), fmaf(passing, behind[1], g), fmaf(passing, behind[2], b));
+        alpha_out.data[pixel] = opaque;
+        depth.data[pixel] = opaque > 0.0f ? d / opaque : 0.0f;
+    }
+"""
+)
+
+_BACKWARD = (
+    _SHARED
+    + """
+    __shared__ float4 s_shape[256];
+    __shared__ float4 s_colour[256];
+    __shared__ float2 s_falloff[256];
+    __shared__ int s_slot[256];
+    __shared__ unsigned char s_parts[256];
+    __shared__ float4 s_gradient[256];
+    __shared__ float s_k[8][8][33];       // warp, splat of eight, pixel: alpha dL/dalpha
+    __shared__ float s_weight[8][8][33];  // and blending weight
+    __shared__ int s_chosen[8][8];
+    __shared__ float s_sum[8][32][11];    // warp, splat of 32, quantity
+    __shared__ unsigned s_visited[8];
+    const int thread = threadIdx.x, lane = thread & 31, part = thread >> 5;
+    const int part_x = (part & 1) * 8, part_y = (part >> 1) * 4;
+    const float px = (float)(part_x + (lane & 7)), py = (float)(part_y + (lane >> 3));
+    const bool inside = left + (int)px < width && top + (int)py < height;
+    const float4* shapes = (const float4*)ellipse.data;
+    const float2* falloffs = (const float2*)falloff.data;
+    const float4* colours = (const float4*)colour_depth.data;
+    float* out = (float*)moments.data;
+    float passing = 1.0f, rest = 0.0f;
+    float4 gradient = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+    if (inside) {
+        const int pixel = (top + (int)py) * width + left + (int)px;
+        gradient = ((const float4*)sum_gradient.data)[pixel];
+        rest = remaining.data[pixel];
+    }
+    s_gradient[thread] = gradient;
+    bool open = inside;
+    for (int base = start; base < end; base += 256) {
+        if (__syncthreads_count(open) == 0) break;
+        const int mine = base + thread;
+        unsigned parts = 0;
+        if (mine < end) {
+            const int id = gaussians.data[mine];
+            s_slot[thread] = slots.data[mine];
+            float4 shape = __ldg(shapes + id);
+            const float2 f = __ldg(falloffs + id);
+            s_colour[thread] = __ldg(colours + id);
+            shape.x -= (float)left + 0.5f;
+            shape.y -= (float)top + 0.5f;
+            shape.z *= LOG2_E;
+            const float v = f.x * LOG2_E, log_opacity = f.y * LOG2_E;
+            parts = parts_of(shape.x, shape.y, shape.z, shape.w, v, log_opacity + LOG2_255);
+            s_shape[thread] = shape;
+            s_falloff[thread] = make_float2(v, log_opacity);
+        }
+        s_parts[thread] = (unsigned char)parts;
+        __syncthreads();
+        const int batch = min(256, end - base);
+        for (int group = 0; group < batch; group += 32) {
+            unsigned todo = __ballot_sync(0xffffffffu, (s_parts[group + lane] >> part) & 1u);
+            unsigned visited = 0;
+            while (todo && __any_sync(0xffffffffu, open)) {
+                int chosen = 0;
+                while (todo && chosen < 8) {
+                    const int k = __ffs(todo) - 1;
+                    todo &= todo - 1;
+                    const float4 shape = s_shape[group + k];
+                    const float2 f = s_falloff[group + k];
+                    const float dy = py - shape.y;
+                    const float u = fmaf(shape.w, dy, px - shape.x);
+                    const float power = f.y - f.x * dy * dy - shape.z * u * u;
+                    float slope = 0.0f, weight = 0.0f;
+                    if (open && power > -LOG2_255 - 1.0e-3f) {
+                        const float unbounded = exp2f(power);
+                        const float alpha = fminf(unbounded, LIMIT);
+                        const float after = passing * (1.0f - alpha);
+                        if (alpha >= CUT) {
+                            if (after <= STOP) {
+                                open = false;
+                            } else {
+                                const float4 c = s_colour[group + k];
+                                const float value =
+                                    c.x * gradient.x + c.y * gradient.y + c.z * gradient.z + c.w * gradient.w;
+                                weight = passing * alpha;
+                                rest -= weight * value;
+                                if (unbounded <= LIMIT) slope = alpha * (passing * value - rest / (1.0f - alpha));
+                                passing = after;
+                            }
+                        }
+                    }
+                    if (__any_sync(0xffffffffu, weight > 0.0f)) {
+                        s_k[part][chosen][lane] = slope;
+                        s_weight[part][chosen][lane] = weight;
+                        if (lane == 0) s_chosen[part][chosen] = k;
+                        visited |= 1u << k;
+                        ++chosen;
+                    }
+                }
+                __syncwarp();
+                // Four lanes to a splat, one for each row of eight pixels.
+                const int splat = lane >> 2, row = lane & 3;
+                float q[10];
+                #pragma unroll
+                for (int i = 0; i < 10; ++i) q[i] = 0.0f;
+                if (splat < chosen) {
+                    const float4 shape = s_shape[group + s_chosen[part][splat]];
+                    const float dy = (float)(part_y + row) - shape.y;
+                    float u = fmaf(shape.w, dy, (float)part_x - shape.x);
+                    #pragma unroll
+                    for (int i = 0; i < 8; ++i) {
+                        const float k = s_k[part][splat][row * 8 + i];
+                        const float w = s_weight[part][splat][row * 8 + i];
+                        const float4 by = s_gradient[part * 32 + row * 8 + i];
+                        const float ku = k * u;
+                        q[0] += k;
+                        q[1] += ku;
+                        q[3] = fmaf(ku, u, q[3]);
+                        q[6] = fmaf(w, by.w, q[6]);
+                        q[7] = fmaf(w, by.x, q[7]);
+                        q[8] = fmaf(w, by.y, q[8]);
+                        q[9] = fmaf(w, by.z, q[9]);
+                        u += 1.0f;
+                    }
+                    q[2] = q[0] * dy;
+                    q[4] = q[1] * dy;
+                    q[5] = q[2] * dy;
+                }
+                #pragma unroll
+                for (int i = 0; i < 10; ++i) {
+                    q[i] += __shfl_xor_sync(0xffffffffu, q[i], 1);
+                    q[i] += __shfl_xor_sync(0xffffffffu, q[i], 2);
+                }
+                if (splat < chosen) {
+                    float* sum = s_sum[part][s_chosen[part][splat]];
+                    #pragma unroll
+                    for (int i = 0; i < 10; ++i)
+                        if ((i & 3) == row) sum[i] = q[i];
+                }
+                __syncwarp();
+            }
+            if (lane == 0) s_visited[part] = visited;
+            __syncthreads();
+            const int splats = min(32, batch - group);
+            for (int i = thread; i < splats * 10; i += 256) {
+                const int k = i / 10, quantity = i - 10 * k;
+                float total = 0.0f;
+                #pragma unroll
+                for (int p = 0; p < 8; ++p)
+                    if ((s_visited[p] >> k) & 1u) total += s_sum[p][k][quantity];
+                // (k, k u, k dy, k u^2), (k u dy, k dy^2, by depth, -), (by colour, -): entry 7 is skipped.
+                out[12 * (size_t)s_slot[group + k] + quantity + (quantity >= 7 ? 1 : 0)] = total;
+            }
+            __syncthreads();
+        }
+    }
+"""
+)
+
+
+@wp.func_native(_FORWARD)
+def composite_block(
+    width: wp.int32,
+    height: wp.int32,
+    left: wp.int32,
+    top: wp.int32,
+    start: wp.int32,
+    end: wp.int32,
+    gaussians: wp.array[wp.int32],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    colour_depth: wp.array[wp.vec4],
+    background: wp.array[wp.vec3],
+    colour: wp.array[wp.vec3],
+    alpha_out: wp.array[wp.float32],
+    depth: wp.array[wp.float32],
+):
+    """Front-to-back blend of one tile by its block."""
+    ...
+
+
+@wp.func_native(_BACKWARD)
+def composite_backward_block(
+    width: wp.int32,
+    height: wp.int32,
+    left: wp.int32,
+    top: wp.int32,
+    start: wp.int32,
+    end: wp.int32,
+    gaussians: wp.array[wp.int32],
+    slots: wp.array[wp.int32],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    colour_depth: wp.array[wp.vec4],
+    sum_gradient: wp.array[wp.vec4],
+    remaining: wp.array[wp.float32],
+    moments: wp.array2d[wp.vec4],
+):
+    """Gradient sums of one tile's splats by its block; the same walk and rounding as ``composite_block``."""
+    ...
+
+
+@wp.kernel
+def composite_block_kernel(
+    # In:
+    width: wp.int32,
+    height: wp.int32,
+    tile_start: wp.array[wp.int32],
+    gaussian_from_intersection: wp.array[wp.int32],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    colour_depth: wp.array[wp.vec4],
+    background: wp.array[wp.vec3],
+    # Out:
+    colour_out: wp.array[wp.vec3],
+    alpha_out: wp.array[wp.float32],
+    depth_out: wp.array[wp.float32],
+):
+    """A block of 256 threads composites one tile; the same picture as ``composite_pixel_kernel``."""
+    tile = wp.tid() / TILE_PIXELS
+    columns = (width + TILE - 1) / TILE
+    composite_block(
+        width,
+        height,
+        (tile % columns) * TILE,
+        (tile / columns) * TILE,
+        tile_start[tile],
+        tile_start[tile + 1],
+        gaussian_from_intersection,
+        ellipse,
+        falloff,
+        colour_depth,
+        background,
+        colour_out,
+        alpha_out,
+        depth_out,
+    )
+
+
+@wp.kernel
+def composite_backward_block_kernel(
+    # In:
+    width: wp.int32,
+    height: wp.int32,
+    tile_start: wp.array[wp.int32],
+    gaussian_from_intersection: wp.array[wp.int32],
+    slot_from_intersection: wp.array[wp.int32],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    colour_depth: wp.array[wp.vec4],
+    sum_gradient: wp.array[wp.vec4],
+    remaining: wp.array[wp.float32],
+    # Out:
+    moments_out: wp.array2d[wp.vec4],
+):
+    """A block of 256 threads does for one tile what ``composite_backward_tile_kernel`` does with one."""
+    tile = wp.tid() / TILE_PIXELS
+    columns = (width + TILE - 1) / TILE
+    composite_backward_block(
+        width,
+        height,
+        (tile % columns) * TILE,
+        (tile / columns) * TILE,
+        tile_start[tile],
+        tile_start[tile + 1],
+        gaussian_from_intersection,
+        slot_from_intersection,
+        ellipse,
+        falloff,
+        colour_depth,
+        sum_gradient,
+        remaining,
+        moments_out,
+    )
