@@ -113,6 +113,19 @@ class LocomotionStepper:
         """No contacts, muscles at rest."""
         return StepMemory(np.zeros(0, int), np.zeros((0, 3)), np.zeros(self.muscles.segment_count))
 
+    @staticmethod
+    def matched_forces(memory: StepMemory, points: np.ndarray) -> np.ndarray:
+        """(n, 3) last step's forces of ``points`` (n,), zero for new ones."""
+        forces = np.zeros((len(points), 3))
+        _, now, before = np.intersect1d(points, memory.points, return_indices=True)
+        forces[now] = memory.forces[before]
+        return forces
+
+    @staticmethod
+    def remember(result: ContactStepResult, activations: np.ndarray) -> StepMemory:
+        """What the next step wants to know."""
+        return StepMemory(result.contacts.points, result.forces, activations)
+
     def advance(
         self,
         state: BodyState,
@@ -137,7 +150,7 @@ class LocomotionStepper:
         clock = _Clock()
         step = ImplicitStep(self.body, state, dt, self._factorisation, drag=self.settings.drag)
         columns = self._columns.sparse(state.positions)
-        points = self._choose_contacts(step, memory)
+        points = self.choose_contacts(step, memory)
         clock.lap("detect")
         contacts = self.detector.contact_set(points, state.positions)
         passive = self._gravity_force + (columns @ memory.activations).reshape(-1, 3)
@@ -146,7 +159,7 @@ class LocomotionStepper:
             contacts,
             passive,
             state.velocities,
-            normal_forces=_matched(memory, points)[:, 0],
+            normal_forces=self.matched_forces(memory, points)[:, 0],
             friction=self.geometry.friction,
             push_out_cap=self.settings.push_out_cap * self.speed_scale,
         )
@@ -165,7 +178,8 @@ class LocomotionStepper:
         clock.lap("correct")
         return self._finish(step, state, plan, result, clock)
 
-    def _choose_contacts(self, step: ImplicitStep, memory: StepMemory) -> np.ndarray:
+    def choose_contacts(self, step: ImplicitStep, memory: StepMemory) -> np.ndarray:
+        """(n,) points that the step may bring to a plane, well-conditioned, last step's first (DESIGN 7)."""
         ballistic = step.state.velocities + step.dt * self.body.gravity
         gaps, _ = self.detector.gaps(step.end_positions(ballistic))
         candidates = self.detector.candidates(memory.points, gaps, self.settings.near * self.body.height)
@@ -223,7 +237,7 @@ class LocomotionStepper:
         velocities, spin = conserve_angular_momentum(self.body, state, end, result.velocities, external, step.dt)
         gaps, _ = self.detector.gaps(end)
         after = BodyState(end, velocities, state.time + step.dt)
-        memory = StepMemory(result.contacts.points, result.forces, plan.activations)
+        memory = self.remember(result, plan.activations)
         clock.lap("audit")
         report = StepReport(
             state=after,
@@ -271,14 +285,6 @@ class _Clock:
         now = time.perf_counter()
         self.milliseconds[name] = 1e3 * (now - self._last)
         self._last = now
-
-
-def _matched(memory: StepMemory, points: np.ndarray) -> np.ndarray:
-    """(n, 3) last step's forces of ``points``, zero for new ones."""
-    forces = np.zeros((len(points), 3))
-    _, now, before = np.intersect1d(points, memory.points, return_indices=True)
-    forces[now] = memory.forces[before]
-    return forces
 
 
 def _frame_forces(prediction: Prediction) -> np.ndarray:

@@ -1,0 +1,111 @@
+"""A body, its muscles and its ground, ready to move; and the loop that moves it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from egs_warp.body import BodyState, SoftBody
+from egs_warp.contact import ContactGeometry
+from egs_warp.contact_step import contact_step
+from egs_warp.dynamics import Factorisation, ImplicitStep
+from egs_warp.locomotion import LocomotionStepper, StepReport
+from egs_warp.objectives import Objective, SpinObjective
+from egs_warp.trajectory import Trajectory, record
+
+FRAME_RATE = 60
+"""Frames of a video, 1/s."""
+
+
+class Motion(Protocol):
+    """Anything that writes objectives from the measured state."""
+
+    def objectives(
+        self, state: BodyState, report: StepReport | None, dt: float
+    ) -> list[Objective | SpinObjective]:
+        """Objectives of the step of ``dt`` seconds that starts at ``state``; ``report`` is of the step before."""
+        ...
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A finished simulation."""
+
+    trajectory: Trajectory
+    reports: tuple[StepReport, ...]
+    frames: np.ndarray
+    """(n,) index into the trajectory's times for each frame of the video."""
+
+
+def steps_per_frame(body: SoftBody) -> int:
+    """Solver steps a frame, so that a step is at most sqrt(H / g) / 19 (DESIGN 4)."""
+    longest = np.sqrt(body.height / np.linalg.norm(body.gravity)) / 19.0
+    return int(np.ceil(1.0 / (FRAME_RATE * longest) - 1e-3))
+
+
+def settle(stepper: LocomotionStepper) -> BodyState:
+    """The body at rest on its ground: contact steps from rest, long ones, each begun without velocity."""
+    body = stepper.body
+    state = BodyState(body.mesh.nodes.copy(), np.zeros_like(body.mesh.nodes))
+    dt = 0.25 * np.sqrt(body.height / np.linalg.norm(body.gravity))
+    force = body.node_mass[:, None] * body.gravity
+    factorisation = Factorisation(body)
+    memory = stepper.initial_memory()
+    for _ in range(12):
+        step = ImplicitStep(body, state, dt, factorisation)
+        points = stepper.choose_contacts(step, memory)
+        result = contact_step(
+            step,
+            stepper.detector,
+            points,
+            force,
+            start_velocities=np.zeros_like(state.positions),
+            start_forces=stepper.matched_forces(memory, points),
+            push_out_cap=0.0,
+            penetration_tolerance=stepper.settings.penetration_tolerance * body.height,
+        )
+        moved = dt * float(np.abs(result.velocities).max())
+        state = BodyState(step.end_positions(result.velocities), np.zeros_like(state.positions))
+        memory = stepper.remember(result, memory.activations)
+        if moved < 2e-4 * body.height:
+            break
+    return state
+
+
+def simulate(
+    stepper: LocomotionStepper,
+    geometry: ContactGeometry,
+    start: BodyState,
+    motion: Motion,
+    *,
+    frames: int,
+    progress: Callable[[int], None] = lambda frame: None,
+) -> Simulation:
+    """Run ``frames`` frames of ``motion`` from ``start``; ``progress`` is told each finished frame."""
+    body = stepper.body
+    per_frame = steps_per_frame(body)
+    dt = 1.0 / (FRAME_RATE * per_frame)
+    state, memory = start, stepper.initial_memory()
+    reports: list[StepReport] = []
+    shown = [0]
+    for frame in range(frames):
+        for _ in range(per_frame):
+            objectives = motion.objectives(state, reports[-1] if reports else None, dt)
+            state, memory, done = stepper.advance(state, memory, objectives, dt)
+            reports.extend(done)
+        shown.append(len(reports))
+        progress(frame)
+    gaps, _ = stepper.detector.gaps(start.positions)
+    trajectory = record(
+        body,
+        geometry,
+        start,
+        float(gaps.min()),
+        reports,
+        drag=stepper.settings.drag,
+        segments=stepper.muscles.segment_count,
+    )
+    return Simulation(trajectory, tuple(reports), np.array(shown))
