@@ -394,9 +394,7 @@ def test_sog_version_1_by_hand(tmp_path: Path) -> None:
         np.testing.assert_allclose(cloud.log_scales.numpy(), [[-1.0, 2.0, -1.8], [-1, -2, -3]], atol=1e-6)
         np.testing.assert_allclose(cloud.sh.numpy()[0, 0], [0.0, 1.0, 0.2], atol=1e-6)
         np.testing.assert_allclose(cloud.opacity_logits.numpy(), [-1.0, -5.0], atol=1e-6)
-        np.testing.assert_allclose(
-            cloud.sh.numpy()[0, 1:], [[-1, 1, -0.6], [-0.2, 0.2, 0.6], [1, -1, -1]], atol=1e-6
-        )
+        np.testing.assert_allclose(cloud.sh.numpy()[0, 1:], [[-1, 1, -0.6], [-0.2, 0.2, 0.6], [1, -1, -1]], atol=1e-6)
 
 
 def unzip(sog: Path, folder: Path) -> dict:
@@ -427,7 +425,11 @@ def test_streamed_sog_reads_the_finest_level(tmp_path: Path) -> None:
         {"lods": {"0": {"file": 0, "offset": 20, "count": 30}}},
         {"children": [{"lods": {"0": {"file": 1, "offset": 10, "count": 20}}}]},
     ]
-    tree = {"lodLevels": 2, "filenames": [f"{n}/meta.json" for n in ("0_0", "0_1", "1_0")], "tree": {"children": leaves}}
+    tree = {
+        "lodLevels": 2,
+        "filenames": [f"{n}/meta.json" for n in ("0_0", "0_1", "1_0")],
+        "tree": {"children": leaves},
+    }
     (tmp_path / "streamed" / "lod-meta.json").write_text(json.dumps(tree))
     capture = read_capture(tmp_path / "streamed", device="cpu")
     expected = np.concatenate([fine.means.numpy(), other.means.numpy()[10:]])

@@ -46,7 +46,9 @@ def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
     anything that cannot be read.
     """
     source = Path(path)
-    raw = _decode(source)
+    # Values too large for float32 and broken floats need no warning: check_finite names them.
+    with np.errstate(over="ignore", invalid="ignore"):
+        raw = _decode(source)
     check_finite(raw, source)
     infinite = np.isinf(raw.opacity_logits)
     cloud = GaussianCloud.from_numpy(

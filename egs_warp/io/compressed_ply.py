@@ -98,8 +98,7 @@ def _fields(words: np.ndarray, fields: tuple[tuple[int, int], ...]) -> np.ndarra
 
 
 def _between(limits: np.ndarray, fraction: np.ndarray) -> np.ndarray:
-    with np.errstate(over="ignore", invalid="ignore"):
-        return limits[:, 0] * (1.0 - fraction) + limits[:, 1] * fraction
+    return limits[:, 0] * (1.0 - fraction) + limits[:, 1] * fraction
 
 
 def _decode_rest(rows: np.ndarray, count: int, source: Path) -> np.ndarray:

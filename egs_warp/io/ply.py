@@ -160,11 +160,10 @@ def _read_text(data: bytes, header: PlyHeader, wanted: list[str], source: Path) 
 def columns_as_float32(rows: np.ndarray, names: list[str]) -> np.ndarray:
     """(n, len(names)) float32 from the named fields of a structured array."""
     out = np.empty((len(rows), len(names)), np.float32)
-    with np.errstate(over="ignore", invalid="ignore"):
-        for start in range(0, len(rows), _BLOCK_ROWS):
-            block = rows[start : start + _BLOCK_ROWS]
-            for column, name in enumerate(names):
-                out[start : start + _BLOCK_ROWS, column] = block[name]
+    for start in range(0, len(rows), _BLOCK_ROWS):
+        block = rows[start : start + _BLOCK_ROWS]
+        for column, name in enumerate(names):
+            out[start : start + _BLOCK_ROWS, column] = block[name]
     return out
 
 

@@ -122,8 +122,7 @@ def decode_sog(meta_json: bytes, files: SogFiles) -> RawCapture:
     low, high = (pixels(name)[:, :3].astype(np.float64) for name in meta.files("means", 2))
     mins, maxs = meta.numbers("means", "mins", count=3), meta.numbers("means", "maxs", count=3)
     logs = mins + (maxs - mins) * ((low + 256.0 * high) / 65535.0)
-    with np.errstate(over="ignore"):
-        means = (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)
+    means = (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32)
     quaternions = pixels(*meta.files("quats", 1))
     scales = pixels(*meta.files("scales", 1))[:, :3]
     colours = pixels(*meta.files("sh0", 1))

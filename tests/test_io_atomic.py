@@ -1,0 +1,85 @@
+"""Files appear whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from egs_warp.errors import UserError
+from egs_warp.io import atomic_write, writable_folder
+
+
+def test_a_finished_file_replaces_the_old_one(tmp_path: Path) -> None:
+    target = tmp_path / "a.json"
+    target.write_text("old")
+    with atomic_write(target) as temporary:
+        assert temporary.parent == tmp_path and temporary.suffix == ".json"
+        temporary.write_text("new")
+        assert target.read_text() == "old"
+    assert target.read_text() == "new"
+    assert os.listdir(tmp_path) == ["a.json"]
+    # As readable for others as any new file is: mkstemp's files are not.
+    (tmp_path / "plain").write_text("")
+    assert target.stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_an_unfinished_file_leaves_the_old_one(error: type[BaseException], tmp_path: Path) -> None:
+    target = tmp_path / "a.json"
+    target.write_text("old")
+    with pytest.raises(error), atomic_write(target) as temporary:
+        temporary.write_text("ne")
+        raise error
+    assert target.read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.json"]
+
+
+def test_a_full_disk_is_one_line_and_leaves_the_old_file(tmp_path: Path) -> None:
+    target = tmp_path / "a.json"
+    target.write_text("old")
+    with pytest.raises(UserError) as caught, atomic_write(target) as temporary:
+        temporary.write_text("ne")
+        raise OSError(28, "No space left on device")
+    assert str(caught.value) == f"{target}: cannot be written (No space left on device); choose another place"
+    assert target.read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.json"]
+
+
+def test_a_link_is_written_through(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link.ply").symlink_to(tmp_path / "real" / "a.ply")
+    with atomic_write(tmp_path / "link.ply") as temporary:
+        temporary.write_text("new")
+    assert (tmp_path / "real" / "a.ply").read_text() == "new"
+    assert (tmp_path / "link.ply").is_symlink()
+
+
+def test_places_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for path, message in (
+        (tmp_path / "missing" / "a", f"its folder does not exist; create {tmp_path / 'missing'} first"),
+        (tmp_path, "is a folder; give the name of a file"),
+    ):
+        with pytest.raises(UserError) as caught, atomic_write(path):
+            raise AssertionError("must not come here")
+        assert str(caught.value) == f"{path}: {message}"
+    for path, reason in ((tmp_path / "file", "File exists"), (tmp_path / "file" / "a", "Not a directory")):
+        with pytest.raises(UserError) as caught:
+            writable_folder(path)
+        assert str(caught.value) == f"{path}: cannot write into this folder ({reason}); choose another one"
+
+
+def test_a_read_only_folder(tmp_path: Path) -> None:
+    if os.geteuid() == 0:
+        pytest.skip("root may write anywhere")
+    tmp_path.chmod(0o500)
+    with pytest.raises(UserError, match="cannot write into this folder"):
+        writable_folder(tmp_path)
+
+
+def test_writable_folder_is_made_and_left_empty(tmp_path: Path) -> None:
+    assert writable_folder(str(tmp_path / "a" / "b")) == tmp_path / "a" / "b"
+    assert writable_folder(tmp_path / "a" / "b").is_dir()
+    assert os.listdir(tmp_path / "a" / "b") == []
