@@ -243,7 +243,7 @@ def test_spz_by_hand(version: int, tmp_path: Path) -> None:
     else:
         # Components x, y, z, w; w is the largest (index 3); a sign bit and nine bits of |c| sqrt(2) for each other one.
         rotation = struct.pack("<I", 3 << 30 | 0 << 20 | (512 | round(0.6 * 2**0.5 * 511)) << 10 | 0)
-    body = struct.pack("<IIIBBBB", 0x5053474E, version, 1, 1, 12, 0, 0) + position
+    body = struct.pack("<IIIBBBB", 0x5053474E, version, 1, 1, 12, version == 3, 0) + position
     body += bytes([51]) + bytes([255, 128, 0]) + bytes([160, 96, 0]) + rotation
     body += bytes([128 + 64, 128, 128, 128, 128 - 64, 128, 128, 128, 0])
     (tmp_path / "a.spz").write_bytes(gzip.compress(body))
@@ -257,6 +257,7 @@ def test_spz_by_hand(version: int, tmp_path: Path) -> None:
     np.testing.assert_allclose(cloud.sh.numpy()[0, 0], [0.5 / 0.15, (128 / 255 - 0.5) / 0.15, -0.5 / 0.15], rtol=1e-5)
     np.testing.assert_array_equal(cloud.sh.numpy()[0, 1:], [[0.5, 0, 0], [0, -0.5, 0], [0, 0, -1.0]])
     np.testing.assert_array_equal(capture.up, [0.0, 1.0, 0.0])
+    assert capture.antialiased == (version == 3)
     assert_same_bits(read_capture(tmp_path / "plain.spz", device="cpu").cloud, cloud)
 
 

@@ -35,6 +35,8 @@ class Capture:
     opacity in a byte have none: their 0 and 255 stand for ranges."""
     up: np.ndarray | None
     """(3,) float64 unit vector where the format defines which way is up, else None."""
+    antialiased: bool
+    """Whether the file says that it was trained with antialiasing (.spz and SOG can): draw it with that, too."""
     notes: tuple[str, ...]
     """What was left out or repaired, for the user."""
 
@@ -59,7 +61,7 @@ def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
         raw.sh,
         device=device,
     )
-    return Capture(cloud, source, raw.format, int(np.count_nonzero(infinite)), raw.up, raw.notes)
+    return Capture(cloud, source, raw.format, int(np.count_nonzero(infinite)), raw.up, raw.antialiased, raw.notes)
 
 
 def _decode(source: Path) -> RawCapture:

@@ -81,15 +81,19 @@ def decode_compressed_ply(data: bytes, header: PlyHeader, source: Path) -> RawCa
     log_scales = _between(limits[:, 1], _fields(words["packed_scale"], _POSITION_FIELDS))
     colours = _between(limits[:, 2], _fields(words["packed_color"], _COLOUR_FIELDS))
     three = (_fields(words["packed_rotation"], _ROTATION_FIELDS) - 0.5) * np.sqrt(2.0)
-    f_dc = (colours - 0.5) / SH_C0
-    f_rest = _decode_rest(elements["sh"], len(vertex), source) if "sh" in elements else np.empty((len(vertex), 0))
+    f_dc = ((colours - 0.5) / SH_C0).astype(np.float32)
+    f_rest = (
+        _decode_rest(elements["sh"], len(vertex), source)
+        if "sh" in elements
+        else np.empty((len(vertex), 0), np.float32)
+    )
     return RawCapture(
         format="compressed .ply",
         means=means.astype(np.float32),
         rotations=largest_restored(three, words["packed_rotation"] >> np.uint32(30)),
         log_scales=log_scales.astype(np.float32),
         opacity_logits=logits_from_bytes(words["packed_color"] & np.uint32(255)),
-        sh=coefficient_major(f_dc, f_rest).astype(np.float32),
+        sh=coefficient_major(f_dc, f_rest),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +35,9 @@ class RawCapture:
     """(n, (degree+1)^2, 3) float32, coefficient-major."""
     up: np.ndarray | None = None
     """(3,) float64 unit, where the format defines which way is up."""
-    notes: tuple[str, ...] = field(default=())
+    antialiased: bool = False
+    """Whether the file says that it was trained with antialiasing."""
+    notes: tuple[str, ...] = ()
     """What the reader left out or repaired, for the user."""
 
 

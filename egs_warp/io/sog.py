@@ -134,16 +134,19 @@ def decode_sog(meta_json: bytes, files: SogFiles) -> RawCapture:
         log_scales = _lerp(meta, "scales", scales)
         f_dc, opacity_logits = np.split(_lerp(meta, "sh0", colours), [3], axis=1)
         opacity_logits = opacity_logits[:, 0]
-    rest = _decode_rest(meta, files, version, pixels) if meta.entry("shN") is not None else np.empty((count, 0, 3))
-    notes = ("trained with antialiasing, drawn without",) if meta.entry("antialias") is True else ()
+    rest = (
+        _decode_rest(meta, files, version, pixels)
+        if meta.entry("shN") is not None
+        else np.empty((count, 0, 3), np.float32)
+    )
     return RawCapture(
         format=f"SOG version {version}",
         means=means,
         rotations=_decode_quaternions(quaternions),
         log_scales=log_scales.astype(np.float32),
         opacity_logits=opacity_logits.astype(np.float32),
-        sh=np.concatenate([f_dc[:, None], rest], axis=1).astype(np.float32),
-        notes=notes,
+        sh=np.concatenate([f_dc.astype(np.float32)[:, None], rest], axis=1),
+        antialiased=meta.entry("antialias") is True,
     )
 
 

@@ -30,7 +30,7 @@ _MAGIC = 0x5053474E
 _HEADER = struct.Struct("<IIIBBBB")
 _COLOUR_SCALE = 0.15
 _FRACTIONAL_BITS = 12
-_HAS_EXTENSIONS = 2
+_ANTIALIASED, _HAS_EXTENSIONS = 1, 2
 _LONGEST_EXTENSION = 1 << 20
 _SH_COUNTS = (0, 3, 8, 15, 24)
 _KEPT_SH_COUNT = 15
@@ -127,7 +127,7 @@ def _decode(body: bytes, layout: _Layout) -> RawCapture:
         fixed = ((low << 8 | middle << 16 | high << 24) >> 8).astype(np.float64)
         means = np.ldexp(fixed, -layout.fractional_bits).astype(np.float32)
     rest = (sh.reshape(layout.count, layout.sh_count, 3)[:, :_KEPT_SH_COUNT] - np.float32(128.0)) / np.float32(128.0)
-    f_dc = (colours / 255.0 - 0.5) / _COLOUR_SCALE
+    f_dc = ((colours / 255.0 - 0.5) / _COLOUR_SCALE).astype(np.float32)
     notes = []
     if layout.sh_count > _KEPT_SH_COUNT:
         notes.append("SH band 4 left out (degree 0 to 3 is drawn)")
@@ -139,8 +139,9 @@ def _decode(body: bytes, layout: _Layout) -> RawCapture:
         rotations=_quaternions(rotations, layout.version),
         log_scales=scales.astype(np.float32) / np.float32(16.0) - np.float32(10.0),
         opacity_logits=logits_from_bytes(alphas[:, 0]),
-        sh=np.concatenate([f_dc[:, None], rest], axis=1).astype(np.float32),
+        sh=np.concatenate([f_dc[:, None], rest], axis=1),
         up=np.array([0.0, 1.0, 0.0]),
+        antialiased=bool(layout.flags & _ANTIALIASED),
         notes=tuple(notes),
     )
 

@@ -67,7 +67,7 @@ def _part(files: SogFiles, name: str, ranges: list[tuple[int, int]]) -> RawCaptu
         log_scales=part.log_scales[chosen],
         opacity_logits=part.opacity_logits[chosen],
         sh=part.sh[chosen],
-        notes=part.notes,
+        antialiased=part.antialiased,
     )
 
 
@@ -81,5 +81,6 @@ def _joined(parts: list[RawCapture]) -> RawCapture:
         log_scales=np.concatenate([part.log_scales for part in parts]),
         opacity_logits=np.concatenate([part.opacity_logits for part in parts]),
         sh=np.concatenate(sh),
-        notes=("finest level of detail", *dict.fromkeys(note for part in parts for note in part.notes)),
+        antialiased=all(part.antialiased for part in parts),
+        notes=("finest level of detail",),
     )
