@@ -10,6 +10,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import warp as wp
@@ -26,9 +27,9 @@ def launch_rows(
 ) -> None:
     """Run ``kernel`` over rows 0 .. ``row_count`` - 1.
 
-    The kernel's first parameter must be ``first_row: wp.int32`` and its row ``first_row + wp.tid()``; each row may write
-    only what belongs to it, so that the result does not depend on how rows are shared out. ``inputs`` and ``outputs`` are
-    the remaining parameters.
+    The kernel's first parameter must be ``first_row: wp.int32`` and its row ``first_row + wp.tid()``; each row may
+    write only what belongs to it, so that the result does not depend on how rows are shared out. ``inputs`` and
+    ``outputs`` are the remaining parameters.
     """
     thread_count = os.cpu_count() or 1
     chunk_count = min(thread_count * _CHUNKS_PER_THREAD, row_count // _MIN_ROWS_PER_CHUNK)
@@ -36,13 +37,13 @@ def launch_rows(
         wp.launch(kernel, dim=row_count, inputs=[0, *inputs], outputs=list(outputs), device=device)
         return
     # Compiling is not safe from several threads at once.
-    kernel.module.load(device)
+    kernel.module.load(device, block_dim=1)
     bounds = [row_count * chunk // chunk_count for chunk in range(chunk_count + 1)]
 
     def launch_chunk(first: int, last: int) -> None:
         wp.launch(kernel, dim=last - first, inputs=[first, *inputs], outputs=list(outputs), device=device)
 
-    for finished in [_pool().submit(launch_chunk, a, b) for a, b in zip(bounds, bounds[1:], strict=False)]:
+    for finished in [_pool().submit(launch_chunk, a, b) for a, b in pairwise(bounds)]:
         finished.result()
 
 

@@ -76,7 +76,7 @@ def test_points_are_located_as_by_brute_force(device: str) -> None:
 def test_weights_reproduce_points_and_shared_faces_take_the_lowest_tet(device: str) -> None:
     """Eq. (2): sum 1 and sum w x = p to rounding, far from the origin too; ties go to the lowest index."""
     mesh = blob(seed=3)
-    far = TetMesh(mesh.nodes + [100.0, -200.0, 50.0], mesh.tets)
+    far = TetMesh(mesh.nodes + np.array([100.0, -200.0, 50.0]), mesh.tets)
     corners = far.nodes[far.tets]
     points = np.concatenate([far.nodes, corners[:, :3].mean(axis=1), 0.5 * (corners[:, 0] + corners[:, 3])])
     embedding = embed_points(far, points, device=device)

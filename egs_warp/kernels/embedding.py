@@ -10,10 +10,16 @@ wp.set_module_options({"enable_backward": False})
 INSIDE_TOLERANCE = wp.constant(wp.float64(1.0e-10))
 DISTANCE_TOLERANCE = wp.constant(wp.float64(1.0e-9))
 
+ARM_SHORTENING = wp.constant(wp.float64(0.6))
+MAX_ARM_LENGTHS = wp.constant(10)
+
 
 @wp.func
 def barycentric_weights(corner: Vec3, inverse_edges: Mat33, point: Vec3) -> Vec4:
-    """Weights of ``point`` on a tetrahedron's corners (Eq. 2), of sum 1; ``inverse_edges`` inverts [x1-x0, x2-x0, x3-x0]."""
+    """Weights of ``point`` on a tetrahedron's corners (Eq. 2), of sum 1.
+
+    ``inverse_edges`` is the inverse of [x1-x0, x2-x0, x3-x0].
+    """
     w = inverse_edges * (point - corner)
     return Vec4(real(1.0) - w[0] - w[1] - w[2], w[0], w[1], w[2])
 
@@ -82,6 +88,75 @@ def distance_to_box(lower: wp.vec3, upper: wp.vec3, point: wp.vec3) -> wp.float3
     return wp.length(outside)
 
 
+@wp.func
+def locate(
+    point: Vec3,
+    extent: real,
+    tets: wp.array[wp.vec4i],
+    nodes: wp.array[Vec3],
+    inverse_edges: wp.array[Mat33],
+    box_lowers: wp.array[wp.vec3],
+    box_uppers: wp.array[wp.vec3],
+    boxes: wp.uint64,
+    surface: wp.uint64,
+) -> wp.vec2i:
+    """Index of the tetrahedron that contains the point, or of the nearest one, and whether it is inside (1 or 0).
+
+    Among several tetrahedra that contain the point, the lowest index is taken. Among several that are equally near (the
+    point faces a shared edge or node), the one from which the weights extrapolate least, then the lowest index.
+    """
+    coarse = single(point)
+
+    best = wp.int32(-1)
+    candidate = wp.int32(0)
+    query = wp.bvh_query_aabb(boxes, coarse, coarse)
+    while wp.bvh_query_next(query, candidate):
+        if best < 0 or candidate < best:
+            weights = barycentric_weights(nodes[tets[candidate][0]], inverse_edges[candidate], point)
+            if least_weight(weights) >= -INSIDE_TOLERANCE:
+                best = candidate
+    if best >= 0:
+        return wp.vec2i(best, 1)
+
+    # The float32 distance to the surface bounds the search; slack covers its rounding.
+    slack = 1.0e-5 * (wp.length(coarse) + wp.float32(extent))
+    radius = wp.length(coarse) + 2.0 * wp.float32(extent)
+    on_surface = wp.mesh_query_point_no_sign(surface, coarse, radius)
+    if on_surface.result:
+        nearest_surface = wp.mesh_eval_position(surface, on_surface.face, on_surface.u, on_surface.v)
+        radius = wp.length(nearest_surface - coarse)
+    radius = radius + slack
+    reach = wp.vec3(radius)
+
+    nearest = real(1.0e300)
+    query = wp.bvh_query_aabb(boxes, coarse - reach, coarse + reach)
+    while wp.bvh_query_next(query, candidate):
+        if distance_to_box(box_lowers[candidate], box_uppers[candidate], coarse) <= radius:
+            corners = tets[candidate]
+            x0 = nodes[corners[0]]
+            weights = barycentric_weights(x0, inverse_edges[candidate], point)
+            distance = distance_to_tet(x0, nodes[corners[1]], nodes[corners[2]], nodes[corners[3]], weights, point)
+            if distance < nearest:
+                nearest = distance
+                radius = wp.min(radius, wp.float32(distance) + slack)
+
+    limit = nearest * (real(1.0) + DISTANCE_TOLERANCE) + DISTANCE_TOLERANCE * extent
+    reach = wp.vec3(radius)
+    least = real(-1.0e300)
+    query = wp.bvh_query_aabb(boxes, coarse - reach, coarse + reach)
+    while wp.bvh_query_next(query, candidate):
+        if distance_to_box(box_lowers[candidate], box_uppers[candidate], coarse) <= radius:
+            corners = tets[candidate]
+            x0 = nodes[corners[0]]
+            weights = barycentric_weights(x0, inverse_edges[candidate], point)
+            distance = distance_to_tet(x0, nodes[corners[1]], nodes[corners[2]], nodes[corners[3]], weights, point)
+            low = least_weight(weights)
+            if distance <= limit and (low > least or (low == least and candidate < best)):
+                least = low
+                best = candidate
+    return wp.vec2i(best, 0)
+
+
 @wp.kernel
 def locate_points_kernel(
     first_row: wp.int32,
@@ -102,68 +177,103 @@ def locate_points_kernel(
     weights_out: wp.array[Vec4],
     inside_out: wp.array[wp.bool],
 ):
-    """Containing tetrahedron of each point, or the nearest one, with barycentric weights (Eq. 2).
-
-    ``nodes`` and all boxes are relative to ``origin``. Among several tetrahedra that contain the point, the lowest index
-    is taken. Among several that are equally near (the point faces a shared edge or node), the one from which the weights
-    extrapolate least, then the lowest index.
-    """
+    """Tetrahedron and barycentric weights of each point (Eq. 2); ``nodes`` and all boxes are relative to ``origin``."""
     row = first_row + wp.tid()
     point = points[row] - origin
-    coarse = single(point)
+    found = locate(point, extent, tets, nodes, inverse_edges, box_lowers, box_uppers, boxes, surface)
+    tet = found[0]
+    tets_out[row] = tet
+    nodes_out[row] = tets[tet]
+    weights_out[row] = barycentric_weights(nodes[tets[tet][0]], inverse_edges[tet], point)
+    inside_out[row] = found[1] == 1
 
-    best = wp.int32(-1)
-    candidate = wp.int32(0)
-    query = wp.bvh_query_aabb(boxes, coarse, coarse)
-    while wp.bvh_query_next(query, candidate):
-        if best < 0 or candidate < best:
-            weights = barycentric_weights(nodes[tets[candidate][0]], inverse_edges[candidate], point)
-            if least_weight(weights) >= -INSIDE_TOLERANCE:
-                best = candidate
-    inside_out[row] = best >= 0
 
-    if best < 0:
-        # The float32 distance to the surface bounds the search; slack covers its rounding.
-        slack = 1.0e-5 * (wp.length(coarse) + wp.float32(extent))
-        radius = wp.length(coarse) + 2.0 * wp.float32(extent)
-        on_surface = wp.mesh_query_point_no_sign(surface, coarse, radius)
-        if on_surface.result:
-            nearest_surface = wp.mesh_eval_position(surface, on_surface.face, on_surface.u, on_surface.v)
-            radius = wp.length(nearest_surface - coarse)
-        radius = radius + slack
-        reach = wp.vec3(radius)
+@wp.func
+def axes_from_quaternion(q: wp.vec4) -> Mat33:
+    """Rotation matrix [r1 r2 r3] of a w, x, y, z quaternion; normalised in float64, as float32 storage is not exact."""
+    d = Vec4(real(q[0]), real(q[1]), real(q[2]), real(q[3]))
+    d = d / wp.length(d)
+    w = d[0]
+    x = d[1]
+    y = d[2]
+    z = d[3]
+    one = real(1.0)
+    two = real(2.0)
+    return Mat33(
+        one - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y),
+        two * (x * y + w * z), one - two * (x * x + z * z), two * (y * z - w * x),
+        two * (x * z - w * y), two * (y * z + w * x), one - two * (x * x + y * y),
+    )  # fmt: skip
 
-        nearest = real(1.0e300)
-        query = wp.bvh_query_aabb(boxes, coarse - reach, coarse + reach)
-        while wp.bvh_query_next(query, candidate):
-            if distance_to_box(box_lowers[candidate], box_uppers[candidate], coarse) <= radius:
-                corners = tets[candidate]
-                x0 = nodes[corners[0]]
-                weights = barycentric_weights(x0, inverse_edges[candidate], point)
-                distance = distance_to_tet(x0, nodes[corners[1]], nodes[corners[2]], nodes[corners[3]], weights, point)
-                if distance < nearest:
-                    nearest = distance
-                    radius = wp.min(radius, wp.float32(distance) + slack)
 
-        limit = nearest * (real(1.0) + DISTANCE_TOLERANCE) + DISTANCE_TOLERANCE * extent
-        reach = wp.vec3(radius)
-        least = real(-1.0e300)
-        query = wp.bvh_query_aabb(boxes, coarse - reach, coarse + reach)
-        while wp.bvh_query_next(query, candidate):
-            if distance_to_box(box_lowers[candidate], box_uppers[candidate], coarse) <= radius:
-                corners = tets[candidate]
-                x0 = nodes[corners[0]]
-                weights = barycentric_weights(x0, inverse_edges[candidate], point)
-                distance = distance_to_tet(x0, nodes[corners[1]], nodes[corners[2]], nodes[corners[3]], weights, point)
-                low = least_weight(weights)
-                if distance <= limit and (low > least or (low == least and candidate < best)):
-                    least = low
-                    best = candidate
+@wp.kernel
+def embed_gaussians_kernel(
+    first_row: wp.int32,
+    # In:
+    means: wp.array[wp.vec3],
+    rotations: wp.array[wp.vec4],
+    log_scales: wp.array[wp.vec3],
+    gamma: real,
+    least_arm: real,
+    origin: Vec3,
+    extent: real,
+    tets: wp.array[wp.vec4i],
+    nodes: wp.array[Vec3],
+    inverse_edges: wp.array[Mat33],
+    box_lowers: wp.array[wp.vec3],
+    box_uppers: wp.array[wp.vec3],
+    boxes: wp.uint64,
+    surface: wp.uint64,
+    # Out:
+    tets_out: wp.array[wp.int32],
+    nodes_out: wp.array[wp.vec4i],
+    weights_out: wp.array[Vec4],
+    inside_out: wp.array[wp.bool],
+    arms_out: wp.array2d[wp.float32],
+):
+    """Point k of Gaussian i is row 7 i + k: the mean, three ends m + arm r_j, three ends m - arm r_j (Eq. 3).
 
-    corners = tets[best]
-    tets_out[row] = best
-    nodes_out[row] = corners
-    weights_out[row] = barycentric_weights(nodes[corners[0]], inverse_edges[best], point)
+    An arm whose end would need weights outside [-1, 2] is shortened until it does not. An arm for which no length will
+    do (the mean itself lies far outside) takes the tetrahedron of the mean.
+    """
+    row = first_row + wp.tid()
+    gaussian = row // 7
+    k = row - 7 * gaussian
+    m = means[gaussian]
+    mean = Vec3(real(m[0]), real(m[1]), real(m[2])) - origin
+    point = mean
+    found = wp.vec2i(0, 0)
+    if k == 0:
+        found = locate(point, extent, tets, nodes, inverse_edges, box_lowers, box_uppers, boxes, surface)
+    else:
+        axis = (k - 1) % 3
+        axes = axes_from_quaternion(rotations[gaussian])
+        direction = Vec3(axes[0, axis], axes[1, axis], axes[2, axis])
+        if k > 3:
+            direction = -direction
+        arm = wp.float32(wp.max(gamma * wp.exp(real(log_scales[gaussian][axis])), least_arm))
+        attempt = wp.int32(0)
+        searching = wp.bool(True)
+        while searching:
+            point = mean + real(arm) * direction
+            found = locate(point, extent, tets, nodes, inverse_edges, box_lowers, box_uppers, boxes, surface)
+            weights = barycentric_weights(nodes[tets[found[0]][0]], inverse_edges[found[0]], point)
+            greatest = wp.max(wp.max(weights[0], weights[1]), wp.max(weights[2], weights[3]))
+            searching = least_weight(weights) < real(-1.0) or greatest > real(2.0)
+            attempt += 1
+            if searching:
+                if attempt == MAX_ARM_LENGTHS or real(arm) * ARM_SHORTENING < least_arm:
+                    found = locate(mean, extent, tets, nodes, inverse_edges, box_lowers, box_uppers, boxes, surface)
+                    found[1] = 0
+                    searching = wp.bool(False)
+                else:
+                    arm = arm * wp.float32(ARM_SHORTENING)
+        arms_out[gaussian, k - 1] = arm
+    tet = found[0]
+    tets_out[row] = tet
+    nodes_out[row] = tets[tet]
+    weights_out[row] = barycentric_weights(nodes[tets[tet][0]], inverse_edges[tet], point)
+    inside_out[row] = found[1] == 1
 
 
 @wp.kernel

@@ -1,0 +1,147 @@
+"""Carry Gaussians with their cage (Eq. 14, 15) and measure how much the motion bends each (Eq. 16)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from egs_warp.embedding import GaussianEmbedding
+from egs_warp.errors import UserError
+from egs_warp.gaussians import GaussianCloud
+from egs_warp.kernels import deformation as kernels
+from egs_warp.kernels.spherical_harmonics import rotate_sh_kernel
+from egs_warp.launching import launch_rows
+from egs_warp.precision import Vec3
+
+MAX_STRETCH = 1.5
+"""An arm may be stretched this many times more than the matter at its two ends; beyond that it would be a spike."""
+
+
+@dataclass(frozen=True)
+class DeformedGaussians:
+    """Gaussians as the cage has carried them."""
+
+    cloud: GaussianCloud
+    """(n,) at their new places. ``opacity_logits`` is the rest cloud's own array."""
+    turns: wp.array
+    """(n,) mat33, the rotation R_polar of F by which each Gaussian and its colour were turned."""
+
+
+@dataclass(frozen=True)
+class BendMeasure:
+    """How far a motion is from affine across each Gaussian: the most of each over all frames given."""
+
+    bend_degrees: np.ndarray
+    """(n,) theta of Eq. (16)."""
+    curl_degrees: np.ndarray
+    """(n, 3) angle between the two ends of each axis: by how much the motion bends or twists along it."""
+    fit_error: np.ndarray
+    """(n, 3) metres: what the affine F leaves out along each axis, at one standard deviation from the mean."""
+
+
+class Deformer:
+    """Carries one cloud, frame after frame, into the same output arrays."""
+
+    def __init__(self, cloud: GaussianCloud, embedding: GaussianEmbedding, *, max_stretch: float = MAX_STRETCH) -> None:
+        self.rest = cloud
+        self.embedding = embedding
+        self.max_stretch = max_stretch
+        self._degree = cloud.sh_degree
+        with wp.ScopedDevice(cloud.device):
+            self._gradients = wp.empty(len(embedding.cage.mesh.tets), dtype=wp.mat33)
+            self._deformed = DeformedGaussians(
+                GaussianCloud(
+                    means=wp.empty_like(cloud.means),
+                    rotations=wp.empty_like(cloud.rotations),
+                    log_scales=wp.empty_like(cloud.log_scales),
+                    opacity_logits=cloud.opacity_logits,
+                    # Band 0 never changes; without higher bands the colour is the rest cloud's own.
+                    sh=wp.clone(cloud.sh) if self._degree else cloud.sh,
+                ),
+                turns=wp.empty(cloud.count, dtype=wp.mat33),
+            )
+
+    def deform(self, positions: wp.array | np.ndarray) -> DeformedGaussians:
+        """The cloud for node positions (N, 3) or (N,) vec3d, metres (Eq. 14, 15); the next call overwrites it."""
+        deformed, cloud = self._deformed, self._deformed.cloud
+        launch_rows(
+            kernels.deform_kernel,
+            self.rest.count,
+            inputs=[self.rest.rotations, self.rest.log_scales, *self._carrying_inputs(positions)],
+            outputs=[cloud.means, cloud.rotations, cloud.log_scales, deformed.turns],
+            device=self.rest.device,
+        )
+        if self._degree:
+            launch_rows(
+                rotate_sh_kernel,
+                self.rest.count,
+                inputs=[deformed.turns, self.rest.sh, self._degree],
+                outputs=[cloud.sh],
+                device=self.rest.device,
+            )
+        return deformed
+
+    def measure_bend(self, frames: Iterable[wp.array | np.ndarray]) -> BendMeasure:
+        """The most that any of ``frames``, each as ``positions`` of ``deform``, bends each Gaussian (Eq. 16)."""
+        count = self.rest.count
+        with wp.ScopedDevice(self.rest.device):
+            bend = wp.zeros(count, dtype=wp.float32)
+            curl = wp.zeros(count, dtype=wp.vec3)
+            error = wp.zeros(count, dtype=wp.vec3)
+        for positions in frames:
+            launch_rows(
+                kernels.measure_bend_kernel,
+                count,
+                inputs=[self.rest.rotations, self.rest.log_scales, *self._carrying_inputs(positions)],
+                outputs=[bend, curl, error],
+                device=self.rest.device,
+            )
+        return BendMeasure(bend.numpy(), curl.numpy(), error.numpy())
+
+    def _carrying_inputs(self, positions: wp.array | np.ndarray) -> list[object]:
+        cage = self.embedding.cage
+        uploaded = _node_positions(positions, len(cage.mesh.nodes), self.rest.device)
+        launch_rows(
+            kernels.tet_gradients_kernel,
+            len(cage.mesh.tets),
+            inputs=[uploaded, cage.tets, cage.inverse_edges],
+            outputs=[self._gradients],
+            device=self.rest.device,
+        )
+        points = self.embedding.points
+        return [
+            uploaded,
+            cage.tets,
+            self._gradients,
+            points.tets,
+            points.weights,
+            self.embedding.arms,
+            self.max_stretch,
+        ]
+
+
+def deform(
+    cloud: GaussianCloud,
+    embedding: GaussianEmbedding,
+    positions: wp.array | np.ndarray,
+    *,
+    max_stretch: float = MAX_STRETCH,
+) -> DeformedGaussians:
+    """Carry ``cloud`` with its cage to node ``positions``, (N, 3) or (N,) vec3d, metres (Eq. 14, 15).
+
+    For many frames keep a ``Deformer``, which reuses its output arrays. Raises ``UserError`` if the node count differs
+    from the cage's.
+    """
+    return Deformer(cloud, embedding, max_stretch=max_stretch).deform(positions)
+
+
+def _node_positions(positions: wp.array | np.ndarray, node_count: int, device: wp.Device) -> wp.array:
+    if len(positions) != node_count:
+        raise UserError(f"deformation: {len(positions)} node positions for a cage of {node_count} nodes")
+    if isinstance(positions, wp.array) and positions.dtype == Vec3 and positions.device == device:
+        return positions
+    values = positions.numpy() if isinstance(positions, wp.array) else np.asarray(positions, dtype=np.float64)
+    return wp.array(values, dtype=Vec3, device=device)

@@ -1,0 +1,222 @@
+"""Eq. (14) to (16): Gaussians carried by the cage."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import Delaunay
+from scipy.spatial.transform import Rotation
+
+from egs_warp.deformation import Deformer, deform
+from egs_warp.embedding import CageLocator, embed_gaussians
+from egs_warp.errors import UserError
+from egs_warp.gaussians import GaussianCloud
+from egs_warp.tetmesh import TetMesh
+
+
+def box(cells: tuple[int, int, int] = (3, 3, 3), size: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> TetMesh:
+    """A box cage, slightly jittered inside so that Delaunay's choice is unique."""
+    axes = [np.linspace(0, length, count + 1) for count, length in zip(cells, size, strict=True)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    jitter = np.random.default_rng(0).uniform(-0.06, 0.06, nodes.shape) * (np.array(size) / cells)
+    nodes = nodes + np.where((nodes > 1e-9) & (nodes < np.array(size) - 1e-9), jitter, 0.0)
+    tets = Delaunay(nodes).simplices
+    corners = nodes[tets]
+    volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) * np.prod(cells) / np.prod(size)
+    return TetMesh.oriented(nodes, tets[volume > 1e-2])
+
+
+def random_cloud(
+    count: int, *, seed: int = 0, degree: int = 3, scale: float = 0.1, device: str = "cpu"
+) -> GaussianCloud:
+    rng = np.random.default_rng(seed)
+    return GaussianCloud.from_numpy(
+        rng.uniform(0.1, 0.9, (count, 3)),
+        rng.normal(size=(count, 4)),
+        np.log(scale) + rng.uniform(-4.0, 0.0, (count, 3)),
+        rng.normal(size=count),
+        rng.normal(size=(count, (degree + 1) ** 2, 3)),
+        device=device,
+    )
+
+
+def matrices(cloud: GaussianCloud) -> np.ndarray:
+    """(n, 3, 3) float64 rotation matrices [r1 r2 r3]."""
+    return Rotation.from_quat(cloud.rotations.numpy().astype(np.float64)[:, [1, 2, 3, 0]]).as_matrix()
+
+
+def covariances(cloud: GaussianCloud) -> np.ndarray:
+    factor = matrices(cloud) * np.exp(cloud.log_scales.numpy().astype(np.float64))[:, None]
+    return factor @ factor.transpose(0, 2, 1)
+
+
+def colours(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """(n, 3) linear colour seen along unit ``direction`` (n, 3), as the INRIA renderer evaluates it."""
+    x, y, z = direction.T
+    basis = [
+        0.28209479177387814 + 0 * x,
+        -0.4886025119029199 * y,
+        0.4886025119029199 * z,
+        -0.4886025119029199 * x,
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2 * z * z - x * x - y * y),
+        -1.0925484305920792 * x * z,
+        0.5462742152960396 * (x * x - y * y),
+        -0.5900435899266435 * y * (3 * x * x - y * y),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
+        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+        -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
+        1.445305721320277 * z * (x * x - y * y),
+        -0.5900435899266435 * x * (x * x - 3 * y * y),
+    ]
+    return np.einsum("kn,nkc->nc", np.array(basis[: sh.shape[1]]), sh)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_turned_cage_turns_shape_and_colour_exactly(device: str, degree: int) -> None:
+    """Eq. (14), (15): under a rotation the covariance turns, and every band of colour seen from a turned eye stays."""
+    mesh, cloud = box(), random_cloud(300, degree=degree, device=device)
+    turn = Rotation.from_rotvec([0.7, -2.1, 0.4]).as_matrix()
+    result = deform(cloud, embed_gaussians(cloud, mesh), mesh.nodes @ turn.T + [3.0, 1.0, -2.0])
+    np.testing.assert_allclose(result.cloud.means.numpy(), cloud.means.numpy() @ turn.T + [3, 1, -2], atol=1e-5)
+    np.testing.assert_allclose(np.exp(result.cloud.log_scales.numpy() - cloud.log_scales.numpy()), 1.0, atol=2e-5)
+    np.testing.assert_allclose(matrices(result.cloud), turn @ matrices(cloud), atol=1e-5)
+    views = np.random.default_rng(5).normal(size=(300, 3))
+    views /= np.linalg.norm(views, axis=1, keepdims=True)
+    seen = colours(cloud.sh.numpy().astype(np.float64), views)
+    turned = colours(result.cloud.sh.numpy().astype(np.float64), views @ turn.T)
+    np.testing.assert_allclose(turned, seen, atol=2e-5)
+
+
+def test_an_affine_cage_carries_flat_splats_exactly(device: str) -> None:
+    """Eq. (14), (15): Sigma' = F Sigma F^T to float32, for scales from e^-16 to a quarter of the body; det R = +1, and
+    axes matched in order and sign to the carried ones."""
+    mesh, rng = box((5, 5, 5)), np.random.default_rng(3)
+    count = 400
+    cloud = GaussianCloud.from_numpy(
+        rng.uniform(0.0, 1.0, (count, 3)),
+        rng.normal(size=(count, 4)),
+        rng.uniform(-16.0, np.log(0.25), (count, 3)),
+        rng.normal(size=count),
+        rng.normal(size=(count, 1, 3)),
+        device=device,
+    )
+    gradient = np.array([[1.3, 0.4, 0.0], [-0.2, 0.8, 0.3], [0.1, 0.0, 1.1]])
+    embedding = embed_gaussians(cloud, mesh)
+    weights = embedding.points.weights.numpy().reshape(count, 7, 4)
+    shortened = embedding.arms.numpy() < 2.99 * np.tile(np.exp(cloud.log_scales.numpy()), (1, 2))
+    assert 0.01 < shortened.mean() < 0.6
+    assert weights[:, 1:].min() >= -1.0 and weights.max() <= 2.0
+    result = deform(cloud, embedding, mesh.nodes @ gradient.T).cloud
+    expected = np.sort(
+        np.linalg.svd(gradient @ matrices(cloud) * np.exp(cloud.log_scales.numpy().astype(float))[:, None])[1]
+    )
+    scales = np.exp(result.log_scales.numpy().astype(float))
+    np.testing.assert_allclose(np.sort(scales), expected, rtol=3e-4)
+    sigma, exact = covariances(result), gradient @ covariances(cloud) @ gradient.T
+    error = np.abs(sigma - exact).max(axis=(1, 2)) / np.abs(exact).max(axis=(1, 2))
+    assert error.max() < 2e-5
+    np.testing.assert_allclose(np.linalg.det(matrices(result)), 1.0, atol=1e-6)
+    left, _, right = np.linalg.svd(gradient)
+    carried = left @ right @ matrices(cloud)
+    assert np.einsum("nij,nij->nj", matrices(result), carried).sum(axis=1).min() > 2.0
+
+
+def bent(points: np.ndarray, radius: float) -> np.ndarray:
+    """A bar along x bent onto a circle of ``radius`` around the y axis."""
+    angle = points[:, 0] / radius
+    r = radius - (points[:, 2] - 0.2)
+    return np.stack([r * np.sin(angle), points[:, 1], radius - r * np.cos(angle)], axis=1)
+
+
+def test_bend_angle_is_the_angle_between_the_arms(device: str) -> None:
+    """Eq. (16): a needle whose two arms are bent by 40 degrees reads 40, not half; one across it reads nothing."""
+    mesh = box((24, 2, 2), (4.0, 0.4, 0.4))
+    scales = np.log([[0.4, 0.004, 0.004], [0.004, 0.05, 0.004], [0.4, 0.4 / 3, 0.004]])
+    means = np.tile([2.0, 0.2, 0.2], (3, 1))
+    cloud = GaussianCloud.from_numpy(
+        means, np.tile([1, 0, 0, 0], (3, 1)), scales, np.zeros(3), np.zeros((3, 1, 3)), device=device
+    )
+    # A chord over the arc of one arm (1.2 m) turns by half that arc on each side: 1.2 / radius in all.
+    radius = 1.2 / np.radians(40.0)
+    deformer = Deformer(cloud, embed_gaussians(cloud, mesh))
+    measure = deformer.measure_bend([mesh.nodes, bent(mesh.nodes, radius)])
+    assert measure.bend_degrees[0] == pytest.approx(40.0, abs=1.0)
+    assert measure.bend_degrees[1] < 4.0
+    assert measure.bend_degrees[2] == pytest.approx(40.0, rel=0.15)
+    assert np.argmax(measure.fit_error[0]) == 0
+    # The sagitta of the arc at one standard deviation, s^2 / 2 radius, is what an affine map leaves out.
+    assert measure.fit_error[0, 0] == pytest.approx(0.4**2 / (2 * radius), rel=0.1)
+    assert measure.curl_degrees[0, 0] == pytest.approx(40.0, abs=1.0)
+    assert deformer.measure_bend([mesh.nodes]).bend_degrees.max() < 0.05
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    noise=st.sampled_from([0.0, 0.05, 0.3, 2.0]),
+    flatten=st.sampled_from([1.0, 1e-3, 0.0, -1.0]),
+    reach=st.sampled_from([0.0, 0.5, 30.0]),
+)
+def test_no_spike_and_no_nan_whatever_the_cage_does(seed: int, noise: float, flatten: float, reach: float) -> None:
+    """Eq. (14): inverted and flattened tetrahedra, far ends, means far outside, scales from e^-16 to a quarter of the
+    body: all finite, proper rotations, and no Gaussian is stretched more than the matter around it allows."""
+    rng = np.random.default_rng(seed)
+    mesh, count = box((2, 2, 2)), 60
+    cloud = GaussianCloud.from_numpy(
+        rng.uniform(-reach, 1.0 + reach, (count, 3)),
+        rng.normal(size=(count, 4)),
+        rng.uniform(-16.0, np.log(0.25), (count, 3)),
+        np.zeros(count),
+        rng.normal(size=(count, 4, 3)),
+        device="cpu",
+    )
+    cage = CageLocator(mesh, device="cpu")
+    positions = mesh.nodes * [1.0, 1.0, flatten] + noise * rng.normal(size=mesh.nodes.shape)
+    embedding = embed_gaussians(cloud, cage)
+    result = deform(cloud, embedding, positions)
+    for values in (result.cloud.means, result.cloud.rotations, result.cloud.log_scales, result.cloud.sh, result.turns):
+        assert np.isfinite(values.numpy()).all()
+    np.testing.assert_allclose(np.linalg.norm(result.cloud.rotations.numpy(), axis=1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.det(result.turns.numpy()), 1.0, atol=1e-4)
+    corners, rest = positions[mesh.tets], mesh.nodes[mesh.tets]
+    edges, rest_edges = ((x[:, 1:] - x[:, :1]).transpose(0, 2, 1) for x in (corners, rest))
+    stretch = np.linalg.svd(edges @ np.linalg.inv(rest_edges))[1][:, 0]
+    around = stretch[embedding.points.tets.numpy().reshape(count, 7)].max(axis=1)
+    grown = np.exp(result.cloud.log_scales.numpy().max(axis=1) - cloud.log_scales.numpy().max(axis=1))
+    # Columns are held to 1.5 times the stretch; three of them can conspire to sqrt(3) times that.
+    assert (grown <= 1.5 * np.sqrt(3.0) * around + 1e-3).all()
+
+
+def test_scale_and_rotation_do_not_flicker() -> None:
+    """Eq. (15): under a slow twist by 360 degrees with stretch, axes keep their order and move a little every frame."""
+    mesh, cloud = box(), random_cloud(200, degree=0)
+    # Twice the stretch apart: nearer ones may rightly swap as fast as they please.
+    scales = np.random.default_rng(1).permuted(np.tile(np.log([0.06, 0.03, 0.01]), (200, 1)), axis=1)
+    cloud = GaussianCloud.from_numpy(
+        cloud.means.numpy(),
+        cloud.rotations.numpy(),
+        scales,
+        cloud.opacity_logits.numpy(),
+        cloud.sh.numpy(),
+        device="cpu",
+    )
+    deformer = Deformer(cloud, embed_gaussians(cloud, mesh))
+    previous = None
+    for angle in np.linspace(0.0, 2 * np.pi, 121):
+        turn = Rotation.from_rotvec([0, 0, angle]).as_matrix()
+        stretch = np.diag([1.0 + 0.2 * np.sin(angle), 1.0, 1.0 - 0.1 * np.sin(angle)])
+        frame = matrices(deformer.deform(mesh.nodes @ (turn @ stretch).T).cloud)
+        if previous is not None:
+            assert np.einsum("nij,nij->nj", frame, previous).min() > np.cos(np.radians(10.0))
+        previous = frame
+
+
+def test_a_wrong_number_of_nodes_is_refused() -> None:
+    mesh, cloud = box(), random_cloud(5)
+    with pytest.raises(UserError, match=r"^deformation: 7 node positions for a cage of 64 nodes$"):
+        deform(cloud, embed_gaussians(cloud, mesh), np.zeros((7, 3)))
