@@ -169,7 +169,7 @@ def test_pixels_share_memory_and_bad_tensors_are_named() -> None:
     image = render_torch(*tensors, camera)
     twin = render_twin(values, camera)
     np.testing.assert_allclose(image.colour.numpy(), twin["colour"], atol=1e-5)
-    assert image.visible.all()
+    assert image.visible().all()
     with pytest.raises(
         UserError, match=r"rotations is \(7, 3\) torch.float32 on cpu, expected \(7, 4\) float32 on cpu"
     ):

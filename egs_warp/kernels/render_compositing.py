@@ -13,13 +13,16 @@ def store_pixel(
     pixel: wp.int32,
     sums: wp.vec4,
     transmittance: wp.float32,
+    flat_background: wp.vec3,
     background: wp.array[wp.vec3],
     colour: wp.array[wp.vec3],
     alpha: wp.array[wp.float32],
     depth: wp.array[wp.float32],
 ):
-    """Lay the sums over the background (one colour, or one per pixel) and divide the depth by alpha."""
-    behind = background[wp.where(background.shape[0] == 1, 0, pixel)]
+    """Lay the sums over the background (an image, or one colour where there is none) and divide the depth by alpha."""
+    behind = flat_background
+    if background.shape[0] > 0:
+        behind = background[pixel]
     opaque = 1.0 - transmittance
     colour[pixel] = wp.vec3(sums[0], sums[1], sums[2]) + transmittance * behind
     alpha[pixel] = opaque
@@ -40,6 +43,7 @@ def composite_tile_kernel(
     ellipse: wp.array[wp.vec4],
     falloff: wp.array[wp.vec2],
     colour_depth: wp.array[wp.vec4],
+    flat_background: wp.vec3,
     background: wp.array[wp.vec3],
     # Out:
     colour_out: wp.array[wp.vec3],
@@ -101,7 +105,9 @@ def composite_tile_kernel(
         for column in range(tile_width):
             i = row * TILE + column
             pixel = (top + row) * width + left + column
-            store_pixel(pixel, sums[i], wp.abs(passing[i]), background, colour_out, alpha_out, depth_out)
+            store_pixel(
+                pixel, sums[i], wp.abs(passing[i]), flat_background, background, colour_out, alpha_out, depth_out
+            )
 
 
 @wp.kernel

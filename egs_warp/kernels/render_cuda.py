@@ -55,25 +55,35 @@ _FORWARD = (
     const float4* colours = (const float4*)colour_depth.data;
     float passing = 1.0f, r = 0.0f, g = 0.0f, b = 0.0f, d = 0.0f;
     bool open = inside;
+    // The loads of the next batch are under way while this one is blended.
+    float4 next_shape, next_colour;
+    float2 next_falloff;
+    auto fetch = [&](int i) {
+        if (i < end) {
+            const int id = gaussians.data[i];
+            next_shape = __ldg(shapes + id);
+            next_falloff = __ldg(falloffs + id);
+            next_colour = __ldg(colours + id);
+        }
+    };
+    fetch(start + thread);
     for (int base = start; base < end; base += 256) {
         if (__syncthreads_count(open) == 0) break;
-        const int mine = base + thread;
         unsigned parts = 0;
-        if (mine < end) {
-            const int id = gaussians.data[mine];
-            float4 shape = __ldg(shapes + id);
-            const float2 f = __ldg(falloffs + id);
-            s_colour[thread] = __ldg(colours + id);
+        if (base + thread < end) {
+            float4 shape = next_shape;
             shape.x -= (float)left + 0.5f;
             shape.y -= (float)top + 0.5f;
             shape.z *= LOG2_E;
-            const float v = f.x * LOG2_E, log_opacity = f.y * LOG2_E;
+            const float v = next_falloff.x * LOG2_E, log_opacity = next_falloff.y * LOG2_E;
             parts = parts_of(shape.x, shape.y, shape.z, shape.w, v, log_opacity + LOG2_255);
             s_shape[thread] = shape;
+            s_colour[thread] = next_colour;
             s_falloff[thread] = make_float2(v, log_opacity);
         }
         s_parts[thread] = (unsigned char)parts;
         __syncthreads();
+        fetch(base + 256 + thread);
         const int batch = min(256, end - base);
         for (int group = 0; group < batch; group += 32) {
             if (!__any_sync(0xffffffffu, open)) break;
@@ -108,7 +118,7 @@ _FORWARD = (
     }
     if (inside) {
         const int pixel = (top + (int)py) * width + left + (int)px;
-        const wp::vec3 behind = background.data[background.shape[0] == 1 ? 0 : pixel];
+        const wp::vec3 behind = background.shape[0] > 0 ? background.data[pixel] : flat_background;
         const float opaque = 1.0f - passing;
         colour.data[pixel] =
             wp::vec3(fmaf(passing, behind[0], r), fmaf(passing, behind[1], g), fmaf(passing, behind[2], b));
@@ -149,26 +159,38 @@ _BACKWARD = (
     }
     s_gradient[thread] = gradient;
     bool open = inside;
+    // The loads of the next batch are under way while this one is blended.
+    float4 next_shape, next_colour;
+    float2 next_falloff;
+    int next_slot;
+    auto fetch = [&](int i) {
+        if (i < end) {
+            const int id = gaussians.data[i];
+            next_shape = __ldg(shapes + id);
+            next_falloff = __ldg(falloffs + id);
+            next_colour = __ldg(colours + id);
+            next_slot = slots.data[i];
+        }
+    };
+    fetch(start + thread);
     for (int base = start; base < end; base += 256) {
         if (__syncthreads_count(open) == 0) break;
-        const int mine = base + thread;
         unsigned parts = 0;
-        if (mine < end) {
-            const int id = gaussians.data[mine];
-            s_slot[thread] = slots.data[mine];
-            float4 shape = __ldg(shapes + id);
-            const float2 f = __ldg(falloffs + id);
-            s_colour[thread] = __ldg(colours + id);
+        if (base + thread < end) {
+            float4 shape = next_shape;
             shape.x -= (float)left + 0.5f;
             shape.y -= (float)top + 0.5f;
             shape.z *= LOG2_E;
-            const float v = f.x * LOG2_E, log_opacity = f.y * LOG2_E;
+            const float v = next_falloff.x * LOG2_E, log_opacity = next_falloff.y * LOG2_E;
             parts = parts_of(shape.x, shape.y, shape.z, shape.w, v, log_opacity + LOG2_255);
             s_shape[thread] = shape;
+            s_colour[thread] = next_colour;
+            s_slot[thread] = next_slot;
             s_falloff[thread] = make_float2(v, log_opacity);
         }
         s_parts[thread] = (unsigned char)parts;
         __syncthreads();
+        fetch(base + 256 + thread);
         const int batch = min(256, end - base);
         for (int group = 0; group < batch; group += 32) {
             unsigned todo = __ballot_sync(0xffffffffu, (s_parts[group + lane] >> part) & 1u);
@@ -283,6 +305,7 @@ def composite_block(
     ellipse: wp.array[wp.vec4],
     falloff: wp.array[wp.vec2],
     colour_depth: wp.array[wp.vec4],
+    flat_background: wp.vec3,
     background: wp.array[wp.vec3],
     colour: wp.array[wp.vec3],
     alpha_out: wp.array[wp.float32],
@@ -323,6 +346,7 @@ def composite_block_kernel(
     ellipse: wp.array[wp.vec4],
     falloff: wp.array[wp.vec2],
     colour_depth: wp.array[wp.vec4],
+    flat_background: wp.vec3,
     background: wp.array[wp.vec3],
     # Out:
     colour_out: wp.array[wp.vec3],
@@ -343,6 +367,7 @@ def composite_block_kernel(
         ellipse,
         falloff,
         colour_depth,
+        flat_background,
         background,
         colour_out,
         alpha_out,

@@ -15,7 +15,7 @@ from egs_warp.gaussians import GaussianCloud
 from egs_warp.render.backward import backward
 from egs_warp.render.compositing import RenderedImage, composite
 from egs_warp.render.projection import ProjectedGaussians, project, view_from_camera
-from egs_warp.render.rasteriser import background_array, refusing_what_does_not_fit
+from egs_warp.render.rasteriser import background_of, refusing_what_does_not_fit
 from egs_warp.render.threads import available_threads
 from egs_warp.render.tiles import TileLists, build_tile_lists
 
@@ -31,9 +31,13 @@ class TorchImage:
     depth: torch.Tensor
     """(H, W) float32, expected z-depth divided by alpha."""
     screen: torch.Tensor
-    """(n, 2) float32 zeros whose ``grad`` receives the gradient by the screen positions, in pixels."""
-    visible: torch.Tensor
-    """(n,) bool: Gaussians that reach a tile."""
+    """(n, 2) float32 zeros whose ``grad`` receives the gradient by the screen positions, in pixels; (0, 2) without grad."""
+    slot_end: torch.Tensor
+    """(n,) int64: number of tiles reached by the Gaussians up to and including this one."""
+
+    def visible(self) -> torch.Tensor:
+        """(n,) bool: Gaussians that reach a tile."""
+        return torch.diff(self.slot_end, prepend=self.slot_end.new_zeros(1)) > 0
 
 
 def render_torch(
@@ -72,12 +76,12 @@ def render_torch(
     if (rotation is None) != (translation is None):
         raise UserError("render: give the pose's rotation and translation together, or neither")
     wanted = any(tensor.requires_grad for tensor, _ in tensors.values()) and torch.is_grad_enabled()
-    screen = torch.zeros((len(means), 2), device=means.device, requires_grad=wanted)
+    screen = torch.zeros((len(means) if wanted else 0, 2), device=means.device, requires_grad=wanted)
     options = _Options(camera, background, antialiased, threads or available_threads())
-    colour, alpha, depth, visible = _Render.apply(
+    colour, alpha, depth, slot_end = _Render.apply(
         *(means, rotations, log_scales, opacity_logits, sh, rotation, translation, screen, options)
     )
-    return TorchImage(colour, alpha, depth, screen, visible)
+    return TorchImage(colour, alpha, depth, screen, slot_end)
 
 
 @dataclass(frozen=True)
@@ -116,6 +120,7 @@ class _Render(torch.autograd.Function):
                 rotation=rotation.detach().double().cpu().numpy(),
                 translation=translation.detach().double().cpu().numpy(),
             )
+        wp.init()
         with _torch_stream(means.device):
             cloud = GaussianCloud(
                 means=wp.from_torch(means.detach().contiguous(), dtype=wp.vec3),
@@ -129,15 +134,15 @@ class _Render(torch.autograd.Function):
             with refusing_what_does_not_fit(cloud, camera):
                 projected = project(cloud, view, antialiased=options.antialiased, threads=threads)
                 lists = build_tile_lists(projected, view, threads=threads)
-                behind = background_array(options.background, camera, cloud.device)
+                behind = background_of(options.background, camera, cloud.device)
                 image = composite(projected, lists, view, background=behind, threads=threads)
             ctx.forward_pass = _Forward(cloud, view, projected, lists, image)
             ctx.options = options
             ctx.want_pose = rotation is not None and (ctx.needs_input_grad[5] or ctx.needs_input_grad[6])
             ctx.set_materialize_grads(False)
-            visible = torch.diff(wp.to_torch(projected.slot_end), prepend=torch.zeros_like(means[:1, 0]).long()) > 0
-            ctx.mark_non_differentiable(visible)
-            return wp.to_torch(image.colour), wp.to_torch(image.alpha), wp.to_torch(image.depth), visible
+            slot_end = wp.to_torch(projected.slot_end)
+            ctx.mark_non_differentiable(slot_end)
+            return wp.to_torch(image.colour), wp.to_torch(image.alpha), wp.to_torch(image.depth), slot_end
 
     @staticmethod
     @torch.autograd.function.once_differentiable

@@ -20,6 +20,16 @@ from egs_warp.render.tiles import TileLists
 
 
 @dataclass(frozen=True)
+class Background:
+    """What shows where the Gaussians let light through."""
+
+    flat: wp.vec3
+    """One colour, where there is no image."""
+    image: wp.array | None = None
+    """(H * W,) vec3."""
+
+
+@dataclass(frozen=True)
 class RenderedImage:
     """One picture. Pixel (row, column) has its centre at (column + 0.5, row + 0.5)."""
 
@@ -40,9 +50,9 @@ class RenderedImage:
 
 
 def composite(
-    projected: ProjectedGaussians, lists: TileLists, view: View, *, background: wp.array, threads: int
+    projected: ProjectedGaussians, lists: TileLists, view: View, *, background: Background, threads: int
 ) -> RenderedImage:
-    """Blend every tile's Gaussians from front to back over ``background``, (1,) or (H * W,) vec3."""
+    """Blend every tile's Gaussians from front to back over ``background``."""
     device = projected.ellipse.device
     width, height = int(view.width), int(view.height)
     colour = wp.empty(width * height, dtype=wp.vec3, device=device)
@@ -56,7 +66,8 @@ def composite(
         projected.ellipse,
         projected.falloff,
         projected.colour_depth,
-        background,
+        background.flat,
+        background.image,
     ]
     outputs = [colour, alpha, depth]
     if device.is_cuda:

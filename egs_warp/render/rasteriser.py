@@ -13,7 +13,7 @@ import warp as wp
 from egs_warp.camera import Camera
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
-from egs_warp.render.compositing import RenderedImage, add_geometry, composite
+from egs_warp.render.compositing import Background, RenderedImage, add_geometry, composite
 from egs_warp.render.projection import project, view_from_camera
 from egs_warp.render.threads import available_threads
 from egs_warp.render.tiles import build_tile_lists
@@ -41,7 +41,7 @@ def render(
     threads = threads or available_threads()
     view = view_from_camera(camera)
     with refusing_what_does_not_fit(cloud, camera):
-        behind = background_array(background, camera, cloud.device)
+        behind = background_of(background, camera, cloud.device)
         projected = project(cloud, view, antialiased=antialiased, threads=threads)
         lists = build_tile_lists(projected, view, threads=threads)
         image = composite(projected, lists, view, background=behind, threads=threads)
@@ -69,15 +69,17 @@ def refusing_what_does_not_fit(cloud: GaussianCloud, camera: Camera) -> Iterator
         ) from error
 
 
-def background_array(background: object, camera: Camera, device: wp.Device) -> wp.array:
-    """(1,) or (H * W,) vec3 from a colour or an image (H, W, 3). Raises ``UserError`` for anything else."""
+def background_of(background: object, camera: Camera, device: wp.Device) -> Background:
+    """From a colour or an image (H, W, 3). Raises ``UserError`` for anything else."""
     shape = (camera.height, camera.width)
     if isinstance(background, wp.array) and background.dtype == wp.vec3 and background.shape == shape:
-        return background.to(device).contiguous().flatten()
+        return Background(wp.vec3(), background.to(device).contiguous().flatten())
     values = np.asarray(background.numpy() if isinstance(background, wp.array) else background, dtype=np.float32)
     if values.shape not in ((3,), (*shape, 3)) or not np.isfinite(values).all():
         raise UserError(
             f"background: give three finite numbers or an image of {camera.height} x {camera.width} x 3,"
             f" not shape {values.shape}"
         )
-    return wp.array(values.reshape(-1, 3), dtype=wp.vec3, device=device)
+    if values.shape == (3,):
+        return Background(wp.vec3(*values.tolist()))
+    return Background(wp.vec3(), wp.array(values.reshape(-1, 3), dtype=wp.vec3, device=device))

@@ -82,11 +82,11 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: View, tiles: int) -> 
     """Radix sort of all (tile, Gaussian) pairs by tile and depth."""
     device = projected.ellipse.device
     count, pairs = projected.slot_end.shape[0], projected.slot_count
-    tile_start = wp.zeros(tiles + 1, dtype=wp.int32, device=device)
     gaussians = wp.empty(max(pairs, 1), dtype=wp.int32, device=device)
     slots = wp.empty(2 * max(pairs, 1), dtype=wp.int32, device=device)
     if pairs == 0:
-        return TileLists(tile_start, gaussians, slots, None)
+        return TileLists(wp.zeros(tiles + 1, dtype=wp.int32, device=device), gaussians, slots, None)
+    tile_start = wp.empty(tiles + 1, dtype=wp.int32, device=device)
     keys = wp.empty(2 * pairs, dtype=wp.int64, device=device)
     gaussian_from_slot = wp.empty(pairs, dtype=wp.int32, device=device)
     wp.launch(

@@ -1,0 +1,334 @@
+"""Speed and likeness of the renderer: against gsplat and gswarp on a GPU, against a PyTorch twin on a CPU.
+
+Aims: ``cuda_beats_gswarp`` (faster in every cell), ``cuda_within_1_3_of_gsplat`` (geometric mean of all cells),
+``same_picture`` (mean difference below 1e-5, and below 1e-3 off the alpha-cut boundaries), ``cpu_vs_twin`` (20 times a
+tile-batched PyTorch rasteriser with the same culling), ``cpu_two_threads`` (1.7 times one thread).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+sys.path.insert(0, str(Path(__file__).parent))
+import render_peers as peers
+
+from egs_warp.camera import Camera
+from egs_warp.gaussians import GaussianCloud
+from egs_warp.render import render
+from egs_warp.render.backward import backward
+from egs_warp.render.compositing import Background, composite
+from egs_warp.render.projection import project, view_from_camera
+from egs_warp.render.threads import available_threads
+from egs_warp.render.tiles import build_tile_lists
+
+CELLS = ((1, 648, 420), (1, 1944, 1260), (5, 648, 420), (5, 1944, 1260), (11, 648, 420))
+AIMS = ("cuda_beats_gswarp", "cuda_within_1_3_of_gsplat", "same_picture", "cpu_vs_twin", "cpu_two_threads")
+
+
+def median_ms(calls: dict[str, Callable[[], Any]], *, repeats: int, synchronise: Callable[[], Any]) -> dict[str, float]:
+    """Median milliseconds of each call; the calls take turns, so that a drift of the machine hits all alike."""
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for turn in range(repeats + 3):
+        for name, call in calls.items():
+            synchronise()
+            start = time.perf_counter()
+            call()
+            synchronise()
+            if turn >= 3:
+                times[name].append((time.perf_counter() - start) * 1e3)
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def difference(ours: torch.Tensor, other: torch.Tensor) -> dict[str, float]:
+    """Mean absolute difference, and the share of pixels above 1e-3 (splats that come or go at their alpha cut)."""
+    off = (ours - other).abs()
+    return {"mean": float(off.mean()), "largest": float(off.max()), "above_1e-3": float((off > 1e-3).float().mean())}
+
+
+def cloud_of(scene: peers.Scene) -> GaussianCloud:
+    """The capture's own terms, from tensors already in them, without a copy."""
+    return GaussianCloud(
+        means=wp.from_torch(scene.means.detach(), dtype=wp.vec3),
+        rotations=wp.from_torch(scene.rotations.detach(), dtype=wp.vec4),
+        log_scales=wp.from_torch(scene.scales.detach(), dtype=wp.vec3),
+        opacity_logits=wp.from_torch(scene.opacities.detach(), dtype=wp.float32),
+        sh=wp.from_torch(scene.colours.detach(), dtype=wp.vec3),
+    )
+
+
+def cuda_rows(points: dict[str, np.ndarray], *, cells: tuple, seed: int, repeats: int) -> list[dict[str, Any]]:
+    """One row for each cell: forward, and forward with backward, of every renderer that is installed."""
+    renderers: dict[str, peers.Renderer] = {"ours": peers.ours}
+    for name, make in (("gsplat", peers.gsplat_renderer), ("gswarp", peers.gswarp_renderer)):
+        try:
+            renderers[name] = make()
+        except ImportError as error:
+            print(f"{name} is not here: {error}")
+    rows = []
+    for grid, width, height in cells:
+        plain = peers.garden_scene(points, grid=grid, seed=seed, device="cuda")
+        own = peers.ours_scene(plain)
+        camera = peers.garden_camera(points, width=width, height=height)
+        scenes = {name: own if name == "ours" else plain for name in renderers}
+        weight = torch.rand((height, width, 3), device="cuda")
+
+        def forward(name: str, scenes: dict = scenes, camera: Camera = camera) -> torch.Tensor:
+            with torch.no_grad():
+                return renderers[name](scenes[name], camera)
+
+        def both(name: str, scenes: dict = scenes, camera: Camera = camera, weight: torch.Tensor = weight) -> None:
+            for tensor in vars(scenes[name]).values():
+                tensor.grad = None
+            renderers[name](scenes[name], camera).backward(weight)
+
+        row: dict[str, Any] = {"kind": "cuda", "gaussians": len(plain.means), "width": width, "height": height}
+        for label, call in (("forward", forward), ("forward_backward", both)):
+            calls = {name: (lambda call=call, name=name: call(name)) for name in renderers}
+            row[label] = median_ms(calls, repeats=repeats, synchronise=torch.cuda.synchronize)
+        picture = forward("ours")
+        row["difference"] = {name: difference(picture, forward(name)) for name in renderers if name != "ours"}
+        for name in renderers:
+            both(name)
+        row["gradient_difference"] = _gradient_differences(scenes)
+        row["stages"] = stage_rows(own, camera, repeats=repeats)
+        rows.append(row)
+        print(json.dumps(row))
+        torch.cuda.empty_cache()
+    return rows
+
+
+def _gradient_differences(scenes: dict[str, peers.Scene]) -> dict[str, float]:
+    """Relative L2 difference to gsplat's gradients, brought to gsplat's terms by the chain rule."""
+    if "gsplat" not in scenes:
+        return {}
+    own, other = scenes["ours"], scenes["gsplat"]
+    opacity = other.opacities.detach()
+    pairs = {
+        "means": (own.means.grad, other.means.grad),
+        "log_scales": (own.scales.grad, other.scales.grad * other.scales.detach()),
+        "opacity_logits": (own.opacities.grad, other.opacities.grad * opacity * (1 - opacity)),
+        # A colour of 0 sits on our clamp, where gsplat, given colours, has none.
+        "sh": (own.colours.grad[:, 0], other.colours.grad * peers.SH_BAND_0 * (own.colours.grad[:, 0] != 0)),
+    }
+    return {name: float((mine - theirs).norm() / theirs.norm()) for name, (mine, theirs) in pairs.items()}
+
+
+def stage_rows(scene: peers.Scene, camera: Camera, *, repeats: int) -> dict[str, dict[str, float]]:
+    """Milliseconds, bytes that must move and share of the measured copy bandwidth, stage by stage of our renderer."""
+    cloud, view, device = cloud_of(scene), view_from_camera(camera), "cuda:0"
+    background = Background(wp.vec3())
+    pixels = camera.width * camera.height
+    gradient = [wp.ones(pixels, dtype=t, device=device) for t in (wp.vec3, wp.float32, wp.float32)]
+    project_now = lambda: project(cloud, view, antialiased=False, threads=1)  # noqa: E731
+    projected = project_now()
+    lists = build_tile_lists(projected, view, threads=1)
+    image = composite(projected, lists, view, background=background, threads=1)
+    source = torch.empty(2**30, dtype=torch.uint8, device="cuda")
+    target = torch.empty_like(source)
+    times = median_ms(
+        {
+            "project": project_now,
+            "lists": lambda: build_tile_lists(projected, view, threads=1),
+            "composite": lambda: composite(projected, lists, view, background=background, threads=1),
+            "backward": lambda: backward(
+                *(cloud, view, projected, lists, image),
+                colour_gradient=gradient[0],
+                alpha_gradient=gradient[1],
+                depth_gradient=gradient[2],
+                antialiased=False,
+                want_pose=False,
+                threads=1,
+            ),
+            "copy_1_GiB": lambda: target.copy_(source),
+        },
+        repeats=repeats,
+        synchronise=torch.cuda.synchronize,
+    )
+    bandwidth = 2 * 2**30 / (times["copy_1_GiB"] * 1e-3)
+    count, pairs = cloud.count, projected.slot_count
+    visible = int((np.diff(projected.slot_end.numpy(), prepend=0) > 0).sum())
+    passes = -(-(31 + lists.tile_count.bit_length()) // 8)
+    moved = {
+        # Attributes in; tile count out and scanned; the ellipse of the visible ones out.
+        "project": count * (56 + 8 + 16) + visible * 40,
+        # Keys, slots and Gaussians out; each radix pass reads and writes 12 bytes a pair; starts read keys again.
+        "lists": count * 8 + visible * 40 + pairs * (16 + 24 * passes + 20),
+        "composite": pairs * (4 + 40) + pixels * 20,
+        # Pairs again, their moments written, zeroed and read; attributes in, gradients out.
+        "backward": pairs * (8 + 40 + 3 * 48) + pixels * 60 + count * (56 + 8 + 64),
+        "copy_1_GiB": 2 * 2**30,
+    }
+    return {
+        name: {"ms": ms, "megabytes": moved[name] / 1e6, "share_of_bandwidth": moved[name] / (ms * 1e-3) / bandwidth}
+        for name, ms in times.items()
+    } | {"counts": {"visible": float(visible), "pairs": float(pairs)}}
+
+
+def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> dict[str, Any]:
+    """112k Gaussians at 640 x 480: one thread, two threads, the PyTorch twin from the same lists on as many."""
+    scene = peers.ours_scene(peers.garden_scene(points, grid=1, seed=seed, device="cpu"))
+    camera = peers.garden_camera(points, width=640, height=480)
+    cloud, view = cloud_of(scene), view_from_camera(camera)
+    threads = available_threads()
+    torch.set_num_threads(threads)
+    projected = project(cloud, view, antialiased=False, threads=threads)
+    lists = build_tile_lists(projected, view, threads=threads)
+    times = median_ms(
+        {
+            "one_thread": lambda: render(cloud, camera, background=(0, 0, 0), threads=1),
+            "two_threads": lambda: render(cloud, camera, background=(0, 0, 0), threads=2),
+            "all_threads": lambda: render(cloud, camera, background=(0, 0, 0), threads=threads),
+        },
+        repeats=repeats,
+        synchronise=lambda: None,
+    )
+    start = time.perf_counter()
+    project_and_list = median_ms(
+        {
+            "lists": lambda: build_tile_lists(
+                project(cloud, view, antialiased=False, threads=threads), view, threads=threads
+            )
+        },
+        repeats=repeats,
+        synchronise=lambda: None,
+    )["lists"]
+    twin_times = []
+    with torch.no_grad():
+        for _ in range(3):
+            start = time.perf_counter()
+            twin = peers.composite_in_torch(projected, lists, camera)
+            twin_times.append((time.perf_counter() - start) * 1e3)
+    picture = wp.to_torch(render(cloud, camera, background=(0, 0, 0), threads=threads).colour)
+    return {
+        "kind": "cpu",
+        "gaussians": cloud.count,
+        "pairs": projected.slot_count,
+        "width": 640,
+        "height": 480,
+        "threads": threads,
+        **times,
+        "twin": project_and_list + statistics.median(twin_times),
+        "difference": difference(picture, twin),
+    }
+
+
+def judge(rows: list[dict[str, Any]]) -> tuple[dict[str, bool | None], dict[str, str]]:
+    """The aims from the rows alone; None, with the reason, where this run could not measure one."""
+    aims: dict[str, bool | None] = dict.fromkeys(AIMS)
+    why: dict[str, str] = {}
+    cuda = [row for row in rows if row["kind"] == "cuda"]
+    labels = ("forward", "forward_backward")
+    for aim, peer in (("cuda_beats_gswarp", "gswarp"), ("cuda_within_1_3_of_gsplat", "gsplat")):
+        if not cuda or any(peer not in row["forward"] for row in cuda):
+            why[aim] = "no CUDA device" if not cuda else f"{peer} is not installed"
+            continue
+        ratios = [row[label]["ours"] / row[label][peer] for row in cuda for label in labels]
+        aims[aim] = max(ratios) < 1.0 if peer == "gswarp" else float(np.exp(np.mean(np.log(ratios)))) <= 1.3
+    differences = [d for row in cuda for d in row["difference"].values()] + [
+        row["difference"] for row in rows if row["kind"] == "cpu"
+    ]
+    # Off the cuts every pixel agrees; a splat at its cut is worth at most 1/255, in few pixels.
+    aims["same_picture"] = all(d["mean"] < 1e-5 and d["above_1e-3"] < 1e-3 for d in differences)
+    cpu = [row for row in rows if row["kind"] == "cpu"]
+    if not cpu:
+        why["cpu_vs_twin"] = why["cpu_two_threads"] = "measured with --device cpu"
+    for row in cpu:
+        aims["cpu_vs_twin"] = row["twin"] / row["all_threads"] >= 20.0
+        if row["threads"] >= 2:
+            aims["cpu_two_threads"] = row["one_thread"] / row["two_threads"] >= 1.7
+        else:
+            why["cpu_two_threads"] = "this machine has one core"
+    return aims, why
+
+
+def plot(rows: list[dict[str, Any]], path: Path) -> None:
+    """Bars of milliseconds by cell and renderer."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    bars: list[tuple[str, dict[str, float]]] = []
+    for row in rows:
+        size = f"{row['gaussians'] / 1e3:.0f}k\n{row['width']}x{row['height']}"
+        if row["kind"] == "cuda":
+            bars += [(f"{size}\n{label}", row[label]) for label in ("forward", "forward_backward")]
+        else:
+            bars.append((f"{size}\nCPU", {k: row[k] for k in ("one_thread", "two_threads", "twin")}))
+    figure, axes = plt.subplots(figsize=(max(6.0, 1.6 * len(bars)), 5.0))
+    names = sorted({name for _, values in bars for name in values})
+    for index, name in enumerate(names):
+        x = [i + (index - len(names) / 2) * 0.8 / len(names) for i, (_, v) in enumerate(bars) if name in v]
+        axes.bar(x, [v[name] for _, v in bars if name in v], 0.8 / len(names), label=name, align="edge")
+    axes.set_xticks(range(len(bars)), [label for label, _ in bars], fontsize=7)
+    axes.set_yscale("log")
+    axes.set_ylabel("ms")
+    axes.legend()
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+
+
+def main() -> None:
+    """Run, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    wp.init()
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--device", default="cuda:0" if wp.is_cuda_available() else "cpu")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--plot", type=Path)
+    options = parser.parse_args()
+    data = Path(os.environ.get("EGS_WARP_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    points = dict(np.load(data / "points" / "garden.npz"))
+    repeats = 10 if options.quick else 30
+    rows: list[dict[str, Any]] = []
+    if options.device.startswith("cuda"):
+        cells = CELLS[:4] if options.quick else CELLS
+        rows += cuda_rows(points, cells=cells, seed=options.seed, repeats=repeats)
+    else:
+        rows.append(cpu_row(points, seed=options.seed, repeats=5 if options.quick else 15))
+    aims, why_null = judge(rows)
+    result = {
+        "rows": rows,
+        "environment": {
+            "device": options.device,
+            "gpu": torch.cuda.get_device_name() if options.device.startswith("cuda") else None,
+            "threads": available_threads(),
+            "python": platform.python_version(),
+            "warp": wp.__version__,
+            "torch": torch.__version__,
+            "seed": options.seed,
+        },
+        "aims": aims,
+        "why_null": why_null,
+    }
+    for row in rows:
+        if row["kind"] == "cuda":
+            for label in ("forward", "forward_backward"):
+                figures = "  ".join(f"{name} {ms:8.3f}" for name, ms in row[label].items())
+                print(f"{row['gaussians']:>9} {row['width']}x{row['height']} {label:17} {figures} ms")
+        else:
+            figures = "  ".join(f"{k} {row[k]:.1f}" for k in ("one_thread", "two_threads", "twin"))
+            print(f"{row['gaussians']:>9} {row['width']}x{row['height']} cpu               {figures} ms")
+    print(json.dumps({"aims": aims, "why_null": why_null}, indent=1))
+    if options.json:
+        options.json.write_text(json.dumps(result, indent=1))
+    if options.plot:
+        plot(rows, options.plot)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,186 @@
+"""The other renderers of ``benchmarks/render.py`` behind one signature, and a plain PyTorch twin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import warp as wp
+
+from egs_warp.camera import Camera
+from egs_warp.render.autograd import render_torch
+from egs_warp.render.projection import ProjectedGaussians
+from egs_warp.render.tiles import TileLists
+
+SH_BAND_0 = 0.28209479177387814
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Gaussians as every peer wants them: leaf tensors of activated values."""
+
+    means: torch.Tensor
+    rotations: torch.Tensor
+    scales: torch.Tensor
+    opacities: torch.Tensor
+    colours: torch.Tensor
+
+
+def garden_scene(points: dict[str, np.ndarray], *, grid: int, seed: int, device: str) -> Scene:
+    """gsplat's own test recipe: points within 2 of the origin, random Gaussians, repeated grid x grid at spacing 4."""
+    means, colours = points["means3d"], points["colors"] / 255.0
+    inside = (np.abs(means) <= 2.0).all(axis=1)
+    steps = np.arange(-(grid // 2), grid // 2 + 1)
+    shifts = np.stack(np.meshgrid(steps, steps, [0], indexing="ij"), -1).reshape(-1, 3) * 4.0
+    means = (means[None, inside] + shifts[:, None]).reshape(-1, 3)
+    count = len(means)
+    random = torch.Generator(device="cpu").manual_seed(seed)
+
+    def leaf(values: torch.Tensor) -> torch.Tensor:
+        return values.float().to(device).contiguous().requires_grad_()
+
+    return Scene(
+        means=leaf(torch.from_numpy(means)),
+        rotations=leaf(torch.nn.functional.normalize(torch.randn((count, 4), generator=random), dim=-1)),
+        scales=leaf(torch.rand((count, 3), generator=random) * (0.02 - 1e-4) + 1e-4),
+        opacities=leaf(torch.rand(count, generator=random)),
+        colours=leaf(torch.from_numpy(np.tile(colours[inside], (grid * grid, 1)))),
+    )
+
+
+def garden_camera(points: dict[str, np.ndarray], *, width: int, height: int) -> Camera:
+    """First camera of the garden, its image resampled to ``width`` x ``height``."""
+    view, k = points["viewmats"][0].astype(float), points["Ks"][0].astype(float)
+    x, y = width / float(points["width"]), height / float(points["height"])
+    return Camera(width, height, k[0, 0] * x, k[1, 1] * y, k[0, 2] * x, k[1, 2] * y, view[:3, :3], view[:3, 3])
+
+
+Renderer = Callable[[Scene, Camera], torch.Tensor]
+
+
+def ours(scene: Scene, camera: Camera) -> torch.Tensor:
+    """(H, W, 3). The leaves are turned into logarithms and logits outside of the timed calls by ``ours_scene``."""
+    return render_torch(
+        scene.means, scene.rotations, scene.scales, scene.opacities, scene.colours, camera, background=(0.0, 0.0, 0.0)
+    ).colour
+
+
+def ours_scene(scene: Scene) -> Scene:
+    """The same Gaussians in the capture's own terms: log scales, opacity logits, SH of degree 0."""
+    return Scene(
+        means=scene.means.detach().clone().requires_grad_(),
+        rotations=scene.rotations.detach().clone().requires_grad_(),
+        scales=scene.scales.detach().log().requires_grad_(),
+        opacities=torch.logit(scene.opacities.detach().double(), eps=1e-7).float().requires_grad_(),
+        colours=((scene.colours.detach() - 0.5) / SH_BAND_0)[:, None].contiguous().requires_grad_(),
+    )
+
+
+def gsplat_renderer() -> Renderer:
+    """gsplat 1.5.3; raises ImportError where it is not installed."""
+    from gsplat.rendering import rasterization
+
+    def draw(scene: Scene, camera: Camera) -> torch.Tensor:
+        view = torch.eye(4, device=scene.means.device)
+        view[:3, :3] = torch.as_tensor(camera.rotation)
+        view[:3, 3] = torch.as_tensor(camera.translation)
+        k = (
+            torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+            .float()
+            .to(scene.means.device)
+        )
+        colours, _, _ = rasterization(
+            *(scene.means, scene.rotations, scene.scales, scene.opacities, scene.colours),
+            *(view[None], k[None], camera.width, camera.height),
+        )
+        return colours[0]
+
+    return draw
+
+
+def gswarp_renderer() -> Renderer:
+    """gswarp 1.1; raises ImportError where it is not installed."""
+    from gswarp import GaussianRasterizationSettings, GaussianRasterizer
+
+    def draw(scene: Scene, camera: Camera) -> torch.Tensor:
+        device = scene.means.device
+        view = torch.eye(4)
+        view[:3, :3] = torch.as_tensor(camera.rotation)
+        view[:3, 3] = torch.as_tensor(camera.translation)
+        near, far = 0.01, 100.0
+        projection = torch.zeros(4, 4)
+        projection[0, 0], projection[1, 1] = 2 * camera.fx / camera.width, 2 * camera.fy / camera.height
+        projection[0, 2] = 2 * camera.cx / camera.width - 1
+        projection[1, 2] = 2 * camera.cy / camera.height - 1
+        projection[2, 2], projection[2, 3], projection[3, 2] = far / (far - near), -far * near / (far - near), 1.0
+        settings = GaussianRasterizationSettings(
+            image_height=camera.height,
+            image_width=camera.width,
+            tanfovx=camera.width / (2 * camera.fx),
+            tanfovy=camera.height / (2 * camera.fy),
+            bg=torch.zeros(3, device=device),
+            scale_modifier=1.0,
+            viewmatrix=view.T.contiguous().to(device),
+            projmatrix=(projection @ view).T.contiguous().to(device),
+            sh_degree=0,
+            campos=torch.as_tensor(camera.centre).float().to(device),
+            prefiltered=False,
+            auto_tune_verbose=False,
+        )
+        colour, _, _ = GaussianRasterizer(settings)(
+            means3D=scene.means,
+            means2D=torch.zeros_like(scene.means, requires_grad=scene.means.requires_grad),
+            opacities=scene.opacities[:, None],
+            colors_precomp=scene.colours,
+            scales=scene.scales,
+            rotations=scene.rotations,
+        )
+        return colour.permute(1, 2, 0)
+
+    return draw
+
+
+def composite_in_torch(projected: ProjectedGaussians, lists: TileLists, camera: Camera) -> torch.Tensor:
+    """(H, W, 3): the tiles blended in plain PyTorch from the very same lists, so that culling is the same.
+
+    Tiles of like length share a batch (tiles, 256 pixels, splats), which keeps PyTorch busy without padding.
+    """
+    ellipse, falloff, colour = (
+        wp.to_torch(array) for array in (projected.ellipse, projected.falloff, projected.colour_depth)
+    )
+    order = wp.to_torch(lists.gaussian_from_intersection)[: projected.slot_count].long()
+    start = wp.to_torch(lists.tile_start).long()
+    lengths = start[1:] - start[:-1]
+    columns = -(-camera.width // 16)
+    rows = -(-camera.height // 16)
+    pixel = torch.arange(256)
+    tiles = torch.zeros((columns * rows, 256, 3))
+    by_length = torch.argsort(lengths)
+    by_length = by_length[lengths[by_length] > 0]
+    first = 0
+    while first < len(by_length):
+        # Batches of about 400,000 pixel-splat pairs stay in the cache; ten times as many took longer.
+        longest = int(lengths[by_length[first]])
+        size = max(1, 400_000 // (256 * max(longest, 1)))
+        batch = by_length[first : first + size]
+        first += size
+        longest = int(lengths[batch].max())
+        slot = torch.arange(longest)
+        real = slot < lengths[batch, None]
+        splat = order[torch.where(real, start[batch, None] + slot, 0)]
+        e, f = ellipse[splat], falloff[splat]
+        x = (batch % columns * 16)[:, None] + pixel % 16 + 0.5
+        y = (torch.div(batch, columns, rounding_mode="floor") * 16)[:, None] + torch.div(
+            pixel, 16, rounding_mode="floor"
+        )
+        dy = y[:, :, None] + 0.5 - e[:, None, :, 1]
+        u = x[:, :, None] - e[:, None, :, 0] + e[:, None, :, 3] * dy
+        alpha = torch.exp(f[:, None, :, 1] - f[:, None, :, 0] * dy * dy - e[:, None, :, 2] * u * u).clamp_max(0.999)
+        alpha = torch.where((alpha >= 1 / 255) & real[:, None], alpha, 0.0)
+        after = torch.cumprod(1 - alpha, dim=2)
+        weight = alpha * torch.cat([torch.ones_like(after[:, :, :1]), after[:, :, :-1]], dim=2) * (after > 1e-4)
+        tiles[batch] = torch.einsum("tps,tsc->tpc", weight, colour[splat][:, :, :3])
+    picture = tiles.reshape(rows, columns, 16, 16, 3).permute(0, 2, 1, 3, 4).reshape(rows * 16, columns * 16, 3)
+    return picture[: camera.height, : camera.width]
