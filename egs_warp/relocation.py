@@ -1,0 +1,139 @@
+"""Gaussians under training as a population: Adam's state follows them as they move and multiply.
+
+The relocation is that of Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+
+_FAINT = 0.005
+"""Opacity below which a Gaussian is moved."""
+_MAX_COPIES = 50
+_EVERY = 100
+"""Steps between relocations."""
+
+
+class Population:
+    """Parameter tensors with one Adam for all; ``evolve`` replaces tensors, so ask ``tensors`` anew each step."""
+
+    def __init__(
+        self,
+        tensors: dict[str, torch.Tensor],
+        rates: Mapping[str, float],
+        *,
+        extent: float,
+        generator: torch.Generator,
+    ) -> None:
+        self.tensors = tensors
+        self._rates = {name: rates[name] * (extent if name == "means" else 1.0) for name in tensors}
+        self._generator = generator
+        self._optimiser = torch.optim.Adam(
+            [{"params": [tensor], "lr": self._rates[name], "name": name} for name, tensor in tensors.items()], eps=1e-15
+        )
+
+    def step(self, *, decay: float) -> None:
+        """One step of Adam; the rate of the means is multiplied by ``decay``."""
+        for group in self._optimiser.param_groups:
+            if group["name"] == "means":
+                group["lr"] = self._rates["means"] * decay
+        self._optimiser.step()
+        self._optimiser.zero_grad(set_to_none=True)
+
+    def regularisation(self) -> torch.Tensor:
+        """Pull on opacities and scales that lets useless Gaussians fade, so that they can be moved."""
+        return 0.01 * (
+            torch.sigmoid(self.tensors["opacity_logits"]).mean() + torch.exp(self.tensors["log_scales"]).mean()
+        )
+
+    @torch.no_grad()
+    def evolve(self, step: int, steps: int, cap: int) -> None:
+        """Jitter the means; now and then move faint Gaussians onto opaque ones and grow by 5 % towards ``cap``."""
+        self._jitter()
+        # The last fifth of the steps settles what is there.
+        if step % _EVERY != _EVERY - 1 or step > 0.8 * steps:
+            return
+        opacity = torch.sigmoid(self.tensors["opacity_logits"])
+        faint = opacity <= _FAINT
+        if bool(faint.any()) and not bool(faint.all()):
+            places = torch.nonzero(faint)[:, 0]
+            chosen = self._draw(torch.where(faint, 0.0, opacity), len(places))
+            self._share(chosen)
+            for tensor in self.tensors.values():
+                tensor[places] = tensor[chosen]
+            self._forget(torch.cat([places, chosen]))
+        count = len(opacity)
+        more = min(cap, int(1.05 * count) + 1) - count
+        if more > 0:
+            chosen = self._draw(torch.sigmoid(self.tensors["opacity_logits"]), more)
+            self._share(chosen)
+            self._forget(chosen)
+            self._append(chosen)
+
+    def _draw(self, weights: torch.Tensor, count: int) -> torch.Tensor:
+        # Not torch.multinomial, which takes at most 2^24 weights.
+        total = torch.cumsum(weights.double(), 0)
+        spots = torch.rand(count, generator=self._generator, device=weights.device, dtype=torch.float64) * total[-1]
+        return torch.searchsorted(total, spots).clamp_max(len(weights) - 1)
+
+    def _share(self, chosen: torch.Tensor) -> None:
+        """Opacity and scale of each chosen Gaussian such that it and its copies together look as it did alone."""
+        opacity = torch.sigmoid(self.tensors["opacity_logits"])
+        copies = torch.bincount(chosen, minlength=len(opacity))
+        unique = torch.nonzero(copies)[:, 0]
+        number = (copies[unique] + 1).clamp_max(_MAX_COPIES)
+        old = opacity[unique].double().clamp(_FAINT, 1 - 1e-6)
+        new = 1 - (1 - old) ** (1 / number)
+        total = torch.zeros_like(old)
+        for i in range(1, int(number.max()) + 1):
+            term = torch.zeros_like(old)
+            for k in range(i):
+                term += math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1) * new ** (k + 1)
+            total += torch.where(number >= i, term, 0.0)
+        new = new.clamp(_FAINT, 1 - 1e-6)
+        self.tensors["opacity_logits"][unique] = torch.logit(new).float()
+        self.tensors["log_scales"][unique] += torch.log(old / total).float()[:, None]
+
+    def _forget(self, which: torch.Tensor) -> None:
+        for tensor in self.tensors.values():
+            for value in self._optimiser.state.get(tensor, {}).values():
+                if torch.is_tensor(value) and value.shape == tensor.shape:
+                    value[which] = 0.0
+
+    def _append(self, chosen: torch.Tensor) -> None:
+        for group in self._optimiser.param_groups:
+            old = group["params"][0]
+            new = torch.cat([old, old[chosen]]).detach().requires_grad_()
+            state = self._optimiser.state.pop(old, {})
+            for key, value in state.items():
+                if torch.is_tensor(value) and value.shape == old.shape:
+                    state[key] = torch.cat([value, torch.zeros_like(value[chosen])])
+            if state:
+                self._optimiser.state[new] = state
+            group["params"] = [new]
+            self.tensors[group["name"]] = new
+
+    def _jitter(self) -> None:
+        """Noise of each Gaussian's own shape on the faint ones' means: 5e5 times the rate, as published."""
+        rate = next(group["lr"] for group in self._optimiser.param_groups if group["name"] == "means")
+        opacity = torch.sigmoid(self.tensors["opacity_logits"])
+        gate = torch.sigmoid(-100.0 * (opacity - _FAINT) + 0.0)
+        scales = torch.exp(self.tensors["log_scales"])
+        noise = torch.randn(scales.shape, generator=self._generator, device=scales.device)
+        axes = _rotation_matrices(self.tensors["rotations"])
+        # Sigma noise = R S S R^T noise.
+        local = torch.einsum("nji,nj->ni", axes, noise) * scales**2
+        self.tensors["means"] += torch.einsum("nij,nj->ni", axes, local) * (gate * 5e5 * rate)[:, None]
+
+
+def _rotation_matrices(rotations: torch.Tensor) -> torch.Tensor:
+    w, x, y, z = torch.nn.functional.normalize(rotations, dim=1).unbind(1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)

@@ -1,0 +1,183 @@
+"""A capture from posed photos: read them, begin with a rough cloud, train. What ``egs-warp train`` calls.
+
+Imports torch, so import it only where something is trained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from egs_warp.camera import Camera
+from egs_warp.errors import UserError
+from egs_warp.finetune import Densification, FinetuneOptions, Rates, TrainingView, finetune, psnr
+from egs_warp.gaussians import GaussianCloud
+from egs_warp.io.cameras import read_cameras
+from egs_warp.render import render
+
+SH_BAND_0 = 0.28209479177387814
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """What training from photos gave."""
+
+    cloud: GaussianCloud
+    losses: np.ndarray
+    """(iterations,) float64."""
+    psnr_train: float
+    """Mean dB over the photos trained on."""
+    psnr_held_out: float | None
+    """Mean dB over every eighth photo, which training did not see; None with fewer than eight photos."""
+
+
+def train(
+    posed: Path | str,
+    *,
+    iterations: int = 3000,
+    max_gaussians: int = 50_000,
+    sh_degree: int = 2,
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    max_side: int | None = None,
+    seed: int = 0,
+    device: str | None = None,
+    threads: int | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> TrainResult:
+    """Make a capture from the photos that ``posed`` (COLMAP, ``transforms.json`` or ``cameras.json``) points to.
+
+    Photos larger than ``max_side`` pixels are reduced. Every eighth photo is held out and judged on. Photos with alpha
+    are laid over ``background``. Raises ``UserError`` for missing photos and impossible options.
+    """
+    if iterations < 1 or max_gaussians < 100 or not 0 <= sh_degree <= 3:
+        raise UserError(
+            f"train: {iterations} iterations, {max_gaussians} Gaussians and SH degree {sh_degree};"
+            " give at least 1, at least 100, and 0 to 3"
+        )
+    views = read_views(posed, background=background, max_side=max_side)
+    held_out = views[::8] if len(views) >= 8 else []
+    chosen = [view for number, view in enumerate(views) if number % 8 or not held_out]
+    start = rough_cloud(chosen, count=max(100, max_gaussians // 3), sh_degree=sh_degree, seed=seed, device=device)
+    options = FinetuneOptions(
+        iterations=iterations,
+        # Short runs cannot wait for the rates of 30,000 steps.
+        rates=Rates(means=1.6e-4 * min(4.0, max(1.0, 30_000 / iterations) ** 0.5)),
+        background=background,
+        densification=Densification.RELOCATION,
+        max_gaussians=max_gaussians,
+        seed=seed,
+        threads=threads,
+    )
+    result = finetune(start, chosen, options=options, progress=progress)
+
+    def judge(which: Sequence[TrainingView]) -> float:
+        pictures = (render(result.cloud, view.camera, background=background, threads=threads) for view in which)
+        return float(
+            np.mean([psnr(np.clip(p.colour.numpy(), 0, 1), v.image) for p, v in zip(pictures, which, strict=True)])
+        )
+
+    return TrainResult(result.cloud, result.losses, judge(chosen), judge(held_out) if held_out else None)
+
+
+def read_views(
+    posed: Path | str, *, background: tuple[float, float, float] = (1.0, 1.0, 1.0), max_side: int | None = None
+) -> list[TrainingView]:
+    """Photos and cameras; a photo with alpha is laid over ``background`` and its alpha becomes the view's weightless mask.
+
+    Raises ``UserError`` for a photo that is missing, unreadable or of another shape than its camera.
+    """
+    views = []
+    for entry in read_cameras(posed):
+        if entry.image is None:
+            raise UserError(f"{posed}: the photo {entry.name} is not beside the poses; put the images there")
+        pixels = cv2.imread(str(entry.image), cv2.IMREAD_UNCHANGED)
+        if pixels is None:
+            raise UserError(f"{entry.image}: not a readable picture; export it again as PNG or JPEG")
+        full = np.iinfo(pixels.dtype).max if np.issubdtype(pixels.dtype, np.integer) else 1.0
+        values = np.atleast_3d(pixels).astype(np.float32) / full
+        colour = values[:, :, :3][:, :, ::-1] if values.shape[2] >= 3 else np.repeat(values[:, :, :1], 3, axis=2)
+        camera = _scaled(entry.camera, colour.shape[1], colour.shape[0], entry.image)
+        if values.shape[2] == 4:
+            alpha = values[:, :, 3:]
+            colour = colour * alpha + (1 - alpha) * np.float32(background)
+        side = max(camera.width, camera.height)
+        if max_side is not None and side > max_side:
+            width, height = (max(1, round(s * max_side / side)) for s in (camera.width, camera.height))
+            colour = cv2.resize(colour, (width, height), interpolation=cv2.INTER_AREA)
+            camera = _scaled(camera, width, height, entry.image, exact=False)
+        views.append(TrainingView(camera, np.ascontiguousarray(colour, dtype=np.float32)))
+    return views
+
+
+def _scaled(camera: Camera, width: int, height: int, image: Path, *, exact: bool = True) -> Camera:
+    """The camera for its photo at another size; poses are often of the full photo and images reduced."""
+    x, y = width / camera.width, height / camera.height
+    if exact and abs(x / y - 1) > 0.01:
+        raise UserError(
+            f"{image}: {width} x {height} pixels, but its camera has {camera.width} x {camera.height};"
+            " use the photos that the poses were made from"
+        )
+    return replace(
+        camera,
+        width=width,
+        height=height,
+        fx=camera.fx * x,
+        fy=camera.fy * y,
+        cx=camera.cx * x,
+        cy=camera.cy * y,
+    )
+
+
+def rough_cloud(
+    views: Sequence[TrainingView], *, count: int, sh_degree: int, seed: int = 0, device: str | None = None
+) -> GaussianCloud:
+    """``count`` round Gaussians, spread evenly over the region that most cameras see, in the colours they see there.
+
+    Of many random points those are kept on whose colour the views agree best: a rough visual and photometric hull.
+    """
+    centres = np.array([view.camera.centre for view in views])
+    axes = np.array([view.camera.rotation[2] for view in views])
+    # The point nearest to all optical axes, in the least-squares sense.
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    focus = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, centres), rcond=None)[0]
+    distance = float(np.median(np.linalg.norm(centres - focus, axis=1)))
+    reach = np.median([0.5 * max(v.camera.width / v.camera.fx, v.camera.height / v.camera.fy) for v in views])
+    random = np.random.default_rng(seed)
+    points = focus + distance * min(float(reach), 1.0) * random.uniform(-1, 1, (8 * count, 3))
+    sums, squares, seen = np.zeros((len(points), 3)), np.zeros((len(points), 3)), np.zeros(len(points))
+    for view in views:
+        camera = view.camera
+        p = points @ camera.rotation.T + camera.translation
+        ahead = p[:, 2] > camera.near
+        z = np.where(ahead, p[:, 2], 1.0)
+        column = np.floor(camera.fx * p[:, 0] / z + camera.cx)
+        row = np.floor(camera.fy * p[:, 1] / z + camera.cy)
+        inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        colour = view.image[row[inside].astype(int), column[inside].astype(int)]
+        sums[inside] += colour
+        squares[inside] += colour**2
+        seen[inside] += 1
+    known = np.maximum(seen, 1)[:, None]
+    mean = sums / known
+    spread = np.sqrt(np.maximum(squares / known - mean**2, 0).sum(axis=1))
+    # Empty space before a plain backdrop agrees as well as a surface does; half of the points are kept at random.
+    often = seen >= 0.5 * seen.max()
+    best = np.argsort(np.where(often, spread, np.inf), kind="stable")[: count // 2]
+    rest = random.permutation(np.setdiff1d(np.flatnonzero(often), best))[: count - len(best)]
+    chosen = np.concatenate([best, rest])
+    means = points[chosen]
+    spacing = 0.5 * 2 * distance * min(float(reach), 1.0) / len(means) ** (1 / 3)
+    sh = np.zeros((len(means), (sh_degree + 1) ** 2, 3))
+    sh[:, 0] = (mean[chosen] - 0.5) / SH_BAND_0
+    return GaussianCloud.from_numpy(
+        means,
+        np.tile([1.0, 0, 0, 0], (len(means), 1)),
+        np.full((len(means), 3), np.log(spacing)),
+        np.full(len(means), np.log(0.1 / 0.9)),
+        sh,
+        device=device,
+    )
