@@ -103,7 +103,7 @@ class Deformer:
 
     def _carrying_inputs(self, positions: wp.array | np.ndarray) -> list[object]:
         cage = self.embedding.cage
-        uploaded = _node_positions(positions, len(cage.mesh.nodes), self.rest.device)
+        uploaded = node_positions(positions, len(cage.mesh.nodes), self.rest.device)
         launch_rows(
             kernels.tet_gradients_kernel,
             len(cage.mesh.tets),
@@ -138,7 +138,8 @@ def deform(
     return Deformer(cloud, embedding, max_stretch=max_stretch).deform(positions)
 
 
-def _node_positions(positions: wp.array | np.ndarray, node_count: int, device: wp.Device) -> wp.array:
+def node_positions(positions: wp.array | np.ndarray, node_count: int, device: wp.Device) -> wp.array:
+    """(N,) vec3d on ``device`` from (N, 3) or (N,) vec3d; raises ``UserError`` unless N is ``node_count``."""
     if len(positions) != node_count:
         raise UserError(f"deformation: {len(positions)} node positions for a cage of {node_count} nodes")
     if isinstance(positions, wp.array) and positions.dtype == Vec3 and positions.device == device:

@@ -110,6 +110,18 @@ class CageLocator:
         )
         return embedding, arms
 
+    def nearest_faces(self, points: wp.array) -> wp.array:
+        """(P,) int32, the row of ``mesh.boundary_faces()`` nearest to each of ``points`` (P,) vec3, in float32."""
+        faces = wp.empty(points.shape[0], dtype=wp.int32, device=self.device)
+        launch_rows(
+            kernels.nearest_face_kernel,
+            points.shape[0],
+            inputs=[points, Vec3(*self._origin), self.extent, self._surface.id],
+            outputs=[faces],
+            device=self.device,
+        )
+        return faces
+
     def _empty_embedding(self, count: int) -> PointEmbedding:
         with wp.ScopedDevice(self.device):
             return PointEmbedding(
@@ -161,6 +173,8 @@ class GaussianEmbedding:
     """(n, 6) float32, metres: arm lengths of the three ends of T+, then of T-; gamma s_j, or less where shortened."""
     cage: CageLocator
     """The rest cage."""
+    gamma: float
+    """Arm length in standard deviations, before shortening."""
 
     @property
     def count(self) -> int:
@@ -176,4 +190,4 @@ def embed_gaussians(cloud: GaussianCloud, mesh: TetMesh | CageLocator, *, gamma:
     """
     cage = mesh if isinstance(mesh, CageLocator) else CageLocator(mesh, device=cloud.device)
     points, arms = cage.locate_gaussians(cloud, gamma)
-    return GaussianEmbedding(points, arms, cage)
+    return GaussianEmbedding(points, arms, cage, gamma)

@@ -457,13 +457,17 @@ def measure_bend_kernel(
     for k in range(3):
         f_plus = gradients[point_tets[7 * row + 1 + k]] * axes
         f_minus = gradients[point_tets[7 * row + 4 + k]] * axes
-        reach = arms[row, k] + arms[row, 3 + k]
+        # Gradients jump between tetrahedra; over a much shortened arm the jump is no derivative.
+        reach = wp.max(arms[row, k] + arms[row, 3 + k], 3.0 * scales[k])
         for j in range(3):
             # Along the axis itself the ends' own positions are known; across it only the gradients at the ends are.
             a = wp.where(j == k, column(both.plus, k), column(f_plus, j))
             b = wp.where(j == k, column(both.minus, k), column(f_minus, j))
             missed = scales[k] * scales[j] * wp.length(a - b) / reach
             angle = wp.degrees(angle_between(a, b))
+            # The mixed derivative is the same both ways round; the longer baseline sees it better.
+            if scales[j] > scales[k]:
+                missed = 0.0
             # An axis too short to be seen bends nothing.
             if missed > 0.25 * error[k]:
                 curl[k] = wp.max(curl[k], angle)

@@ -291,3 +291,21 @@ def interpolate_points_kernel(
     n = nodes[row]
     w = weights[row]
     points_out[row] = w[0] * positions[n[0]] + w[1] * positions[n[1]] + w[2] * positions[n[2]] + w[3] * positions[n[3]]
+
+
+@wp.kernel
+def nearest_face_kernel(
+    first_row: wp.int32,
+    # In:
+    points: wp.array[wp.vec3],
+    origin: Vec3,
+    extent: real,
+    surface: wp.uint64,
+    # Out:
+    faces_out: wp.array[wp.int32],
+):
+    """The surface triangle nearest to each point."""
+    row = first_row + wp.tid()
+    point = points[row] - single(origin)
+    found = wp.mesh_query_point_no_sign(surface, point, wp.length(point) + 2.0 * wp.float32(extent))
+    faces_out[row] = wp.where(found.result, found.face, 0)
