@@ -45,14 +45,14 @@ def bake_light_kernel(
     height = wp.dot(points[i], up) - ground_height
     turn = float(i) * 1.7
 
-    sky = float(0.0)
-    ground = float(0.0)
+    sky = wp.float32(0.0)
+    ground = wp.float32(0.0)
     for k in range(ambient_rays):
         local = fibonacci_cosine_direction(k, ambient_rays, turn)
         direction = t * local[0] + b * local[1] + n * local[2]
         rise = wp.dot(direction, up)
         length = float(reach)
-        to_ground = float(1.0e9)
+        to_ground = wp.float32(1.0e9)
         if ground_is_solid == 1 and rise < -1.0e-4:
             to_ground = wp.max(height, 0.0) / (-rise)
             length = wp.min(length, to_ground)
@@ -67,7 +67,7 @@ def bake_light_kernel(
     light = wp.normalize(light_direction)
     light_t = wp.normalize(wp.cross(wp.vec3(0.31, 0.17, -0.93), light))
     light_b = wp.cross(light, light_t)
-    seen = float(0.0)
+    seen = wp.float32(0.0)
     for k in range(light_rays):
         radius = light_softness * wp.sqrt((float(k) + 0.5) / float(light_rays))
         angle = 2.39996323 * float(k) + turn

@@ -83,11 +83,11 @@ def _turned_surface(count: int, random: np.random.Generator) -> SurfaceSamples:
     outline, arc = _profile()
     area = float(np.sum(np.pi * (outline[1:, 0] + outline[:-1, 0]) * np.diff(arc)))
     spacing = np.sqrt(area / count)
-    ring_count = int(round(arc[-1] / spacing))
+    ring_count = round(arc[-1] / spacing)
     points, normals = [], []
     for ring in range(ring_count):
         around = max(
-            3, int(round(2.0 * np.pi * np.interp((ring + 0.5) * arc[-1] / ring_count, arc, outline[:, 0]) / spacing))
+            3, round(2.0 * np.pi * np.interp((ring + 0.5) * arc[-1] / ring_count, arc, outline[:, 0]) / spacing)
         )
         s = np.clip((ring + 0.5 + random.uniform(-0.3, 0.3, around)) * arc[-1] / ring_count, 0.0, arc[-1])
         angle = 2.0 * np.pi * (np.arange(around) + random.uniform() + random.uniform(-0.3, 0.3, around)) / around
