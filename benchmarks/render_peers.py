@@ -161,9 +161,9 @@ def composite_in_torch(projected: ProjectedGaussians, lists: TileLists, camera: 
     by_length = by_length[lengths[by_length] > 0]
     first = 0
     while first < len(by_length):
-        # Batches of about 400,000 pixel-splat pairs stay in the cache; ten times as many took longer.
+        # Batches of about 100,000 pixel-splat pairs stay in the cache; forty times as many took longer.
         longest = int(lengths[by_length[first]])
-        size = max(1, 400_000 // (256 * max(longest, 1)))
+        size = max(1, 100_000 // (256 * max(longest, 1)))
         batch = by_length[first : first + size]
         first += size
         longest = int(lengths[batch].max())

@@ -5,15 +5,7 @@ Every sum has one owner and a fixed order: no atomics, the same bits on every ru
 
 import warp as wp
 
-from egs_warp.kernels.render_ellipse import (
-    ALPHA_CUT,
-    ALPHA_LIMIT,
-    LOG_255,
-    LOW_PASS,
-    TILE,
-    TILE_PIXELS,
-    TRANSMITTANCE_STOP,
-)
+from egs_warp.kernels.render_ellipse import LOW_PASS
 from egs_warp.kernels.render_projection import View, rotation_matrix, screen_axes, sh_sum
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -47,105 +39,6 @@ def pixel_gradients_kernel(
     by_alpha = alpha_gradient[i] - by_depth_sum * depth[i]
     # colour holds T times the background already; depth times alpha is the weighted sum of depths.
     remaining_out[i] = wp.dot(g, colour[i]) + depth_gradient[i] * depth[i] - (1.0 - alpha[i]) * by_alpha
-
-
-@wp.kernel
-def composite_backward_tile_kernel(
-    first: wp.int32,
-    # In:
-    width: wp.int32,
-    height: wp.int32,
-    tile_start: wp.array[wp.int32],
-    gaussian_from_intersection: wp.array[wp.int32],
-    slot_from_intersection: wp.array[wp.int32],
-    ellipse: wp.array[wp.vec4],
-    falloff: wp.array[wp.vec2],
-    colour_depth: wp.array[wp.vec4],
-    sum_gradient: wp.array[wp.vec4],
-    remaining: wp.array[wp.float32],
-    # Out:
-    moments_out: wp.array2d[wp.vec4],
-):
-    """One thread walks one tile as ``composite_tile_kernel`` does and sums each splat's gradient over its pixels (CPU).
-
-    With k = alpha dL/dalpha per pixel, ``moments_out[slot]`` holds (sum k, k u, k dy, k u^2), (k u dy, k dy^2, by depth, 0)
-    and (by colour, 0).
-    """
-    tile = wp.tid() + first
-    columns = (width + TILE - 1) / TILE
-    left = (tile % columns) * TILE
-    top = (tile / columns) * TILE
-    tile_width = wp.min(TILE, width - left)
-    tile_height = wp.min(TILE, height - top)
-    passing = wp.zeros(shape=TILE_PIXELS, dtype=wp.float32)
-    rest = wp.zeros(shape=TILE_PIXELS, dtype=wp.float32)
-    gradient = wp.zeros(shape=TILE_PIXELS, dtype=wp.vec4)
-    for row in range(tile_height):
-        for column in range(tile_width):
-            i = row * TILE + column
-            pixel = (top + row) * width + left + column
-            passing[i] = 1.0
-            rest[i] = remaining[pixel]
-            gradient[i] = sum_gradient[pixel]
-    open_pixels = tile_width * tile_height
-    intersection = tile_start[tile]
-    end = tile_start[tile + 1]
-    while intersection < end and open_pixels > 0:
-        g = gaussian_from_intersection[intersection]
-        slot = slot_from_intersection[intersection]
-        intersection += 1
-        e = ellipse[g]
-        f = falloff[g]
-        colour = colour_depth[g]
-        x = e[0] - wp.float32(left) - 0.5
-        y = e[1] - wp.float32(top) - 0.5
-        a = e[2]
-        cut = f[1] + LOG_255
-        reach = wp.sqrt(cut / f[0])
-        row_first = wp.max(wp.int32(wp.ceil(wp.max(y - reach, -1.0))), 0)
-        row_last = wp.min(wp.int32(wp.floor(wp.min(y + reach, 16.0))), tile_height - 1)
-        k_sum = wp.vec4()
-        k_more = wp.vec4()
-        by_colour = wp.vec4()
-        for row in range(row_first, row_last + 1):
-            dy = wp.float32(row) - y
-            in_row = f[0] * dy * dy
-            half_width = wp.sqrt(wp.max(cut - in_row, 0.0) / a)
-            middle = x - e[3] * dy
-            column_first = wp.max(wp.int32(wp.ceil(wp.max(middle - half_width, -1.0))), 0)
-            column_last = wp.min(wp.int32(wp.floor(wp.min(middle + half_width, 16.0))), tile_width - 1)
-            k_row = wp.float32(0.0)
-            ku_row = wp.float32(0.0)
-            kuu_row = wp.float32(0.0)
-            for column in range(column_first, column_last + 1):
-                i = row * TILE + column
-                before = passing[i]
-                if before > 0.0:
-                    u = wp.float32(column) - middle
-                    unbounded = wp.exp(f[1] - in_row - a * u * u)
-                    alpha = wp.min(unbounded, ALPHA_LIMIT)
-                    after = before * (1.0 - alpha)
-                    if alpha >= ALPHA_CUT:
-                        if after <= TRANSMITTANCE_STOP:
-                            passing[i] = 0.0
-                            open_pixels -= 1
-                        else:
-                            weight = before * alpha
-                            value = wp.dot(colour, gradient[i])
-                            left_over = rest[i] - weight * value
-                            rest[i] = left_over
-                            passing[i] = after
-                            by_colour = by_colour + weight * gradient[i]
-                            if unbounded <= ALPHA_LIMIT:
-                                k = alpha * (before * value - left_over / (1.0 - alpha))
-                                k_row += k
-                                ku_row += k * u
-                                kuu_row += k * u * u
-            k_sum = k_sum + wp.vec4(k_row, ku_row, k_row * dy, kuu_row)
-            k_more = k_more + wp.vec4(ku_row * dy, k_row * dy * dy, 0.0, 0.0)
-        moments_out[slot, 0] = k_sum
-        moments_out[slot, 1] = wp.vec4(k_more[0], k_more[1], by_colour[3], 0.0)
-        moments_out[slot, 2] = wp.vec4(by_colour[0], by_colour[1], by_colour[2], 0.0)
 
 
 @wp.func

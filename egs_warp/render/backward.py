@@ -8,7 +8,6 @@ import warp as wp
 
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.kernels.render_backward import (
-    composite_backward_tile_kernel,
     pixel_gradients_kernel,
     project_backward_kernel,
 )
@@ -89,6 +88,9 @@ def backward(
             block_dim=256,
         )
     else:
+        # Likewise: a GPU's compiler would refuse this one.
+        from egs_warp.kernels.render_cpu import composite_backward_tile_kernel
+
         launch_ranges(
             composite_backward_tile_kernel,
             lists.tile_count,

@@ -8,11 +8,7 @@ import numpy as np
 import warp as wp
 
 from egs_warp.gaussians import GaussianCloud
-from egs_warp.kernels.render_compositing import (
-    composite_geometry_kernel,
-    composite_tile_kernel,
-    splat_normals_kernel,
-)
+from egs_warp.kernels.render_compositing import composite_geometry_kernel, splat_normals_kernel
 from egs_warp.kernels.render_projection import View
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.threads import launch_ranges
@@ -83,6 +79,9 @@ def composite(
             block_dim=256,
         )
     else:
+        # Likewise: a GPU's compiler would refuse this one.
+        from egs_warp.kernels.render_cpu import composite_tile_kernel
+
         launch_ranges(
             composite_tile_kernel,
             lists.tile_count,
