@@ -15,6 +15,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -98,8 +99,14 @@ def cuda_rows(points: dict[str, np.ndarray], *, cells: tuple, seed: int, repeats
         for label, call in (("forward", forward), ("forward_backward", both)):
             calls = {name: (lambda call=call, name=name: call(name)) for name in renderers}
             row[label] = median_ms(calls, repeats=repeats, synchronise=torch.cuda.synchronize)
-        picture = forward("ours")
-        row["difference"] = {name: difference(picture, forward(name)) for name in renderers if name != "ours"}
+        # Matching settings: gswarp stops every splat at three sigma and at an alpha of 0.99, which below 0.35 do nothing.
+        fainter = replace(plain, opacities=plain.opacities.detach() * 0.35)
+        faint = {name: peers.ours_scene(fainter) if name == "ours" else fainter for name in renderers}
+        with torch.no_grad():
+            pictures = {name: draw(faint[name], camera) for name, draw in renderers.items()}
+        row["difference"] = {
+            name: difference(pictures["ours"], picture) for name, picture in pictures.items() if name != "ours"
+        }
         for name in renderers:
             both(name)
         row["gradient_difference"] = _gradient_differences(scenes)
@@ -116,14 +123,15 @@ def _gradient_differences(scenes: dict[str, peers.Scene]) -> dict[str, float]:
         return {}
     own, other = scenes["ours"], scenes["gsplat"]
     opacity = other.opacities.detach()
+    mine, theirs = ({name: t.grad for name, t in vars(scene).items() if t.grad is not None} for scene in (own, other))
     pairs = {
-        "means": (own.means.grad, other.means.grad),
-        "log_scales": (own.scales.grad, other.scales.grad * other.scales.detach()),
-        "opacity_logits": (own.opacities.grad, other.opacities.grad * opacity * (1 - opacity)),
+        "means": (mine["means"], theirs["means"]),
+        "log_scales": (mine["scales"], theirs["scales"] * other.scales.detach()),
+        "opacity_logits": (mine["opacities"], theirs["opacities"] * opacity * (1 - opacity)),
         # A colour of 0 sits on our clamp, where gsplat, given colours, has none.
-        "sh": (own.colours.grad[:, 0], other.colours.grad * peers.SH_BAND_0 * (own.colours.grad[:, 0] != 0)),
+        "sh": (mine["colours"][:, 0], theirs["colours"] * peers.SH_BAND_0 * (mine["colours"][:, 0] != 0)),
     }
-    return {name: float((mine - theirs).norm() / theirs.norm()) for name, (mine, theirs) in pairs.items()}
+    return {name: float((one - two).norm() / two.norm()) for name, (one, two) in pairs.items()}
 
 
 def stage_rows(scene: peers.Scene, camera: Camera, *, repeats: int) -> dict[str, dict[str, float]]:
@@ -175,6 +183,38 @@ def stage_rows(scene: peers.Scene, camera: Camera, *, repeats: int) -> dict[str,
         name: {"ms": ms, "megabytes": moved[name] / 1e6, "share_of_bandwidth": moved[name] / (ms * 1e-3) / bandwidth}
         for name, ms in times.items()
     } | {"counts": {"visible": float(visible), "pairs": float(pairs)}}
+
+
+def memory_row(*, seed: int) -> dict[str, Any]:
+    """Peak GPU memory of one 1920 x 1080 picture of five million Gaussians with SH of degree 3, capture included."""
+    device, count = wp.get_device("cuda:0"), 5_000_000
+    random = torch.Generator(device="cuda").manual_seed(seed)
+
+    def uniform(*shape: int) -> torch.Tensor:
+        return torch.rand(shape, generator=random, device="cuda") * 2 - 1
+
+    cloud = GaussianCloud(
+        means=wp.from_torch(uniform(count, 3), dtype=wp.vec3),
+        rotations=wp.from_torch(uniform(count, 4), dtype=wp.vec4),
+        log_scales=wp.from_torch(uniform(count, 3) - 6.0, dtype=wp.vec3),
+        opacity_logits=wp.from_torch(uniform(count), dtype=wp.float32),
+        sh=wp.from_torch(uniform(count, 16, 3), dtype=wp.vec3),
+    )
+    camera = Camera.look_at(np.array([0.0, -1.0, -3.0]), np.zeros(3), np.array([0, -1.0, 0]), width=1920, height=1080)
+    before = wp.get_mempool_used_mem_current(device)
+    wp.set_mempool_release_threshold(device, 0)
+    picture = render(cloud, camera)
+    peak = wp.get_mempool_used_mem_high(device) - before
+    capture = sum(array.capacity for array in vars(cloud).values())
+    return {
+        "kind": "memory",
+        "gaussians": count,
+        "width": 1920,
+        "height": 1080,
+        "capture_gib": capture / 2**30,
+        "working_gib": peak / 2**30,
+        "mean_alpha": float(wp.to_torch(picture.alpha).mean()),
+    }
 
 
 def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> dict[str, Any]:
@@ -242,8 +282,10 @@ def judge(rows: list[dict[str, Any]]) -> tuple[dict[str, bool | None], dict[str,
     differences = [d for row in cuda for d in row["difference"].values()] + [
         row["difference"] for row in rows if row["kind"] == "cpu"
     ]
-    # Off the cuts every pixel agrees; a splat at its cut is worth at most 1/255, in few pixels.
-    aims["same_picture"] = all(d["mean"] < 1e-5 and d["above_1e-3"] < 1e-3 for d in differences)
+    # Off the cuts every pixel agrees to 1e-3; a splat at its cut, worth at most 1/255, may come or go in few pixels.
+    aims["same_picture"] = all(
+        d["mean"] < 1e-5 and d["above_1e-3"] < 1e-4 and d["largest"] < 1.5 / 255 for d in differences
+    )
     cpu = [row for row in rows if row["kind"] == "cpu"]
     if not cpu:
         why["cpu_vs_twin"] = why["cpu_two_threads"] = "measured with --device cpu"
@@ -268,7 +310,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
         size = f"{row['gaussians'] / 1e3:.0f}k\n{row['width']}x{row['height']}"
         if row["kind"] == "cuda":
             bars += [(f"{size}\n{label}", row[label]) for label in ("forward", "forward_backward")]
-        else:
+        elif row["kind"] == "cpu":
             bars.append((f"{size}\nCPU", {k: row[k] for k in ("one_thread", "two_threads", "twin")}))
     figure, axes = plt.subplots(figsize=(max(6.0, 1.6 * len(bars)), 5.0))
     names = sorted({name for _, values in bars for name in values})
@@ -300,6 +342,8 @@ def main() -> None:
     if options.device.startswith("cuda"):
         cells = CELLS[:4] if options.quick else CELLS
         rows += cuda_rows(points, cells=cells, seed=options.seed, repeats=repeats)
+        rows.append(memory_row(seed=options.seed))
+        print(json.dumps(rows[-1]))
     else:
         rows.append(cpu_row(points, seed=options.seed, repeats=5 if options.quick else 15))
     aims, why_null = judge(rows)
@@ -322,7 +366,7 @@ def main() -> None:
             for label in ("forward", "forward_backward"):
                 figures = "  ".join(f"{name} {ms:8.3f}" for name, ms in row[label].items())
                 print(f"{row['gaussians']:>9} {row['width']}x{row['height']} {label:17} {figures} ms")
-        else:
+        elif row["kind"] == "cpu":
             figures = "  ".join(f"{k} {row[k]:.1f}" for k in ("one_thread", "two_threads", "twin"))
             print(f"{row['gaussians']:>9} {row['width']}x{row['height']} cpu               {figures} ms")
     print(json.dumps({"aims": aims, "why_null": why_null}, indent=1))

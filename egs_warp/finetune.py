@@ -218,8 +218,8 @@ def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    """Peak signal to noise ratio in dB of two pictures in 0 to 1."""
-    return float(-10.0 * np.log10(max(float(np.mean((a.astype(np.float64) - b) ** 2)), 1e-20)))
+    """Peak signal to noise ratio in dB of two pictures in 0 to 1; at most 100."""
+    return float(-10.0 * np.log10(max(float(np.mean((a.astype(np.float64) - b) ** 2)), 1e-10)))
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,7 @@ def train(
 def read_views(
     posed: Path | str, *, background: tuple[float, float, float] = (1.0, 1.0, 1.0), max_side: int | None = None
 ) -> list[TrainingView]:
-    """Photos and cameras; a photo with alpha is laid over ``background`` and its alpha becomes the view's weightless mask.
+    """Photos and cameras; a photo with alpha is laid over ``background``.
 
     Raises ``UserError`` for a photo that is missing, unreadable or of another shape than its camera.
     """
@@ -97,13 +97,13 @@ def read_views(
         pixels = cv2.imread(str(entry.image), cv2.IMREAD_UNCHANGED)
         if pixels is None:
             raise UserError(f"{entry.image}: not a readable picture; export it again as PNG or JPEG")
-        full = np.iinfo(pixels.dtype).max if np.issubdtype(pixels.dtype, np.integer) else 1.0
-        values = np.atleast_3d(pixels).astype(np.float32) / full
+        full = {"uint8": 255.0, "uint16": 65535.0}.get(pixels.dtype.name, 1.0)
+        values = np.atleast_3d(np.asarray(pixels, dtype=np.float32)) / full
         colour = values[:, :, :3][:, :, ::-1] if values.shape[2] >= 3 else np.repeat(values[:, :, :1], 3, axis=2)
         camera = _scaled(entry.camera, colour.shape[1], colour.shape[0], entry.image)
         if values.shape[2] == 4:
             alpha = values[:, :, 3:]
-            colour = colour * alpha + (1 - alpha) * np.float32(background)
+            colour = colour * alpha + (1 - alpha) * np.asarray(background, dtype=np.float32)
         side = max(camera.width, camera.height)
         if max_side is not None and side > max_side:
             width, height = (max(1, round(s * max_side / side)) for s in (camera.width, camera.height))

@@ -12,6 +12,7 @@ import warp as wp
 from egs_warp.camera import Camera
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
+from egs_warp.render.arrays import zeros
 from egs_warp.render.backward import backward
 from egs_warp.render.compositing import RenderedImage, composite
 from egs_warp.render.projection import ProjectedGaussians, project, view_from_camera
@@ -158,7 +159,7 @@ class _Render(torch.autograd.Function):
                 strict=True,
             ):
                 if gradient is None:
-                    by_pixel.append(wp.zeros(array.size, dtype=dtype, device=done.cloud.device))
+                    by_pixel.append(zeros(array.size, dtype, done.cloud.device))
                 else:
                     by_pixel.append(wp.from_torch(gradient.detach().contiguous(), dtype=dtype).flatten())
             gradients = backward(
@@ -171,7 +172,9 @@ class _Render(torch.autograd.Function):
                 threads=ctx.options.threads,
             )
             names = ("means", "rotations", "log_scales", "opacity_logits", "sh", "pose_rotation", "pose_translation")
-            tensors = [wp.to_torch(getattr(gradients, name)) for name in (*names, "screen")]
+            tensors: list[torch.Tensor | None] = [wp.to_torch(getattr(gradients, name)) for name in (*names, "screen")]
+            # The pose's gradient is the sum of every Gaussian's part.
             for index in (5, 6):
-                tensors[index] = tensors[index].sum(dim=0) if ctx.want_pose else None
+                part = tensors[index]
+                tensors[index] = part.sum(dim=0) if ctx.want_pose and part is not None else None
             return (*tensors, None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import warp as wp
 
@@ -11,7 +12,7 @@ from egs_warp.kernels.render_backward import (
     pixel_gradients_kernel,
     project_backward_kernel,
 )
-from egs_warp.kernels.render_projection import View
+from egs_warp.render.arrays import empty, zeros
 from egs_warp.render.compositing import RenderedImage
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.threads import launch_ranges
@@ -42,7 +43,7 @@ class CloudGradients:
 
 def backward(
     cloud: GaussianCloud,
-    view: View,
+    view: Any,
     projected: ProjectedGaussians,
     lists: TileLists,
     image: RenderedImage,
@@ -57,8 +58,8 @@ def backward(
     """Gradients for (H * W,) vec3, float32 and float32 gradients of ``image``'s colour, alpha and depth."""
     device, count = cloud.device, cloud.count
     pixels = int(view.width) * int(view.height)
-    sum_gradient = wp.empty(pixels, dtype=wp.vec4, device=device)
-    remaining = wp.empty(pixels, dtype=wp.float32, device=device)
+    sum_gradient = empty(pixels, wp.vec4, device)
+    remaining = empty(pixels, wp.float32, device)
     wp.launch(
         pixel_gradients_kernel,
         dim=pixels,
@@ -70,7 +71,7 @@ def backward(
         device=device,
     )
     # Zero, because pairs behind the last open pixel of a tile are never visited.
-    moments = wp.zeros((max(projected.slot_count, 1), 3), dtype=wp.vec4, device=device)
+    moments = zeros((max(projected.slot_count, 1), 3), wp.vec4, device)
     inputs = [
         *(view.width, view.height, lists.tile_start, lists.gaussian_from_intersection, lists.slot_from_intersection),
         *(projected.ellipse, projected.falloff, projected.colour_depth, sum_gradient, remaining),
@@ -102,14 +103,14 @@ def backward(
         )
     poses = count if want_pose else 0
     gradients = CloudGradients(
-        means=wp.empty(count, dtype=wp.vec3, device=device),
-        rotations=wp.empty(count, dtype=wp.vec4, device=device),
-        log_scales=wp.empty(count, dtype=wp.vec3, device=device),
-        opacity_logits=wp.empty(count, dtype=wp.float32, device=device),
-        sh=wp.empty(cloud.sh.shape, dtype=wp.vec3, device=device),
-        screen=wp.empty(count, dtype=wp.vec2, device=device),
-        pose_rotation=wp.empty(poses, dtype=wp.mat33, device=device),
-        pose_translation=wp.empty(poses, dtype=wp.vec3, device=device),
+        means=empty(count, wp.vec3, device),
+        rotations=empty(count, wp.vec4, device),
+        log_scales=empty(count, wp.vec3, device),
+        opacity_logits=empty(count, wp.float32, device),
+        sh=empty(cloud.sh.shape, wp.vec3, device),
+        screen=empty(count, wp.vec2, device),
+        pose_rotation=empty(poses, wp.mat33, device),
+        pose_translation=empty(poses, wp.vec3, device),
     )
     launch_ranges(
         project_backward_kernel,

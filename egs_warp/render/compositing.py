@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.kernels.render_compositing import composite_geometry_kernel, splat_normals_kernel
-from egs_warp.kernels.render_projection import View
+from egs_warp.render.arrays import empty
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.threads import launch_ranges
 from egs_warp.render.tiles import TileLists
@@ -46,14 +47,14 @@ class RenderedImage:
 
 
 def composite(
-    projected: ProjectedGaussians, lists: TileLists, view: View, *, background: Background, threads: int
+    projected: ProjectedGaussians, lists: TileLists, view: Any, *, background: Background, threads: int
 ) -> RenderedImage:
     """Blend every tile's Gaussians from front to back over ``background``."""
-    device = projected.ellipse.device
+    device: Any = projected.ellipse.device
     width, height = int(view.width), int(view.height)
-    colour = wp.empty(width * height, dtype=wp.vec3, device=device)
-    alpha = wp.empty(width * height, dtype=wp.float32, device=device)
-    depth = wp.empty(width * height, dtype=wp.float32, device=device)
+    colour = empty(width * height, wp.vec3, device)
+    alpha = empty(width * height, wp.float32, device)
+    depth = empty(width * height, wp.float32, device)
     inputs = [
         width,
         height,
@@ -100,14 +101,14 @@ def add_geometry(
     cloud: GaussianCloud,
     projected: ProjectedGaussians,
     lists: TileLists,
-    view: View,
+    view: Any,
     *,
     threads: int,
 ) -> RenderedImage:
     """``image`` with median depth and normals."""
     device = cloud.device
     width, height = int(view.width), int(view.height)
-    splat_normals = wp.empty(cloud.count, dtype=wp.vec3, device=device)
+    splat_normals = empty(cloud.count, wp.vec3, device)
     launch_ranges(
         splat_normals_kernel,
         cloud.count,
@@ -116,8 +117,8 @@ def add_geometry(
         device=device,
         threads=threads,
     )
-    median_depth = wp.empty(width * height, dtype=wp.float32, device=device)
-    normal = wp.empty(width * height, dtype=wp.vec3, device=device)
+    median_depth = empty(width * height, wp.float32, device)
+    normal = empty(width * height, wp.vec3, device)
     launch_ranges(
         composite_geometry_kernel,
         lists.tile_count * 256,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -11,6 +12,7 @@ from egs_warp.camera import Camera
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.kernels.render_projection import View, project_kernel
+from egs_warp.render.arrays import empty
 from egs_warp.render.threads import launch_ranges
 
 _ATTRIBUTES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
@@ -32,7 +34,7 @@ class ProjectedGaussians:
     """Number of (Gaussian, tile) pairs."""
 
 
-def view_from_camera(camera: Camera) -> View:
+def view_from_camera(camera: Camera) -> Any:
     """The camera in single precision, with the bounds of the projection's Jacobian. Raises ``UserError`` for an
     impossible camera.
     """
@@ -58,16 +60,16 @@ def view_from_camera(camera: Camera) -> View:
     return view
 
 
-def project(cloud: GaussianCloud, view: View, *, antialiased: bool, threads: int) -> ProjectedGaussians:
+def project(cloud: GaussianCloud, view: Any, *, antialiased: bool, threads: int) -> ProjectedGaussians:
     """Project every Gaussian of ``cloud``; those outside the view, or fainter than 1/255 everywhere, reach no tile.
 
     Raises ``UserError`` that names the first Gaussian with a non-finite value, if there is one.
     """
     device, count = cloud.device, cloud.count
-    ellipse = wp.empty(count, dtype=wp.vec4, device=device)
-    falloff = wp.empty(count, dtype=wp.vec2, device=device)
-    colour_depth = wp.empty(count, dtype=wp.vec4, device=device)
-    tile_count = wp.empty(count, dtype=wp.int64, device=device)
+    ellipse = empty(count, wp.vec4, device)
+    falloff = empty(count, wp.vec2, device)
+    colour_depth = empty(count, wp.vec4, device)
+    tile_count = empty(count, wp.int64, device)
     # The first non-finite Gaussian by attribute, then the number of slots: one read-back for all.
     findings = wp.full(len(_ATTRIBUTES) + 1, count, dtype=wp.int64, device=device)
     launch_ranges(

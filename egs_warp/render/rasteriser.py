@@ -69,11 +69,12 @@ def refusing_what_does_not_fit(cloud: GaussianCloud, camera: Camera) -> Iterator
         ) from error
 
 
-def background_of(background: object, camera: Camera, device: wp.Device) -> Background:
+def background_of(background: Any, camera: Camera, device: Any) -> Background:
     """From a colour or an image (H, W, 3). Raises ``UserError`` for anything else."""
     shape = (camera.height, camera.width)
     if isinstance(background, wp.array) and background.dtype == wp.vec3 and background.shape == shape:
-        return Background(wp.vec3(), background.to(device).contiguous().flatten())
+        image: Any = background.to(device).contiguous()
+        return Background(wp.vec3(), image.flatten())
     values = np.asarray(background.numpy() if isinstance(background, wp.array) else background, dtype=np.float32)
     if values.shape not in ((3,), (*shape, 3)) or not np.isfinite(values).all():
         raise UserError(

@@ -17,12 +17,12 @@ def available_threads() -> int:
 
 
 def launch_ranges(
-    kernel: wp.Kernel,
+    kernel: Any,
     count: int,
     *,
     inputs: Sequence[Any],
     outputs: Sequence[Any],
-    device: wp.Device,
+    device: Any,
     threads: int,
     work: np.ndarray | None = None,
 ) -> None:

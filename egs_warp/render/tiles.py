@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from egs_warp.kernels.render_ellipse import TILE
-from egs_warp.kernels.render_projection import View
 from egs_warp.kernels.render_tiles import band_lists_kernel, emit_tiles_kernel, tile_starts_kernel
+from egs_warp.render.arrays import empty, zeros
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.threads import launch_ranges
 
@@ -35,29 +36,30 @@ class TileLists:
         return self.tile_start.shape[0] - 1
 
 
-def build_tile_lists(projected: ProjectedGaussians, view: View, *, threads: int) -> TileLists:
+def build_tile_lists(projected: ProjectedGaussians, view: Any, *, threads: int) -> TileLists:
     """Sort the visible Gaussians by depth and list them for every tile that they reach (exact ellipse-tile test)."""
     columns = -(-view.width // TILE_SIDE)
     rows = -(-view.height // TILE_SIDE)
-    if projected.ellipse.device.is_cuda:
+    device: Any = projected.ellipse.device
+    if device.is_cuda:
         return _lists_by_sorting(projected, view, columns * rows)
     return _lists_by_counting(projected, view, columns, rows, threads)
 
 
-def _lists_by_counting(projected: ProjectedGaussians, view: View, columns: int, rows: int, threads: int) -> TileLists:
+def _lists_by_counting(projected: ProjectedGaussians, view: Any, columns: int, rows: int, threads: int) -> TileLists:
     """Counting sort: bands of tile rows are filled side by side, each from front to back: no pair is compared."""
     device = projected.ellipse.device
     gaussian_from_visible = np.flatnonzero(np.diff(projected.slot_end.numpy(), prepend=0)).astype(np.int32)
     visible_count = len(gaussian_from_visible)
-    keys = wp.empty(2 * max(visible_count, 1), dtype=wp.float32, device=device)
-    order = wp.empty(2 * max(visible_count, 1), dtype=wp.int32, device=device)
+    keys = empty(2 * max(visible_count, 1), wp.float32, device)
+    order = empty(2 * max(visible_count, 1), wp.int32, device)
     keys.numpy()[:visible_count] = projected.colour_depth.numpy()[gaussian_from_visible, 3]
     order.numpy()[:visible_count] = gaussian_from_visible
     wp.utils.radix_sort_pairs(keys, order, visible_count)
 
-    band_rows = max(1, -(-rows // (4 * threads))) if threads > 1 else rows
-    gaussians = wp.empty(max(projected.slot_count, 1), dtype=wp.int32, device=device)
-    slots = wp.empty(max(projected.slot_count, 1), dtype=wp.int32, device=device)
+    band_rows = max(1, -(-rows // (2 * threads))) if threads > 1 else rows
+    gaussians = empty(max(projected.slot_count, 1), wp.int32, device)
+    slots = empty(max(projected.slot_count, 1), wp.int32, device)
 
     def walk(cursor: wp.array, fill: int) -> None:
         shared = [order, projected.slot_end, projected.ellipse, projected.falloff]
@@ -70,7 +72,7 @@ def _lists_by_counting(projected: ProjectedGaussians, view: View, columns: int, 
             threads=threads,
         )
 
-    counts = wp.zeros(columns * rows, dtype=wp.int32, device=device)
+    counts = zeros(columns * rows, wp.int32, device)
     walk(counts, 0)
     work = counts.numpy().copy()
     tile_start = np.concatenate([[0], np.cumsum(work)]).astype(np.int32)
@@ -78,17 +80,17 @@ def _lists_by_counting(projected: ProjectedGaussians, view: View, columns: int, 
     return TileLists(wp.array(tile_start, dtype=wp.int32, device=device), gaussians, slots, work)
 
 
-def _lists_by_sorting(projected: ProjectedGaussians, view: View, tiles: int) -> TileLists:
+def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int) -> TileLists:
     """Radix sort of all (tile, Gaussian) pairs by tile and depth."""
     device = projected.ellipse.device
     count, pairs = projected.slot_end.shape[0], projected.slot_count
-    gaussians = wp.empty(max(pairs, 1), dtype=wp.int32, device=device)
-    slots = wp.empty(2 * max(pairs, 1), dtype=wp.int32, device=device)
+    gaussians = empty(max(pairs, 1), wp.int32, device)
+    slots = empty(2 * max(pairs, 1), wp.int32, device)
     if pairs == 0:
-        return TileLists(wp.zeros(tiles + 1, dtype=wp.int32, device=device), gaussians, slots, None)
-    tile_start = wp.empty(tiles + 1, dtype=wp.int32, device=device)
-    keys = wp.empty(2 * pairs, dtype=wp.int64, device=device)
-    gaussian_from_slot = wp.empty(pairs, dtype=wp.int32, device=device)
+        return TileLists(zeros(tiles + 1, wp.int32, device), gaussians, slots, None)
+    tile_start = empty(tiles + 1, wp.int32, device)
+    keys = empty(2 * pairs, wp.int64, device)
+    gaussian_from_slot = empty(pairs, wp.int32, device)
     wp.launch(
         emit_tiles_kernel,
         dim=count,
