@@ -165,6 +165,26 @@ def test_several_cameras_and_what_does_not_fit(monkeypatch: pytest.MonkeyPatch) 
         render(cloud, cameras[0])
 
 
+@pytest.mark.cuda
+def test_a_full_gpu_refuses_and_works_again() -> None:
+    """240 million pairs want 8 GB where 600 MB are left."""
+    torch = pytest.importorskip("torch")
+    values = random_scene(200_000, coefficients=1, log_scale=3.0)
+    values["opacity_logits"][:] = 2.0
+    values["means"] += [0.0, 0.0, 3.0]
+    cloud, camera = cloud_of(values, "cuda:0"), camera_of(640, 480)
+    free, _ = torch.cuda.mem_get_info()
+    hog = torch.empty(free - 600_000_000, dtype=torch.uint8, device="cuda")
+    with pytest.raises(
+        UserError, match=r"^render: 200000 Gaussians at 640 x 480 do not fit into the memory of cuda:0; "
+    ):
+        render(cloud, camera)
+    del hog
+    torch.cuda.empty_cache()
+    small = random_scene(300)
+    assert_same(render(cloud_of(small, "cuda:0"), camera_of()), render_twin(small, camera_of()))
+
+
 def test_rotating_the_object_equals_rotating_the_camera(device: str) -> None:
     values = random_scene(300, coefficients=1, seed=4)
     camera = camera_of()

@@ -162,15 +162,16 @@ class _Render(torch.autograd.Function):
                     by_pixel.append(zeros(array.size, dtype, done.cloud.device))
                 else:
                     by_pixel.append(wp.from_torch(gradient.detach().contiguous(), dtype=dtype).flatten())
-            gradients = backward(
-                *(done.cloud, done.view, done.projected, done.lists, done.image),
-                colour_gradient=by_pixel[0],
-                alpha_gradient=by_pixel[1],
-                depth_gradient=by_pixel[2],
-                antialiased=ctx.options.antialiased,
-                want_pose=ctx.want_pose,
-                threads=ctx.options.threads,
-            )
+            with refusing_what_does_not_fit(done.cloud, ctx.options.camera):
+                gradients = backward(
+                    *(done.cloud, done.view, done.projected, done.lists, done.image),
+                    colour_gradient=by_pixel[0],
+                    alpha_gradient=by_pixel[1],
+                    depth_gradient=by_pixel[2],
+                    antialiased=ctx.options.antialiased,
+                    want_pose=ctx.want_pose,
+                    threads=ctx.options.threads,
+                )
             names = ("means", "rotations", "log_scales", "opacity_logits", "sh", "pose_rotation", "pose_translation")
             tensors: list[torch.Tensor | None] = [wp.to_torch(getattr(gradients, name)) for name in (*names, "screen")]
             # The pose's gradient is the sum of every Gaussian's part.

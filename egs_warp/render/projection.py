@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,19 +39,21 @@ def view_from_camera(camera: Camera) -> Any:
     """The camera in single precision, with the bounds of the projection's Jacobian. Raises ``UserError`` for an
     impossible camera.
     """
-    numbers = [camera.fx, camera.fy, camera.cx, camera.cy, camera.near, *camera.rotation.ravel(), *camera.translation]
-    if not np.isfinite(numbers).all() or camera.fx <= 0 or camera.fy <= 0:
+    rotation = np.asarray(camera.rotation, dtype=np.float64).ravel().tolist()
+    translation = np.asarray(camera.translation, dtype=np.float64).tolist()
+    numbers = (camera.fx, camera.fy, camera.cx, camera.cy, camera.near, *rotation, *translation)
+    if not all(map(math.isfinite, numbers)) or camera.fx <= 0 or camera.fy <= 0:
         raise UserError("camera: its pose and intrinsics must be finite and its focal lengths positive")
     if camera.width < 1 or camera.height < 1:
         raise UserError(f"camera: image size {camera.width} x {camera.height} must be at least 1 x 1")
     if not 0 < camera.near < camera.far:
         raise UserError(f"camera: near {camera.near} and far {camera.far} must satisfy 0 < near < far")
     view = View()
-    view.rotation = wp.mat33(np.asarray(camera.rotation, dtype=np.float32))
-    view.translation = wp.vec3(*np.asarray(camera.translation, dtype=np.float32))
-    view.centre = wp.vec3(*camera.centre.astype(np.float32))
+    view.rotation = wp.mat33(*rotation)
+    view.translation = wp.vec3(*translation)
+    view.centre = wp.vec3(*camera.centre.tolist())
     view.fx, view.fy, view.cx, view.cy = camera.fx, camera.fy, camera.cx, camera.cy
-    view.near, view.far = camera.near, min(camera.far, float(np.finfo(np.float32).max))
+    view.near, view.far = camera.near, min(camera.far, 3.4e38)
     view.width, view.height = camera.width, camera.height
     margin_x, margin_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy
     view.slope_low = wp.vec2(-camera.cx / camera.fx - margin_x, -camera.cy / camera.fy - margin_y)

@@ -15,6 +15,7 @@ from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.threads import launch_ranges
 
 TILE_SIDE = int(TILE)
+_LARGE_SORT = 10_000_000
 
 
 @dataclass(frozen=True)
@@ -105,6 +106,9 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int) -> T
         outputs=[keys, gaussian_from_slot, slots],
         device=device,
     )
+    if pairs > _LARGE_SORT:
+        # The sort takes scratch memory inside Warp, which does not report a failure: see first whether there is any.
+        empty(12 * pairs, wp.uint8, device)
     wp.utils.radix_sort_pairs(keys, slots, pairs, end_bit=31 + max(tiles - 1, 1).bit_length())
     wp.launch(
         tile_starts_kernel,
