@@ -1,13 +1,14 @@
 # Plain venv + pip; constraints.txt pins every package.
 PYTHON ?= python3
 VENV := .venv
+FRAMES ?= 110
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .PHONY: demo test setup lint types examples clean
 
 demo: $(VENV)/demo.stamp
-	$(BIN)/python examples/jump.py --out out/jump
+	$(BIN)/python examples/jump.py --out out/jump --frames $(FRAMES)
 
 test: setup
 	$(BIN)/python -m pytest

@@ -170,6 +170,12 @@ class ContactDetector:
         )
         return self._gaps.numpy().copy(), self._nearest.numpy().copy()
 
+    def points_within(self, positions: np.ndarray, distance: float) -> np.ndarray:
+        """(k, 3) contact points that are nearer than ``distance`` metres to a plane at ``positions`` (N, 3)."""
+        near = np.flatnonzero(self.gaps(positions)[0] < distance)
+        nodes = self.geometry.mesh.tets[self.geometry.tet_from_point[near]]
+        return np.einsum("kw,kwi->ki", self.geometry.weights[near], positions[nodes])
+
     def contact_set(self, points: np.ndarray, positions: np.ndarray) -> ContactSet:
         """The given points with their frames; ``positions`` (N, 3) at the start of the step."""
         gaps, nearest = self.gaps(positions)
@@ -278,10 +284,7 @@ def coulomb_forces(
             if current < tolerance:
                 break
             jacobian = _projection_jacobian(delassus, rate, force, velocity, friction)
-            try:
-                step = dense.solve(jacobian, -value.ravel(), check_finite=False, overwrite_a=True).reshape(count, 3)
-            except (np.linalg.LinAlgError, ValueError):
-                break
+            step = _newton_step(jacobian, -value.ravel()).reshape(count, 3)
             length = 1.0
             while length > 1e-3:
                 trial = force + length * step
@@ -299,6 +302,15 @@ def coulomb_forces(
         force = best
     normal = np.maximum(best[:, 0], 0.0)
     return _project(np.column_stack([normal, best[:, 1:]]), normal, friction), best_size
+
+
+def _newton_step(jacobian: np.ndarray, right: np.ndarray) -> np.ndarray:
+    factors, pivots, _ = dense.lapack.dgetrf(jacobian)
+    diagonal = np.abs(np.diag(factors))
+    if diagonal.min() > 1e-11 * diagonal.max():
+        return dense.lapack.dgetrs(factors, pivots, right)[0]
+    # Redundant contacts: of all steps that do equally well, the shortest keeps the forces bounded.
+    return np.linalg.lstsq(jacobian, right, rcond=1e-11)[0]
 
 
 def _project(force: np.ndarray, normal: np.ndarray, friction: float) -> np.ndarray:

@@ -67,7 +67,7 @@ def contact_step(
             if iteration % 4 == 0:  # the tangent changes little between corrections
                 step.factor(velocities)
                 delassus = dt * (contacts.frame @ step.factorisation.solve(contacts.frame.T.toarray()))
-                delassus = 0.5 * (delassus + delassus.T)
+                delassus = 0.5 * (delassus + np.transpose(delassus))
                 # More points than the cage can resolve leave it singular; this moves no velocity by more than 1e-7.
                 delassus[np.diag_indices_from(delassus)] += 1e-7 * delassus.diagonal().mean()
             speed = contacts.frame @ velocities.ravel()

@@ -47,8 +47,8 @@ class LocomotionSettings:
     push_out_cap: float = 0.05
     qp_limit: int = 3
     """QPs a step at most."""
-    activation_weight: float = 1e-4
-    activation_change_weight: float = 1e-3
+    activation_weight: float = 2e-4
+    activation_change_weight: float = 3e-4
     drag: float = 0.0
     """alpha, 1/s."""
 

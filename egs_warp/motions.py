@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from enum import Enum
 
 import numpy as np
@@ -43,11 +43,17 @@ class JumpPlan:
     flight_time: float
     speed_up: float
     speed_forward: float
+    lean: float
+    """How far the centre of mass moves ahead while crouching."""
+    landing_lag: float
+    """How far it is behind its place over the base at touch-down."""
     landing_rate: float
-    """1/s of the critically damped landing."""
+    """1/s of the critically damped descent on landing."""
 
 
-def plan_jump(target: JumpTarget, *, height: float, gravity: float, step: float) -> JumpPlan:
+def plan_jump(
+    target: JumpTarget, *, height: float, com_height: float, support_behind: float, support_ahead: float, gravity: float, step: float
+) -> JumpPlan:
     """Stroke, times and take-off velocity for a jump of ``target`` by a body of ``height`` H (DESIGN 9)."""
     time_unit = np.sqrt(height / gravity)
     extension = min(0.04 * height, 0.25 * target.height)
@@ -57,8 +63,13 @@ def plan_jump(target: JumpTarget, *, height: float, gravity: float, step: float)
     stroke = max(speed_up**2 / (2.0 * acceleration), extension + 0.02 * height)
     thrust_time = 2.0 * stroke / speed_up
     flight_time = 2.0 * np.sqrt(2.0 * rise / gravity)
-    landing_rate = 4.0 / time_unit
-    speed_forward = target.distance / (flight_time + 1.0 / landing_rate + 0.5 * thrust_time)
+    lean = min(0.3 * support_ahead, 0.05 * height, 0.2 * target.distance)
+    # A body that comes in with speed v stops over its base if that is ahead by v sqrt(h/g) (the capture point); the
+    # front of the footprint helps.
+    capture_time = np.sqrt(com_height / (1.3 * gravity))
+    help_ = min(0.3 * support_ahead, 0.5 * target.distance * capture_time / flight_time)
+    speed_forward = (target.distance - lean + help_) / (flight_time + capture_time + 0.5 * thrust_time)
+    landing_lag = speed_forward * capture_time - help_
     return JumpPlan(
         crouch_depth=stroke - extension,
         extension=extension,
@@ -67,7 +78,9 @@ def plan_jump(target: JumpTarget, *, height: float, gravity: float, step: float)
         flight_time=flight_time,
         speed_up=speed_up,
         speed_forward=speed_forward,
-        landing_rate=landing_rate,
+        lean=lean,
+        landing_lag=landing_lag,
+        landing_rate=4.0 / time_unit,
     )
 
 
@@ -81,14 +94,23 @@ class Jump:
         standing: np.ndarray,
         target: JumpTarget,
         *,
+        touching: np.ndarray,
         step: float,
         weights: Weights | None = None,
     ) -> None:
         self.body, self.ground, self.target = body, ground, target
         self.weights = weights or Weights()
-        self.pose = PoseFamily(body, ground, standing)
+        self.pose = PoseFamily(body, ground, standing, touching)
         self.gravity = float(np.linalg.norm(body.gravity))
-        self.plan = plan_jump(target, height=body.height, gravity=self.gravity, step=step)
+        self.plan = plan_jump(
+            target,
+            height=body.height,
+            com_height=self.pose.standing_height,
+            support_behind=float(-self.pose.support_low[0]),
+            support_ahead=float(self.pose.support_high[0]),
+            gravity=self.gravity,
+            step=step,
+        )
         self.phase = JumpPhase.SETTLE
         self._entered = 0.0
         local = ground.local(standing)
@@ -98,6 +120,19 @@ class Jump:
         self._pose = np.eye(3)
         self._time_unit = float(np.sqrt(body.height / self.gravity))
         self._flew = False
+        self._overran: list[JumpPhase] = []
+
+    def planned(self) -> dict[str, float]:
+        """What the jump aims at, after re-planning: metres, seconds, m/s."""
+        return {name: float(value) for name, value in asdict(self.plan).items()}
+
+    def notes(self) -> list[str]:
+        """What kept the jump from its target, for the user."""
+        named = {
+            JumpPhase.THRUST: "the muscles could not reach the take-off speed within the time of a thrust",
+            JumpPhase.FLIGHT: "the body never came back to the ground",
+        }
+        return [f"{phase.value} took too long: {named[phase]}" for phase in self._overran]
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
@@ -110,6 +145,7 @@ class Jump:
             position, velocity = self._stance_reference(elapsed)
             rate = 6.0 / self._time_unit
             com_velocity = velocity + rate * (position - velocity * dt - seen.com)
+            com_velocity = self._balanced(seen, com_velocity, dt)
             if self.phase is JumpPhase.THRUST:
                 com_velocity[2] = min(com_velocity[2], self._sufficient_speed(seen, dt))
             return self._stand(state, com_velocity, position, self._start_base, dt)
@@ -120,13 +156,17 @@ class Jump:
         following = {
             JumpPhase.SETTLE: elapsed >= 0.3 * self._time_unit,
             JumpPhase.CROUCH: elapsed >= plan.crouch_time,
-            JumpPhase.THRUST: self._risen(seen, dt) or elapsed > 3.0 * plan.thrust_time,
-            JumpPhase.FLIGHT: self._flew and seen.touching or elapsed > 3.0 * plan.flight_time,
+            JumpPhase.THRUST: self._risen(seen, dt),
+            JumpPhase.FLIGHT: self._flew and seen.touching,
             JumpPhase.LAND: elapsed >= 5.0 * self._time_unit,
             JumpPhase.REST: False,
         }
         if self.phase is JumpPhase.FLIGHT and not seen.touching:
             self._flew = True
+        limits = {JumpPhase.THRUST: 3.0 * plan.thrust_time, JumpPhase.FLIGHT: 3.0 * plan.flight_time}
+        if not following[self.phase] and elapsed > limits.get(self.phase, np.inf):
+            self._overran.append(self.phase)
+            following[self.phase] = True
         if following[self.phase]:
             self.phase = list(JumpPhase)[list(JumpPhase).index(self.phase) + 1]
             self._entered = time
@@ -148,7 +188,7 @@ class Jump:
         plan, start = self.plan, self._start_com
         if self.phase is JumpPhase.SETTLE:
             return start, np.zeros(3)
-        down = np.array([0.0, 0.0, -plan.crouch_depth])
+        down = np.array([plan.lean, 0.0, -plan.crouch_depth])
         if self.phase is JumpPhase.CROUCH:
             s = min(elapsed / plan.crouch_time, 1.0)
             blend, slope = s * s * (3 - 2 * s), 6 * s * (1 - s) / plan.crouch_time
@@ -164,9 +204,15 @@ class Jump:
             spin = self.pose.turn_towards(state, landing) / self.plan.flight_time
         return self._write(state, com_velocity, pose, spin, dt)
 
+    def _balanced(self, seen: Measurement, velocity: np.ndarray, dt: float) -> np.ndarray:
+        """``velocity`` (3,) with its horizontal change kept within what the feet can give."""
+        acceleration = (velocity - seen.velocity) / dt
+        level = self.pose.balanced_acceleration(seen, acceleration[:2], float(acceleration[2]), self.gravity)
+        return np.array([*(seen.velocity[:2] + dt * level), velocity[2]])
+
     def _landing_com(self, position: np.ndarray) -> np.ndarray:
-        lag = self.plan.speed_forward / self.plan.landing_rate
-        return np.array([self._goal_base[0] - self.pose.base_offset[0] - lag, position[1], self._start_com[2]])
+        ahead = self._goal_base[0] - self.pose.base_offset[0] - self.plan.landing_lag
+        return np.array([ahead, position[1], self._start_com[2]])
 
     def _fly(self, state: BodyState, seen: Measurement, dt: float) -> list[Objective | SpinObjective]:
         drop = max(seen.com[2] - self._start_com[2], 0.0)
@@ -185,7 +231,11 @@ class Jump:
         goal = np.array([*(seen.base - self.pose.base_offset), self._start_com[2]])
         acceleration = rate**2 * (goal - seen.com) - 2.0 * rate * seen.velocity
         acceleration[2] = max(acceleration[2], -0.8 * self.gravity)
-        velocity = seen.velocity + dt * acceleration
+        # Sideways the capture point com + v sqrt(h/g) is steered to its place over the base.
+        pendulum = self.gravity / seen.com[2]
+        capture = seen.com[:2] + seen.velocity[:2] / np.sqrt(pendulum)
+        acceleration[:2] = -2.0 * pendulum * (capture - goal[:2]) + pendulum * (seen.com[:2] - goal[:2])
+        velocity = self._balanced(seen, seen.velocity + dt * acceleration, dt)
         return self._stand(state, velocity, seen.com + dt * velocity, seen.base, dt)
 
     def _write(self, state: BodyState, com_velocity, pose, spin, dt: float) -> list[Objective | SpinObjective]:

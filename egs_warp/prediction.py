@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from egs_warp.contact import ContactSet, push_out_speeds
-from egs_warp.dynamics import ImplicitStep, NewtonResult, PenaltyTerms
+from egs_warp.dynamics import ImplicitStep, NewtonResult
 
 
 @dataclass(frozen=True)

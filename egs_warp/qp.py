@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 import numpy as np
 import osqp
@@ -68,12 +69,13 @@ class QuadraticProgram:
         else:
             self._solver.update(l=lower, u=upper)
         result = self._solver.solve(raise_error=False)
+        codes: Any = osqp.SolverStatus
         status = {
-            osqp.SolverStatus.OSQP_SOLVED: QpStatus.SOLVED,
-            osqp.SolverStatus.OSQP_SOLVED_INACCURATE: QpStatus.INEXACT,
-            osqp.SolverStatus.OSQP_MAX_ITER_REACHED: QpStatus.INEXACT,
-            osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE: QpStatus.INFEASIBLE,
-            osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE_INACCURATE: QpStatus.INFEASIBLE,
+            codes.OSQP_SOLVED: QpStatus.SOLVED,
+            codes.OSQP_SOLVED_INACCURATE: QpStatus.INEXACT,
+            codes.OSQP_MAX_ITER_REACHED: QpStatus.INEXACT,
+            codes.OSQP_PRIMAL_INFEASIBLE: QpStatus.INFEASIBLE,
+            codes.OSQP_PRIMAL_INFEASIBLE_INACCURATE: QpStatus.INFEASIBLE,
         }.get(result.info.status_val, QpStatus.FAILED)
         solution = QpSolution(status, result.x, result.y, float("inf"))
         if not solution.usable or result.x is None or not np.isfinite(result.x).all():

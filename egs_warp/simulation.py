@@ -23,9 +23,7 @@ FRAME_RATE = 60
 class Motion(Protocol):
     """Anything that writes objectives from the measured state."""
 
-    def objectives(
-        self, state: BodyState, report: StepReport | None, dt: float
-    ) -> list[Objective | SpinObjective]:
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
         """Objectives of the step of ``dt`` seconds that starts at ``state``; ``report`` is of the step before."""
         ...
 

@@ -17,8 +17,8 @@ from egs_warp.plane import Plane
 class Weights:
     """Weights of a motion's objectives; speeds are compared in sqrt(g H)."""
 
-    com: float = 1.0
-    spin: float = 1.0
+    com: float = 2.0
+    spin: float = 5.0
     pose: float = 0.02
 
 
@@ -65,7 +65,8 @@ class Ground:
 class PoseFamily:
     """Affine poses of the rest shape, A = stretch along up, bulge across it, shear by the lean (DESIGN 9)."""
 
-    def __init__(self, body: SoftBody, ground: Ground, standing: np.ndarray) -> None:
+    def __init__(self, body: SoftBody, ground: Ground, standing: np.ndarray, touching: np.ndarray) -> None:
+        """``standing`` (N, 3): nodes at rest; ``touching`` (k, 3): points of the body on the ground then."""
         self.body, self.ground = body, ground
         local = ground.local(standing)
         self._arms = (local - body.centre_of_mass(local)) @ ground.axes
@@ -75,6 +76,26 @@ class PoseFamily:
         self._sole_mass = body.node_mass * sole
         self._standing = standing
         self.base_offset = self._base(local) - body.centre_of_mass(local)[:2]
+        footprint = ground.local(touching)[:, :2] - body.centre_of_mass(local)[:2]
+        self.support_low = np.minimum(footprint.min(axis=0), -0.01 * body.height)
+        self.support_high = np.maximum(footprint.max(axis=0), 0.01 * body.height)
+
+    def balanced_acceleration(
+        self, seen: Measurement, wanted: np.ndarray, up: float, gravity: float, *, margin: float = 0.8
+    ) -> np.ndarray:
+        """(2,) the horizontal acceleration nearest to ``wanted`` (2,) m/s^2 that the feet can give without tipping the body.
+
+        The centre of pressure com - h a / (g + ``up``) stays within ``margin`` of the footprint (linear inverted pendulum).
+        """
+        lever = max(seen.com[2], 0.3 * self.standing_height) / max(gravity + up, 0.2 * gravity)
+        pressure = seen.com[:2] - lever * wanted
+        place = seen.base - self.base_offset
+        # Never ask for a fall: some push either way stays allowed even where the centre of mass is past the edge.
+        slack = 0.04 * self.body.height
+        low = np.minimum(place + margin * self.support_low, seen.com[:2] - slack)
+        high = np.maximum(place + margin * self.support_high, seen.com[:2] + slack)
+        pressure = np.clip(pressure, low, high)
+        return (seen.com[:2] - pressure) / lever
 
     def _base(self, local: np.ndarray) -> np.ndarray:
         return (self._sole_mass @ local / self._sole_mass.sum())[:2]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -59,7 +60,8 @@ class Trajectory:
     def save(self, path: Path) -> None:
         """Write ``trajectory.npz``; the same trajectory gives the same bytes."""
         with atomic_write(path) as temporary, temporary.open("wb") as stream:
-            np.savez(stream, **{name: np.asarray(getattr(self, name)) for name in self.__dataclass_fields__})
+            arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in self.__dataclass_fields__}
+            np.savez(stream, **arrays)
 
     @classmethod
     def load(cls, path: Path) -> Trajectory:
@@ -133,9 +135,7 @@ def record(
         contact_nodes=joined([r.contacts.nodes for r in reports], (4,), np.int32),
         contact_weights=joined([r.contacts.weights for r in reports], (4,), np.float64),
         contact_normal=joined([r.contacts.axes[:, 0] for r in reports], (3,), np.float64),
-        contact_force=joined(
-            [np.einsum("na,nai->ni", r.forces, r.contacts.axes) for r in reports], (3,), np.float64
-        ),
+        contact_force=joined([np.einsum("na,nai->ni", r.forces, r.contacts.axes) for r in reports], (3,), np.float64),
         contact_gap=joined([r.end_gaps for r in reports], (), np.float64),
         min_gap=np.array([start_gap, *(report.min_gap for report in reports)]),
         activations=joined([r.activations[None] for r in reports], (segments,), np.float64),
@@ -170,9 +170,7 @@ def audit(trajectory: Trajectory, *, newton_unconverged: int = 0) -> Audit:
         angular_momentum_residual=float(np.linalg.norm(angular, axis=1).max(initial=0.0) / (weight * t.height)),
         cone_violation=float(max(np.maximum(tangent - t.friction * normal, -normal).max(initial=0.0) / weight, 0.0)),
         penetration=float(max(-t.min_gap.min(), 0.0) / t.height),
-        complementarity_gap=float(
-            (normal * np.maximum(t.contact_gap, 0.0)).max(initial=0.0) / (weight * t.height)
-        ),
+        complementarity_gap=float((normal * np.maximum(t.contact_gap, 0.0)).max(initial=0.0) / (weight * t.height)),
         inverted_elements=int((np.linalg.det(edges) <= 0.0).sum()),
         newton_unconverged=newton_unconverged,
     )

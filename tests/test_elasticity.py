@@ -38,7 +38,9 @@ def test_gradient_is_derivative_of_energy(bent) -> None:
     for _ in range(4):
         direction = rng.standard_normal(x.shape)
         h = 1e-6
-        elastic = (assembly.energy(x + h * direction, 0 * v, 0) - assembly.energy(x - h * direction, 0 * v, 0)) / (2 * h)
+        elastic = (assembly.energy(x + h * direction, 0 * v, 0) - assembly.energy(x - h * direction, 0 * v, 0)) / (
+            2 * h
+        )
         assert elastic == pytest.approx(np.sum(assembly.gradient(x, 0 * v) * direction), rel=1e-6)
         damped = (assembly.energy(x, v + h * direction, 1.0) - assembly.energy(x, v - h * direction, 1.0)) / (2 * h)
         damping = assembly.gradient(x, v) - assembly.gradient(x, 0 * v)

@@ -82,8 +82,8 @@ def enclosed_kernel(
     misses = int(0)
     for direction in range(27):
         if direction != 13:
-            dx = direction / 9 - 1
-            dy = (direction / 3) % 3 - 1
+            dx = direction // 9 - 1
+            dy = (direction // 3) % 3 - 1
             dz = direction % 3 - 1
             px = x + dx
             py = y + dy
@@ -97,9 +97,7 @@ def enclosed_kernel(
                 and py < occupied.shape[1]
                 and pz < occupied.shape[2]
             ):
-                if pz < 0:
-                    hit = 1
-                elif occupied[px, py, pz] != wp.uint8(0):
+                if pz < 0 or occupied[px, py, pz] != wp.uint8(0):
                     hit = 1
                 px += dx
                 py += dy

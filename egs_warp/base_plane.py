@@ -1,0 +1,107 @@
+"""The plane an object stands on, and which way is up, when nobody says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from egs_warp.errors import UserError
+from egs_warp.gaussians import GaussianCloud
+from egs_warp.plane import Plane
+
+_COLUMNS = 64
+"""Columns across the longer side of the footprint."""
+_SEARCHED_SHARE = 0.15
+"""The support is looked for in this share of the height, from the bottom."""
+_BANDWIDTH = 0.01
+"""Of the height: undersides this close are one support."""
+_MAX_MASS_BELOW = 0.015
+"""Share of the opacity mass that may lie below the plane: half of what contact can leave out."""
+
+
+@dataclass(frozen=True)
+class _Underside:
+    """What the object looks like from below."""
+
+    heights: np.ndarray
+    """(n,) of all means along up, scene units."""
+    opacities: np.ndarray
+    """(n,)"""
+    low: float
+    high: float
+    """Robust lowest and highest height."""
+    bottoms: np.ndarray
+    """(c,) lowest visible height of each column."""
+    columns: np.ndarray
+    """(c, 2) integer position of each column."""
+    column_width: float
+
+    @property
+    def size(self) -> float:
+        """Robust height, scene units."""
+        return self.high - self.low
+
+
+def find_base_plane(cloud: GaussianCloud, up: np.ndarray) -> Plane:
+    """Plane square to ``up`` (3,) on which the object stands.
+
+    The object is cut into columns; their lowest visible Gaussians are its underside. The support is the densest level
+    of the underside in the lowest 15 % of the height (strays are too few to make one), the plane the lower edge of that
+    level. It is lowered, if need be, until at most 1.5 % of the opacity mass lies below it.
+
+    Raises ``UserError`` if the object has no height.
+    """
+    normal = np.asarray(up, dtype=np.float64)
+    normal = normal / np.linalg.norm(normal)
+    underside = _underside(cloud, normal)
+    level = min(_support_level(underside), _mass_quantile(underside.heights, underside.opacities, _MAX_MASS_BELOW))
+    return Plane(normal, -level)
+
+
+def _underside(cloud: GaussianCloud, normal: np.ndarray) -> _Underside:
+    means, opacities = cloud.means.numpy().astype(np.float64), cloud.opacities()
+    heights = means @ normal
+    low, high = (_mass_quantile(heights, opacities, share) for share in (0.002, 0.998))
+    if not high > low:
+        raise UserError(
+            f"object: its {cloud.count} Gaussians have no height along up, so no plane can be found; check --up"
+        )
+    first, second = Plane(normal, 0.0).tangents()
+    across = np.stack([means @ first, means @ second], axis=1)
+    box = np.array([[_mass_quantile(across[:, k], opacities, share) for share in (0.002, 0.998)] for k in range(2)])
+    width = max(float(np.ptp(box, axis=1).max()) / _COLUMNS, 1e-12 * (high - low))
+    # Faint captures have hardly any opaque Gaussian: what counts as visible follows the capture.
+    visible = opacities >= min(0.3, 0.5 * _mass_quantile(opacities, opacities, 0.5))
+    column = np.floor((across[visible] - box[:, 0]) / width).astype(np.int64)
+    near = np.all((column >= -2) & (column <= _COLUMNS + 2), axis=1)
+    columns, of = np.unique(column[near], axis=0, return_inverse=True)
+    bottoms = np.full(len(columns), np.inf)
+    np.minimum.at(bottoms, of.ravel(), heights[visible][near])
+    return _Underside(heights, opacities, low, high, bottoms, columns, width)
+
+
+def _support_level(underside: _Underside) -> float:
+    """Height of the lower edge of the densest low level of the underside."""
+    size = underside.size
+    bottoms = underside.bottoms[
+        (underside.bottoms > underside.low - 0.1 * size) & (underside.bottoms < underside.low + _SEARCHED_SHARE * size)
+    ]
+    if len(bottoms) == 0:
+        return underside.low
+    levels = np.linspace(underside.low - 0.1 * size, underside.low + _SEARCHED_SHARE * size, 501)
+    density = np.exp(-0.5 * ((levels[:, None] - bottoms[None, :]) / (_BANDWIDTH * size)) ** 2).sum(axis=1)
+    # The lowest peak that holds its own against the highest: a bevel above the sole may be the larger of the two.
+    inner = density[1:-1]
+    peaks = 1 + np.flatnonzero((inner >= density[:-2]) & (inner > density[2:]) & (inner > 0.5 * density.max()))
+    mode = levels[peaks[0]] if len(peaks) else levels[int(np.argmax(density))]
+    members = bottoms[np.abs(bottoms - mode) <= 1.5 * _BANDWIDTH * size]
+    return float(np.quantile(members, 0.15)) if len(members) else float(mode)
+
+
+def _mass_quantile(values: np.ndarray, masses: np.ndarray, share: float) -> float:
+    """The value below which at most ``share`` of the mass lies."""
+    order = np.argsort(values, kind="stable")
+    mass = np.cumsum(masses[order])
+    return float(values[order][min(int(np.searchsorted(mass, share * mass[-1])), len(values) - 1)])
