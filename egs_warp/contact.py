@@ -305,10 +305,13 @@ def coulomb_forces(
 
 
 def _newton_step(jacobian: np.ndarray, right: np.ndarray) -> np.ndarray:
-    factors, pivots, _ = dense.lapack.dgetrf(jacobian)
+    factor, solve = dense.get_lapack_funcs(("getrf", "getrs"), (jacobian,))
+    factors, pivots, _ = factor(jacobian)
     diagonal = np.abs(np.diag(factors))
     if diagonal.min() > 1e-11 * diagonal.max():
-        return dense.lapack.dgetrs(factors, pivots, right)[0]
+        return solve(factors, pivots, right)[0]
+    if not np.isfinite(diagonal).all():
+        return np.zeros_like(right)
     # Redundant contacts: of all steps that do equally well, the shortest keeps the forces bounded.
     return np.linalg.lstsq(jacobian, right, rcond=1e-11)[0]
 
