@@ -109,8 +109,8 @@ def split_bent(
     """Replace each Gaussian that ``bend`` marks by its children, once (Eq. 17). Everything stays at rest.
 
     ``MEASURED`` marks an axis whose ends are turned against each other by more than ``threshold_degrees``, if the affine
-    motion is wrong by more than ``min_error`` metres at one standard deviation (default: 3e-4 of the cage's diagonal, a
-    third of a pixel where the object fills 1000). ``PAPER`` marks theta of Eq. (16) alone. ``parents`` and ``depths``
+    motion is wrong by more than ``min_error`` metres at one standard deviation (default: 1e-3 of the cage's diagonal: of
+    2e-4 to 2e-3, best in benchmarks/table1.py). ``PAPER`` marks theta of Eq. (16) alone. ``parents`` and ``depths``
     (n,) are those of an earlier call; a Gaussian of ``max_depth`` is not split again. Where there would be more than
     ``max_count`` Gaussians, those with the largest misfit are split.
     """
@@ -122,7 +122,7 @@ def split_bent(
         axes = np.argmax(cloud.log_scales.numpy(), axis=1)
         marked = bend.bend_degrees > threshold_degrees
     else:
-        least = 3e-4 * embedding.cage.extent if min_error is None else min_error
+        least = 1e-3 * embedding.cage.extent if min_error is None else min_error
         error = np.where(bend.curl_degrees > threshold_degrees, bend.fit_error, 0.0)
         axes = np.argmax(error, axis=1)
         marked = error.max(axis=1) > least

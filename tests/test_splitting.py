@@ -90,7 +90,7 @@ def test_splitting_for_a_motion_makes_every_part_nearly_affine() -> None:
     after = Deformer(result.cloud, result.embedding).measure_bend(frames)
     visible = result.cloud.opacities() > 0.01
     assert after.fit_error[visible].max() < 0.5 * before.fit_error[cloud.opacities() > 0.05].max()
-    wrong = (after.curl_degrees > 15.0) & (after.fit_error > 3e-4 * embedding.cage.extent)
+    wrong = (after.curl_degrees > 15.0) & (after.fit_error > 1e-3 * embedding.cage.extent)
     assert not (wrong.any(axis=1) & (result.depths < 3) & visible).any()
     capped = split_for_motion(cloud, embedding, frames, max_growth=1.5)
     assert cloud.count < capped.cloud.count <= 1.5 * cloud.count

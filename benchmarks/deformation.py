@@ -1,0 +1,223 @@
+"""Cost of carrying a million Gaussians with degree 3 colour (seven points, covariance, SVD, SH rotation).
+
+Aims: ``cuda_within_2x_copy`` (on a GPU, at most twice the time that its bytes need at measured copy bandwidth),
+``cpu_5x_twin`` (on a CPU, at least 5 times as fast as the same in vectorised PyTorch on as many threads).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+sys.path.insert(0, str(Path(__file__).parent))
+import mesh_scenes as scenes
+
+from egs_warp.deformation import Deformer
+from egs_warp.embedding import GaussianEmbedding, embed_gaussians
+from egs_warp.gaussians import GaussianCloud
+
+BYTES_READ = 16 + 12 + 7 * 4 + 7 * 32 + 24
+"""Rotation, scales, seven tetrahedra, seven weights, six arms; the cage itself stays in cache."""
+BYTES_WRITTEN = 12 + 16 + 12 + 36
+BYTES_OF_COLOUR = 36 + 15 * 12 + 15 * 12
+"""The turn, and bands 1 to 3 read and written."""
+
+
+def random_cloud(count: int, seed: int, device: str) -> GaussianCloud:
+    """Gaussians of many sizes in the unit cube, the larger ones reaching into several tetrahedra."""
+    rng = np.random.default_rng(seed)
+    return GaussianCloud.from_numpy(
+        rng.uniform(0.0, 1.0, (count, 3)),
+        rng.normal(size=(count, 4)),
+        rng.uniform(-7.0, -3.0, (count, 3)),
+        rng.normal(size=count),
+        rng.normal(size=(count, 16, 3)),
+        device=device,
+    )
+
+
+def _basis_2(d: torch.Tensor) -> torch.Tensor:
+    x, y, z = d.unbind(-1)
+    c = 1.0925484305920792
+    return torch.stack(
+        [c * x * y, -c * y * z, 0.31539156525252005 * (2 * z * z - x * x - y * y), -c * x * z, c / 2 * (x * x - y * y)],
+        -1,
+    )
+
+
+def _basis_3(d: torch.Tensor) -> torch.Tensor:
+    x, y, z = d.unbind(-1)
+    return torch.stack(
+        [
+            -0.5900435899266435 * y * (3 * x * x - y * y),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
+            0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+            -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
+            1.445305721320277 * z * (x * x - y * y),
+            -0.5900435899266435 * x * (x * x - 3 * y * y),
+        ],
+        -1,
+    )
+
+
+class TorchTwin:
+    """The same in vectorised PyTorch, whole arrays at a time."""
+
+    def __init__(self, cloud: GaussianCloud, embedding: GaussianEmbedding) -> None:
+        points = embedding.points
+        self.nodes = wp.to_torch(points.nodes).long().reshape(-1, 7, 4)
+        self.weights = wp.to_torch(points.weights).reshape(-1, 7, 4)
+        self.arms = wp.to_torch(embedding.arms).double()
+        q = wp.to_torch(cloud.rotations)
+        w, x, y, z = q.unbind(1)
+        self.axes = torch.stack(
+            [
+                torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], 1),
+                torch.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], 1),
+                torch.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1),
+            ],
+            1,
+        )
+        self.scales = wp.to_torch(cloud.log_scales).exp()
+        self.sh = wp.to_torch(cloud.sh)
+        directions = torch.nn.functional.normalize(torch.randn(7, 3, generator=torch.Generator().manual_seed(2)), dim=1)
+        self.directions = directions.to(q.device)
+        self.from_values_2 = torch.linalg.inv(_basis_2(self.directions[:5]))
+        self.from_values_3 = torch.linalg.inv(_basis_3(self.directions))
+
+    def deform(self, positions: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Means, covariance factor (rotation, scales) and colour for node positions (N, 3)."""
+        ends = (self.weights[..., None] * positions[self.nodes]).sum(2)
+        mean = ends[:, 0]
+        plus = (ends[:, 1:4] - mean[:, None]) / self.arms[:, :3, None]
+        minus = (mean[:, None] - ends[:, 4:7]) / self.arms[:, 3:, None]
+        stretched = (0.5 * (plus + minus)).transpose(1, 2).float()
+        u, _, v = torch.linalg.svd(stretched)
+        carried = u @ v
+        frame, scales, _ = torch.linalg.svd(stretched * self.scales[:, None])
+        turn = carried @ self.axes.transpose(1, 2)
+        colour = self.sh.clone()
+        linear = torch.stack([-self.sh[:, 3], -self.sh[:, 1], self.sh[:, 2]], 1)
+        linear = turn @ linear
+        colour[:, 3], colour[:, 1], colour[:, 2] = -linear[:, 0], -linear[:, 1], linear[:, 2]
+        back = self.directions @ turn
+        colour[:, 4:9] = self.from_values_2 @ (_basis_2(back[:, :5]) @ self.sh[:, 4:9])
+        colour[:, 9:16] = self.from_values_3 @ (_basis_3(back) @ self.sh[:, 9:16])
+        # The singular values come in falling order; the engine keeps the order of the axes instead.
+        return mean.float(), frame, scales, colour
+
+
+def median_ms(calls: dict[str, Callable[[], Any]], repeats: int, synchronise: Callable[[], Any]) -> dict[str, float]:
+    """Median milliseconds of each; they take turns."""
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for turn in range(repeats + 2):
+        for name, call in calls.items():
+            synchronise()
+            start = time.perf_counter()
+            call()
+            synchronise()
+            if turn >= 2:
+                times[name].append(1e3 * (time.perf_counter() - start))
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def main() -> None:
+    """Run, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    wp.init()
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--device", default="cuda:0" if wp.is_cuda_available() else "cpu")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--plot", type=Path)
+    parser.add_argument("--gaussians", type=int)
+    options = parser.parse_args()
+    device = wp.get_device(options.device)
+    count = options.gaussians or (1_000_000 if device.is_cuda or not options.quick else 200_000)
+    cage = scenes.box_cage(np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]), 7)
+    cloud = random_cloud(count, options.seed, options.device)
+    embedding = embed_gaussians(cloud, cage)
+    deformer, twin = Deformer(cloud, embedding), TorchTwin(cloud, embedding)
+    positions = wp.array(scenes.bend(cage.nodes), dtype=wp.vec3d, device=device)
+    torch_positions = wp.to_torch(positions)
+    ours, theirs = deformer.deform(positions).cloud, twin.deform(torch_positions)
+    off = {
+        "means": float((wp.to_torch(ours.means) - theirs[0]).abs().max()),
+        "scales": float(
+            (wp.to_torch(ours.log_scales).exp().sort(dim=1).values / theirs[2].sort(dim=1).values - 1).abs().median()
+        ),
+        "colour": float((wp.to_torch(ours.sh) - theirs[3]).abs().median()),
+    }
+    calls: dict[str, Callable[[], Any]] = {
+        "deform": lambda: deformer.deform(positions),
+        "torch_twin": lambda: twin.deform(torch_positions),
+    }
+    bytes_moved = count * (BYTES_READ + BYTES_WRITTEN + BYTES_OF_COLOUR)
+    source = wp.zeros(bytes_moved // 8, dtype=wp.float32, device=device)
+    target = wp.empty_like(source)
+    # Reading and writing half of the bytes each moves as many as the deformation does.
+    calls["copy"] = lambda: wp.copy(target, source)
+    if device.is_cuda:
+        with wp.ScopedCapture(device=device) as capture:
+            deformer.deform(positions)
+        graph = capture.graph
+        calls["deform_in_graph"] = lambda: wp.capture_launch(graph)
+    times = median_ms(calls, 5 if options.quick else 15, lambda: wp.synchronize_device(device))
+    fastest = min(times["deform"], times.get("deform_in_graph", np.inf))
+    row = {
+        "gaussians": count,
+        "nodes": len(cage.nodes),
+        "tets": len(cage.tets),
+        "in_one_tet": float(
+            (wp.to_torch(embedding.points.tets).reshape(-1, 7).diff(dim=1) == 0).all(dim=1).float().mean()
+        ),
+        "milliseconds": times,
+        "bytes": bytes_moved,
+        "copy_gigabytes_per_second": bytes_moved / times["copy"] / 1e6,
+        "times_copy": fastest / times["copy"],
+        "twin_over_ours": times["torch_twin"] / fastest,
+        "difference_from_twin": off,
+    }
+    aims: dict[str, bool | None] = {
+        "cuda_within_2x_copy": row["times_copy"] <= 2.0 if device.is_cuda else None,
+        "cpu_5x_twin": None if device.is_cuda else row["twin_over_ours"] >= 5.0,
+    }
+    why = {name: f"cannot be measured on {device.name}" for name, value in aims.items() if value is None}
+    print(f"{count} Gaussians on {device.name}: " + ", ".join(f"{name} {ms:.3f} ms" for name, ms in times.items()))
+    print(
+        f"  {row['times_copy']:.2f} times the copy of its bytes, {row['twin_over_ours']:.1f} times as fast as PyTorch"
+    )
+    print(f"  difference from PyTorch: {off}")
+    print(json.dumps({"aims": aims, "why_null": why}, indent=1))
+    environment = {**scenes.environment(options.device, options.seed), "torch": torch.__version__}
+    environment["torch_threads"] = torch.get_num_threads()
+    if options.json:
+        options.json.write_text(
+            json.dumps({"rows": [row], "environment": environment, "aims": aims, "why_null": why}, indent=1)
+        )
+    if options.plot:
+        import matplotlib
+
+        matplotlib.use("Agg")
+        from matplotlib import pyplot
+
+        figure, axes = pyplot.subplots(figsize=(5, 2.5))
+        axes.barh(list(times), list(times.values()))
+        axes.set_xlabel(f"ms for {count:,} Gaussians, {device.name}")
+        figure.tight_layout()
+        figure.savefig(options.plot)
+
+
+if __name__ == "__main__":
+    main()
