@@ -12,7 +12,7 @@ MIN_ATTACHMENT_NODES = 8
 """Fewer nodes than this would concentrate the force on one or two elements, which then crumple."""
 
 _NEWTON_ITERATIONS = 30
-_MULTIPLIER_PENALTY = 1e-3
+_MULTIPLIER_PENALTY = 0.05
 
 
 def edge_graph(mesh: TetMesh) -> sp.csr_matrix:

@@ -33,8 +33,8 @@ class Fibre:
     kind: FibreKind
     points: np.ndarray
     """(K, 3) float64, metres, K >= 2; a closed hoop repeats its first point at its end."""
-    max_force: float
-    """Strength F_max of each segment, newtons."""
+    max_force: float | np.ndarray
+    """Strength F_max of its segments, newtons: one number, or (K-1,)."""
     group: int = 0
     """Fibres of one group belong together (one branch, or the user's choice)."""
     partner: str | None = None

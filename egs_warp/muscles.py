@@ -13,9 +13,11 @@ import warp as wp
 
 from egs_warp.attachments import attachment_rows, mean_edge_length
 from egs_warp.errors import UserError
+from egs_warp.fibre_layout import lay_fibres
 from egs_warp.fibres import Fibre, FibreKind
 from egs_warp.kernels.muscles import muscle_columns_kernel, muscle_entries_kernel
 from egs_warp.precision import Vec3, real
+from egs_warp.skeleton import skeleton
 from egs_warp.tetmesh import TetMesh
 
 
@@ -180,7 +182,7 @@ def attach_fibres(
             f'muscles: a segment of fibre "{names[fibre_from_segment[segment]]}" has no length inside the body; '
             "put its points further apart"
         )
-    max_forces = np.array([fibre.max_force for fibre in fibres])[fibre_from_segment]
+    max_forces = np.concatenate([np.broadcast_to(fibre.max_force, len(fibre.points) - 1) for fibre in fibres])
     bounds = max_strain * rest_lengths
     return MuscleSet(
         end_rows=end_rows,
@@ -194,3 +196,32 @@ def attach_fibres(
         fibre_groups=np.array([fibre.group for fibre in fibres], dtype=np.int32),
         fibre_partners=np.array([index_from_name.get(fibre.partner or "", -1) for fibre in fibres], dtype=np.int32),
     )
+
+
+def automatic_muscles(
+    mesh: TetMesh,
+    plane_normal: np.ndarray,
+    *,
+    body_weight: float,
+    height: float,
+    strength: float = 4.0,
+    max_strain: float = 0.3,
+    sag: float = 0.05,
+    max_segments: int = 112,
+) -> MuscleSet:
+    """Muscles for any body: fibres of every kind along each branch of its curve skeleton (DESIGN 6).
+
+    ``plane_normal`` (3,) points away from the ground; ``body_weight`` in newtons; ``height`` in metres along the normal;
+    ``strength`` is F_max of a segment in body weights. It is lowered where the body is thin: all longitudinal fibres
+    of a section together pull no harder than its area times E, E = body_weight height / (volume sag).
+    """
+    volume = float(mesh.volumes().sum())
+    young = body_weight * height / (volume * sag)
+    fibres = lay_fibres(
+        mesh,
+        skeleton(mesh, plane_normal),
+        max_force=strength * body_weight,
+        max_stress=young,
+        max_segments=max_segments,
+    )
+    return attach_fibres(mesh, fibres, max_strain=max_strain)

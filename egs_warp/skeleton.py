@@ -4,7 +4,8 @@ A height-like function phi is made that grows along every limb away from the gro
 is heated evenly and cooled only at its base, so that heat flows down every limb to the ground: -lap u = 1, u = 0 at the
 base; u has no minimum but the base and no maximum but the tips), then phi with the direction of u's gradient and unit
 slope, as in the heat method of Crane, Weischedel and Wardetzky (2013). Connected slabs of phi are the body's sections;
-how they join is its Reeb graph, whose short and thin chains are merged into their neighbours.
+how they join is its Reeb graph, whose short and thin chains are merged into their neighbours. Slabs cut through
+tetrahedra (phi is linear inside each), so that a coarse mesh has as fine a skeleton as a dense one.
 """
 
 from __future__ import annotations
@@ -22,8 +23,11 @@ from egs_warp.tetmesh import TetMesh
 
 _BASE_FRACTION = 0.02
 """Nodes lower than this part of the body's height above its lowest point are its base (or half an edge, if more)."""
-_SLAB_EDGES = 1.25
-"""Thickness of a section in mean edge lengths: fewer would break sections into single nodes."""
+_SECTION_COUNT = 24
+"""Sections from the base to the farthest tip."""
+_SAMPLES_PER_EDGE = 4
+"""A tetrahedron is sampled at the points of a lattice with this many along its edge (20 points in all)."""
+_SMOOTHING_PASSES = 3
 _MIN_BRANCH_VOLUME = 0.01
 """A branch holds at least this part of the body's volume."""
 _MIN_BRANCH_SLENDERNESS = 1.5
@@ -38,10 +42,12 @@ class Branch:
     """(K, 3) float64, metres, K >= 2."""
     radii: np.ndarray
     """(K,) float64, metres: radius of the disc with the section's area."""
-    sections: tuple[np.ndarray, ...]
-    """K arrays of node indices: the nodes of each section."""
+    own: np.ndarray
+    """(K,) bool: the section belongs to this branch alone; elsewhere the branch runs inside a junction."""
     starts_on_ground: bool
     """Its first point lies on the body's base."""
+    ends_freely: bool
+    """Its last point is a tip of the body."""
     volume: float
     """Cubic metres of the body that its sections hold."""
 
@@ -66,10 +72,9 @@ def skeleton(mesh: TetMesh, up: np.ndarray) -> Skeleton:
     The same mesh gives the same bits every time.
     """
     up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
-    ascent = ascent_field(mesh, up)
-    graph = _SectionGraph.sliced(mesh, ascent)
+    graph = _SectionGraph(mesh, ascent_field(mesh, up), up)
     graph.merge_insignificant_chains()
-    branches = [graph.branch(chain, ascent) for chain in graph.joined_chains()]
+    branches = [graph.branch(chain) for chain in graph.joined_chains()]
     branches.sort(key=lambda branch: -branch.volume)
     return Skeleton(tuple(branches), up)
 
@@ -105,35 +110,37 @@ def ascent_field(mesh: TetMesh, up: np.ndarray) -> np.ndarray:
 class _SectionGraph:
     """Sections (connected slabs of equal ascent) and which of them touch; merging changes it in place."""
 
-    def __init__(self, mesh: TetMesh, label_from_node: np.ndarray, level_from_section: np.ndarray, thickness: float):
-        self.mesh = mesh
-        self.thickness = thickness
-        self.level = {section: int(level) for section, level in enumerate(level_from_section)}
-        self.nodes = {section: np.flatnonzero(label_from_node == section) for section in self.level}
-        self.node_volumes = mesh.lumped_masses(1.0)
-        self.total_volume = float(self.node_volumes.sum())
-        edges = edge_graph(mesh).tocoo()
-        pairs = np.stack([label_from_node[edges.row], label_from_node[edges.col]], axis=1)
-        pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
+    def __init__(self, mesh: TetMesh, ascent: np.ndarray, up: np.ndarray) -> None:
+        self.thickness = float(ascent.max()) / _SECTION_COUNT
+        self.up = up
+        cells = _Cells.cut(mesh.tets, ascent / self.thickness)
+        joined = sp.coo_matrix((np.ones(len(cells.touching)), cells.touching.T), shape=(cells.count,) * 2)
+        count, section_from_cell = connected_components(joined, directed=False)
+        self.level = dict.fromkeys(range(count), 0)
+        for section, level in zip(section_from_cell, cells.level_from_cell, strict=True):
+            self.level[int(section)] = int(level)
+        grounded = np.zeros(count, dtype=bool)
+        on_base = (ascent[mesh.tets] == 0.0).any(axis=1)[cells.tet_from_cell] & (cells.level_from_cell == 0)
+        grounded[section_from_cell[on_base]] = True
+        self.grounded = {section: bool(grounded[section]) for section in self.level}
+        lattice = _tetrahedron_lattice(_SAMPLES_PER_EDGE)
+        self.samples = np.einsum("sa,tai->tsi", lattice, mesh.nodes[mesh.tets]).reshape(-1, 3)
+        self.sample_ascent = (ascent[mesh.tets] @ lattice.T).ravel()
+        self.sample_volumes = np.repeat(mesh.volumes() / len(lattice), len(lattice))
+        tet_from_sample = np.repeat(np.arange(len(mesh.tets)), len(lattice))
+        section_from_sample = section_from_cell[cells.holding(tet_from_sample, self.sample_ascent / self.thickness)]
+        order = np.argsort(section_from_sample, kind="stable")
+        starts = np.searchsorted(section_from_sample[order], np.arange(count + 1))
+        self.members = {section: order[starts[section] : starts[section + 1]] for section in self.level}
+        self.lowest = float((mesh.nodes @ up).min())
+        self.total_volume = float(self.sample_volumes.sum())
         self.neighbours: dict[int, set[int]] = {section: set() for section in self.level}
-        for a, b in pairs:
+        for a, b in np.unique(section_from_cell[cells.stacked], axis=0):
             self.neighbours[int(a)].add(int(b))
-
-    @classmethod
-    def sliced(cls, mesh: TetMesh, ascent: np.ndarray) -> _SectionGraph:
-        edges = edge_graph(mesh).tocoo()
-        levels = max(3, int(ascent.max() / (_SLAB_EDGES * edges.data.mean())))
-        thickness = float(ascent.max()) / levels
-        level = np.clip((ascent / thickness).astype(int), 0, levels - 1)
-        same = level[edges.row] == level[edges.col]
-        slabs = sp.coo_matrix((edges.data[same], (edges.row[same], edges.col[same])), shape=edges.shape)
-        count, label = connected_components(slabs, directed=False)
-        level_from_section = np.zeros(count, dtype=int)
-        level_from_section[label] = level
-        return cls(mesh, label, level_from_section, thickness)
+            self.neighbours[int(b)].add(int(a))
 
     def volume(self, sections: Iterable[int]) -> float:
-        return sum(float(self.node_volumes[self.nodes[section]].sum()) for section in sections)
+        return sum(float(self.sample_volumes[self.members[section]].sum()) for section in sections)
 
     def merge_insignificant_chains(self) -> None:
         """Merge the least chain that is no limb, until every chain is one."""
@@ -171,26 +178,41 @@ class _SectionGraph:
                 chains.append(below[0] + onward[1:])
         return chains
 
-    def branch(self, chain: list[int], ascent: np.ndarray) -> Branch:
+    def branch(self, chain: list[int]) -> Branch:
         """The polyline of a chain of sections; a free end is carried on to its tip, a ground end to the base."""
-        sections = [self.nodes[section] for section in chain]
-        points = [np.average(self.mesh.nodes[nodes], axis=0, weights=self.node_volumes[nodes]) for nodes in sections]
-        radii = [self._radius(section) for section in chain]
-        grounded = bool(np.any(ascent[sections[0]] == 0.0))
-        if grounded or len(self.neighbours[chain[0]]) <= 1:
-            lowest = sections[0][ascent[sections[0]] <= ascent[sections[0]].min() + 1e-9 * self.thickness]
-            points.insert(0, np.average(self.mesh.nodes[lowest], axis=0, weights=self.node_volumes[lowest]))
+        kept = [section for section in chain if len(self.members[section])] or chain
+        points = [self._middle(self.members[section]) for section in kept]
+        radii = [self._radius(section) for section in kept]
+        own = [not self._is_junction(section) for section in kept]
+        grounded, ends_freely = self.grounded[kept[0]], len(self.neighbours[kept[-1]]) <= 1
+        if grounded or self._is_free(kept[0]):
+            points.insert(0, self._ground_point(kept[0]) if grounded else self._extreme(kept[0], -1.0))
             radii.insert(0, radii[0])
-            sections.insert(0, sections[0])
-        if len(self.neighbours[chain[-1]]) <= 1:
-            top = sections[-1][ascent[sections[-1]] >= ascent[sections[-1]].max() - 0.25 * self.thickness]
-            points.append(np.average(self.mesh.nodes[top], axis=0, weights=self.node_volumes[top]))
+            own.insert(0, own[0])
+        if ends_freely:
+            points.append(self._extreme(kept[-1], 1.0))
             radii.append(radii[-1])
-            sections.append(sections[-1])
+            own.append(own[-1])
         polyline = np.array(points)
-        for _ in range(2):
+        for _ in range(_SMOOTHING_PASSES):
             polyline[1:-1] = 0.25 * polyline[:-2] + 0.5 * polyline[1:-1] + 0.25 * polyline[2:]
-        return Branch(polyline, np.array(radii), tuple(sections), grounded, self.volume(set(chain)))
+        return Branch(polyline, np.array(radii), np.array(own), grounded, ends_freely, self.volume(set(chain)))
+
+    def _middle(self, members: np.ndarray) -> np.ndarray:
+        return np.average(self.samples[members], axis=0, weights=self.sample_volumes[members])
+
+    def _extreme(self, section: int, sign: float) -> np.ndarray:
+        """Where a free end of the body is: the middle of the part of its last section that is farthest along."""
+        members = self.members[section]
+        ascent = sign * self.sample_ascent[members]
+        return self._middle(members[ascent >= ascent.max() - 0.25 * self.thickness])
+
+    def _ground_point(self, section: int) -> np.ndarray:
+        """The middle of the section's lowest layer, on the ground."""
+        members = self.members[section]
+        heights = self.samples[members] @ self.up
+        base = self._middle(members[heights <= heights.min() + 0.5 * self.thickness])
+        return base - (base @ self.up - self.lowest) * self.up
 
     def _radius(self, section: int) -> float:
         return float(np.sqrt(self.volume([section]) / (np.pi * self.thickness)))
@@ -242,10 +264,82 @@ class _SectionGraph:
                     self._unite(chain[0], section)
 
     def _unite(self, kept: int, gone: int) -> None:
-        self.nodes[kept] = np.sort(np.concatenate([self.nodes[kept], self.nodes.pop(gone)]))
+        self.members[kept] = np.sort(np.concatenate([self.members[kept], self.members.pop(gone)]))
+        self.grounded[kept] |= self.grounded.pop(gone)
         for other in self.neighbours.pop(gone):
             self.neighbours[other].discard(gone)
             if other != kept:
                 self.neighbours[other].add(kept)
                 self.neighbours[kept].add(other)
         del self.level[gone]
+
+
+@dataclass(frozen=True)
+class _Cells:
+    """The pieces into which slabs of equal ascent cut the tetrahedra; each tetrahedron holds a run of levels."""
+
+    tet_from_cell: np.ndarray
+    level_from_cell: np.ndarray
+    touching: np.ndarray
+    """(., 2) cells of one level that share part of a face."""
+    stacked: np.ndarray
+    """(., 2) cells of one tetrahedron on consecutive levels."""
+    first_cell: np.ndarray
+    """(T,) the cell of each tetrahedron's lowest level."""
+    first_level: np.ndarray
+    """(T,)."""
+
+    @property
+    def count(self) -> int:
+        return len(self.tet_from_cell)
+
+    @classmethod
+    def cut(cls, tets: np.ndarray, level_field: np.ndarray) -> _Cells:
+        """Cut where ``level_field`` (N,), given at the nodes and linear inside each tetrahedron, is a whole number."""
+        first, last = _level_range(level_field[tets])
+        tet_from_cell, level_from_cell = _runs(first, last)
+        first_cell = np.concatenate([[0], np.cumsum(last - first + 1)[:-1]])
+        sides, corners = _inner_faces(tets)
+        face_from_run, level = _runs(*_level_range(level_field[corners]))
+        owners = sides[face_from_run]
+        touching = first_cell[owners] + level[:, None] - first[owners]
+        below = np.flatnonzero(tet_from_cell[1:] == tet_from_cell[:-1])
+        return cls(tet_from_cell, level_from_cell, touching, np.stack([below, below + 1], axis=1), first_cell, first)
+
+    def holding(self, tets: np.ndarray, level_field: np.ndarray) -> np.ndarray:
+        """The cell of tetrahedron ``tets`` (S,) that holds the point where the field is ``level_field`` (S,)."""
+        last_level = np.append(self.first_cell[1:], self.count) - self.first_cell + self.first_level - 1
+        level = np.clip(np.floor(level_field).astype(int), self.first_level[tets], last_level[tets])
+        return self.first_cell[tets] + level - self.first_level[tets]
+
+
+def _level_range(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """First and last level (rows,) that each row of corner values (rows, corners) passes through."""
+    first = np.clip(np.floor(values.min(axis=1)).astype(int), 0, _SECTION_COUNT - 1)
+    return first, np.clip(np.ceil(values.max(axis=1)).astype(int) - 1, first, _SECTION_COUNT - 1)
+
+
+def _runs(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Row number and level of every level first .. last of each row."""
+    counts = last - first + 1
+    row = np.repeat(np.arange(len(first)), counts)
+    return row, np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts) + first[row]
+
+
+def _inner_faces(tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The two tetrahedra (I, 2) on either side of every inner face, and its three nodes (I, 3)."""
+    faces = np.sort(tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
+    order = np.lexsort(faces.T)
+    same = np.flatnonzero((faces[order[1:]] == faces[order[:-1]]).all(axis=1))
+    return np.stack([order[same], order[same + 1]], axis=1) // 4, faces[order[same]]
+
+
+def _tetrahedron_lattice(per_edge: int) -> np.ndarray:
+    """(S, 4) barycentric coordinates of a lattice of inner points."""
+    indices = [
+        (a, b, c, per_edge - 1 - a - b - c)
+        for a in range(per_edge)
+        for b in range(per_edge - a)
+        for c in range(per_edge - a - b)
+    ]
+    return (np.array(indices) + 0.25) / per_edge
