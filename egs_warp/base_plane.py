@@ -105,3 +105,56 @@ def _mass_quantile(values: np.ndarray, masses: np.ndarray, share: float) -> floa
     order = np.argsort(values, kind="stable")
     mass = np.cumsum(masses[order])
     return float(values[order][min(int(np.searchsorted(mass, share * mass[-1])), len(values) - 1)])
+
+
+_AXIS_NAMES = "xyz"
+_HABIT = {1: 0.10, 2: 0.05, 0: 0.0}
+"""Trainers and generators put up along y most often (COLMAP: -y, glTF: +y), then along z, hardly ever along x."""
+_CLEAR_MARGIN = 0.3
+
+
+def guess_up(cloud: GaussianCloud, capture_format_up: np.ndarray | None = None) -> tuple[np.ndarray, str]:
+    """Up (3,), unit, and the reason, for the user: the format's own up if it has one, else the best of the six axes.
+
+    An object rests on the side where it is supported widely and at one level. Each axis scores the area of its support
+    polygon, as a share of the silhouette seen along the axis, plus the share of its low columns that end at one level.
+    """
+    if capture_format_up is not None:
+        return np.asarray(capture_format_up, dtype=np.float64), "the file format defines it"
+    scores = []
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            up = np.zeros(3)
+            up[axis] = sign
+            polygon, level = _support_shape(cloud, up)
+            scores.append((polygon + level + _HABIT[axis], polygon, level, up))
+    # Python's sort is stable, so a tie goes to the earlier axis.
+    scores.sort(key=lambda entry: -entry[0])
+    (best, polygon, level, up), (second, _, _, other) = scores[0], scores[1]
+    margin = best - second
+    sure = "clearly" if margin > _CLEAR_MARGIN else "narrowly"
+    reason = (
+        f"guessed: its support polygon there is {100 * polygon:.0f} % of the silhouette and {100 * level:.0f} % of the "
+        f"low parts end at one level; {sure} ahead of {_name(other)}, score {best:.2f} to {second:.2f}"
+    )
+    return up, reason
+
+
+def _name(up: np.ndarray) -> str:
+    axis = int(np.argmax(np.abs(up)))
+    return f"{'-' if up[axis] < 0 else '+'}{_AXIS_NAMES[axis]}"
+
+
+def _support_shape(cloud: GaussianCloud, up: np.ndarray) -> tuple[float, float]:
+    """Area of the support polygon over that of the silhouette, and the share of low columns at support level."""
+    underside = _underside(cloud, up)
+    extent = max(underside.size, _COLUMNS * underside.column_width)
+    above = underside.bottoms - _support_level(underside)
+    support, low = np.abs(above) < 0.02 * extent, above < 0.12 * extent
+    if not low.any():
+        return 0.0, 0.0
+    try:
+        area = float(ConvexHull(underside.columns[support]).volume)
+    except (QhullError, ValueError):  # fewer than three columns, or all in one line
+        area = 0.0
+    return min(area / len(above), 1.0), float(np.sum(support) / np.sum(low))

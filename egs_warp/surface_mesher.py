@@ -55,7 +55,7 @@ def tetwild(field: SampledField, target_nodes: int) -> TetMesh | None:
         return None
 
 
-def _tetrahedralize():  # noqa: ANN202  (the type lives in a package without stubs)
+def _tetrahedralize():
     """pytetwild's function. Its 0.4.2 imports pyvista (and with it all of VTK) for an accessor that is not used here,
     though its metadata call pyvista optional: an empty module takes its place while it is imported."""
     try:
