@@ -89,22 +89,32 @@ _FORWARD = (
             if (!__any_sync(0xffffffffu, open)) break;
             unsigned mine_here = __ballot_sync(0xffffffffu, (s_parts[group + lane] >> part) & 1u);
             while (mine_here) {
-                const int k = group + __ffs(mine_here) - 1;
-                mine_here &= mine_here - 1;
-                const float4 shape = s_shape[k];
-                const float2 f = s_falloff[k];
-                const float dy = py - shape.y;
-                const float u = fmaf(shape.w, dy, px - shape.x);
-                const float power = f.y - f.x * dy * dy - shape.z * u * u;
-                if (open && power > -LOG2_255 - 1.0e-3f) {
-                    const float alpha = fminf(exp2f(power), LIMIT);
+                // Four splats' alphas are worked out side by side: one alone would wait for every step of its own.
+                int chosen[4];
+                float alphas[4];
+                #pragma unroll
+                for (int i = 0; i < 4; ++i) {
+                    const bool real = mine_here != 0;
+                    const int k = real ? group + __ffs(mine_here) - 1 : group;
+                    mine_here &= mine_here - 1;
+                    const float4 shape = s_shape[k];
+                    const float2 f = s_falloff[k];
+                    const float dy = py - shape.y;
+                    const float u = fmaf(shape.w, dy, px - shape.x);
+                    const float power = f.y - f.x * dy * dy - shape.z * u * u;
+                    chosen[i] = k;
+                    alphas[i] = real ? fminf(exp2f(power), LIMIT) : 0.0f;
+                }
+                #pragma unroll
+                for (int i = 0; i < 4; ++i) {
+                    const float alpha = alphas[i];
                     const float after = passing * (1.0f - alpha);
-                    if (alpha >= CUT) {
+                    if (open && alpha >= CUT) {
                         if (after <= STOP) {
                             open = false;
                         } else {
                             const float weight = passing * alpha;
-                            const float4 c = s_colour[k];
+                            const float4 c = s_colour[chosen[i]];
                             r = fmaf(weight, c.x, r);
                             g = fmaf(weight, c.y, g);
                             b = fmaf(weight, c.z, b);
@@ -197,20 +207,31 @@ _BACKWARD = (
             unsigned visited = 0;
             while (todo && __any_sync(0xffffffffu, open)) {
                 int chosen = 0;
-                while (todo && chosen < 8) {
-                    const int k = __ffs(todo) - 1;
-                    todo &= todo - 1;
-                    const float4 shape = s_shape[group + k];
-                    const float2 f = s_falloff[group + k];
-                    const float dy = py - shape.y;
-                    const float u = fmaf(shape.w, dy, px - shape.x);
-                    const float power = f.y - f.x * dy * dy - shape.z * u * u;
-                    float slope = 0.0f, weight = 0.0f;
-                    if (open && power > -LOG2_255 - 1.0e-3f) {
-                        const float unbounded = exp2f(power);
+                // Two splats' alphas side by side, as in the forward pass.
+                while (todo && chosen < 7) {
+                    int pair[2];
+                    float raw[2];
+                    #pragma unroll
+                    for (int i = 0; i < 2; ++i) {
+                        const bool real = todo != 0;
+                        const int k = real ? __ffs(todo) - 1 : 0;
+                        todo &= todo - 1;
+                        const float4 shape = s_shape[group + k];
+                        const float2 f = s_falloff[group + k];
+                        const float dy = py - shape.y;
+                        const float u = fmaf(shape.w, dy, px - shape.x);
+                        const float power = f.y - f.x * dy * dy - shape.z * u * u;
+                        pair[i] = k;
+                        raw[i] = real ? exp2f(power) : 0.0f;
+                    }
+                    #pragma unroll
+                    for (int i = 0; i < 2; ++i) {
+                        const int k = pair[i];
+                        const float unbounded = raw[i];
                         const float alpha = fminf(unbounded, LIMIT);
                         const float after = passing * (1.0f - alpha);
-                        if (alpha >= CUT) {
+                        float slope = 0.0f, weight = 0.0f;
+                        if (open && alpha >= CUT) {
                             if (after <= STOP) {
                                 open = false;
                             } else {
@@ -223,13 +244,13 @@ _BACKWARD = (
                                 passing = after;
                             }
                         }
-                    }
-                    if (__any_sync(0xffffffffu, weight > 0.0f)) {
-                        s_k[part][chosen][lane] = slope;
-                        s_weight[part][chosen][lane] = weight;
-                        if (lane == 0) s_chosen[part][chosen] = k;
-                        visited |= 1u << k;
-                        ++chosen;
+                        if (__any_sync(0xffffffffu, weight > 0.0f)) {
+                            s_k[part][chosen][lane] = slope;
+                            s_weight[part][chosen][lane] = weight;
+                            if (lane == 0) s_chosen[part][chosen] = k;
+                            visited |= 1u << k;
+                            ++chosen;
+                        }
                     }
                 }
                 __syncwarp();

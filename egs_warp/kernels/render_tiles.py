@@ -61,6 +61,8 @@ def emit_tiles_kernel(
     # In:
     width: wp.int32,
     height: wp.int32,
+    nearest_bits: wp.int32,
+    depth_bits: wp.int64,
     slot_end: wp.array[wp.int64],
     ellipse: wp.array[wp.vec4],
     falloff: wp.array[wp.vec2],
@@ -80,13 +82,13 @@ def emit_tiles_kernel(
     columns = (width + TILE - 1) / TILE
     e = ellipse[g]
     f = falloff[g]
-    # Positive floats order as their bits do.
-    depth_bits = wp.int64(wp.cast(colour_depth[g][3], wp.int32))
+    # Positive floats order as their bits do; counted from those of the near plane they need fewer.
+    depth_key = wp.int64(wp.cast(colour_depth[g][3], wp.int32) - nearest_bits)
     rows = tile_rows(e, f, height)
     for row in range(rows[0], rows[1] + 1):
         span = tile_columns(e, f, row, width, height)
         for column in range(span[0], span[1] + 1):
-            key_out[slot] = (wp.int64(row * columns + column) << wp.int64(31)) | depth_bits
+            key_out[slot] = (wp.int64(row * columns + column) << depth_bits) | depth_key
             gaussian_from_slot_out[slot] = g
             slot_out[slot] = slot
             slot += 1
@@ -96,6 +98,7 @@ def emit_tiles_kernel(
 def tile_starts_kernel(
     # In:
     intersection_count: wp.int32,
+    depth_bits: wp.int64,
     key: wp.array[wp.int64],
     gaussian_from_slot: wp.array[wp.int32],
     slot_from_intersection: wp.array[wp.int32],
@@ -107,10 +110,10 @@ def tile_starts_kernel(
     i = wp.tid()
     before = wp.int32(-1)
     if i > 0:
-        before = wp.int32(key[i - 1] >> wp.int64(31))
+        before = wp.int32(key[i - 1] >> depth_bits)
     here = tile_start_out.shape[0] - 1
     if i < intersection_count:
-        here = wp.int32(key[i] >> wp.int64(31))
+        here = wp.int32(key[i] >> depth_bits)
         gaussian_from_intersection_out[i] = gaussian_from_slot[slot_from_intersection[i]]
     for tile in range(before + 1, here + 1):
         tile_start_out[tile] = i

@@ -92,12 +92,16 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int) -> T
     tile_start = empty(tiles + 1, wp.int32, device)
     keys = empty(2 * pairs, wp.int64, device)
     gaussian_from_slot = empty(pairs, wp.int32, device)
+    nearest, farthest = (int(np.float32(z).view(np.int32)) for z in (view.near, view.far))
+    depth_bits = max((farthest - nearest).bit_length(), 1)
     wp.launch(
         emit_tiles_kernel,
         dim=count,
         inputs=[
             view.width,
             view.height,
+            nearest,
+            depth_bits,
             projected.slot_end,
             projected.ellipse,
             projected.falloff,
@@ -109,11 +113,11 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int) -> T
     if pairs > _LARGE_SORT:
         # The sort takes scratch memory inside Warp, which does not report a failure: see first whether there is any.
         empty(12 * pairs, wp.uint8, device)
-    wp.utils.radix_sort_pairs(keys, slots, pairs, end_bit=31 + max(tiles - 1, 1).bit_length())
+    wp.utils.radix_sort_pairs(keys, slots, pairs, end_bit=depth_bits + max(tiles - 1, 1).bit_length())
     wp.launch(
         tile_starts_kernel,
         dim=pairs + 1,
-        inputs=[pairs, keys, gaussian_from_slot, slots],
+        inputs=[pairs, depth_bits, keys, gaussian_from_slot, slots],
         outputs=[tile_start, gaussians],
         device=device,
     )
