@@ -136,16 +136,18 @@ def _one_look(
     in_lattice = np.all((node >= 0) & (node < counts), axis=1)
     masses = np.where(in_lattice, opacities, 0.0)
     at = tuple(node.clip(0, counts - 1).T)
+    whole, labels, main, bridged = occupied, np.zeros(occupied.shape, np.int32), 0, 0
     for bridged in range(_MAX_BRIDGE + 1):
         whole = _bridge(occupied, bridged)
-        labels, _ = ndimage.label(whole, structure=np.ones((3, 3, 3), bool))
+        labels = np.zeros_like(labels)
+        ndimage.label(whole, structure=np.ones((3, 3, 3), bool), output=labels)
         piece_mass = np.bincount(labels[at], weights=masses)
         piece_mass[0] = 0.0
         main = int(np.argmax(piece_mass))
         rest = np.delete(piece_mass, [0, main]) if main else piece_mass[1:]
         if main and (rest.size == 0 or rest.max() <= _MIN_COMPONENT_TO_BRIDGE * piece_mass.sum()):
             break
-    piece = labels == main if main else whole
+    piece = np.asarray(labels == main if main else whole)
     inside = _fill(piece, cloud.device)
     belongs = in_lattice & ndimage.binary_dilation(piece)[at] & (means[:, 2] >= 0.0)
     return Solid(inside, frame, origin, spacing, belongs, means[:, 2] < 0.0, bridged)
@@ -155,9 +157,8 @@ def _bridge(occupied: np.ndarray, radius: int) -> np.ndarray:
     """Morphological closing by ``radius`` spacings."""
     if radius == 0:
         return occupied
-    distance = ndimage.distance_transform_edt(~occupied)
-    grown = distance <= radius
-    return occupied | (ndimage.distance_transform_edt(grown) > radius)
+    grown = np.asarray(ndimage.distance_transform_edt(~occupied)) <= radius
+    return occupied | (np.asarray(ndimage.distance_transform_edt(grown)) > radius)
 
 
 def _fill(piece: np.ndarray, device: wp.Device) -> np.ndarray:

@@ -59,7 +59,7 @@ def _lattice(low: np.ndarray, high: np.ndarray, cell: float) -> tuple[np.ndarray
     floor = corner.size + middle.size + np.arange(nx * ny).reshape(nx, ny)
 
     def positions(shape: tuple[int, ...], shift: tuple[float, float, float]) -> np.ndarray:
-        return start + cell * (np.stack(np.indices(shape), axis=-1).reshape(-1, 3) + np.array(shift))
+        return start + cell * (np.indices(shape).reshape(3, -1).T + np.array(shift))
 
     points = np.concatenate(
         [

@@ -113,15 +113,13 @@ def enclosed_kernel(
 def inside_mesh_kernel(
     # In:
     mesh: wp.uint64,
-    means: wp.array[wp.vec3],
-    centre: wp.vec3,
-    scale: float,
+    points: wp.array[wp.vec3],
     # Out:
     inside_out: wp.array[wp.uint8],
 ):
-    """Whether each mean lies within 1e-4 of the inside of ``mesh``, which is (x - centre) * scale of the real one."""
+    """Whether each point lies inside ``mesh`` (about one unit in size), or within 1e-4 of its surface."""
     i = wp.tid()
-    p = (means[i] - centre) * scale
+    p = points[i]
     query = wp.mesh_query_point_sign_winding_number(mesh, p, 4.0)
     if query.result:
         nearest = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
