@@ -98,7 +98,7 @@ def make_creature(
     scale = metres_per_unit or 1.0 / cage.height(plane)
     cloud, plane, cage = cloud.scaled(scale), plane.scaled(scale), cage.scaled(scale)
     body = make_body(cage.mesh, plane, device=device)
-    muscles = automatic_muscles(cage.mesh, plane.normal, body_weight=body.weight, height=body.height)
+    muscles = automatic_muscles(cage.mesh, plane.normal, body_weight=body.weight, height=body.height, young_modulus=body.young_modulus)
     geometry = contact_geometry(cloud, cage.mesh, (plane,), friction=friction, device=device)
     return Creature(cloud, plane, scale, cage, body, muscles, geometry)
 

@@ -14,6 +14,8 @@ from egs_warp.tetmesh import TetMesh
 
 GRAVITY = 9.81
 """m/s^2."""
+LARGEST_SINK = 0.02
+"""Body heights by which the centre of mass may sink from the unloaded to the standing body."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,11 @@ class SoftBody:
     def mass(self) -> float:
         """Kilograms."""
         return float(self.node_mass.sum())
+
+    @property
+    def young_modulus(self) -> float:
+        """Pascals."""
+        return self.assembly.material.young_modulus
 
     @property
     def weight(self) -> float:
@@ -90,7 +97,10 @@ def make_body(
     damping_ratio: float = 0.05,
     device: str | None = None,
 ) -> SoftBody:
-    """A body whose elasticity follows from its own height H: E = density g H / sag (DESIGN 4).
+    """A body whose elasticity follows from its own height H: E = density g H / sag, that of a column (DESIGN 4).
+
+    A body on thin legs would sink further into them than a column does; it is stiffened until its centre of mass sinks by no
+    more than ``LARGEST_SINK`` H under its weight.
 
     ``damping_ratio`` is that of the first mode of the body held at its base (nodes within 5 % of H above the plane); it sets the
     Rayleigh coefficient beta.
@@ -98,20 +108,36 @@ def make_body(
     heights = plane.heights(mesh.nodes)
     height = float(heights.max() - heights.min())
     young = density * GRAVITY * height / sag
-    undamped = ElasticAssembly(mesh, Material(young, poisson_ratio, density, 0.0), device=device)
     node_mass = mesh.lumped_masses(density)
-    frequency = _first_frequency(undamped, node_mass, heights > heights.min() + 0.05 * height)
+    free = heights > heights.min() + 0.05 * height
+    column = ElasticAssembly(mesh, Material(young, poisson_ratio, density, 0.0), device=device)
+    young *= max(1.0, _sink(column, node_mass, free, -GRAVITY * plane.normal) / (LARGEST_SINK * height))
+    undamped = ElasticAssembly(mesh, Material(young, poisson_ratio, density, 0.0), device=device)
+    frequency = _first_frequency(undamped, node_mass, free)
     damped = Material(young, poisson_ratio, density, 2.0 * damping_ratio / frequency)
     assembly = ElasticAssembly(mesh, damped, device=device)
     return SoftBody(mesh, assembly, node_mass, -GRAVITY * plane.normal, height)
 
 
+def _held_stiffness(assembly: ElasticAssembly, free: np.ndarray) -> tuple[sparse.csc_matrix, np.ndarray]:
+    """Stiffness at rest of the ``free`` (N,) nodes, and the indices of their coordinates."""
+    upper = assembly.matrix(assembly.matrix_entries(assembly.mesh.nodes, stiffness=1.0, damping=0.0))
+    kept = np.flatnonzero(np.repeat(free, 3))
+    return (upper + sparse.triu(upper, 1).T).tocsc()[kept][:, kept], kept
+
+
+def _sink(assembly: ElasticAssembly, node_mass: np.ndarray, free: np.ndarray, gravity: np.ndarray) -> float:
+    """Metres by which the centre of mass moves along ``gravity`` (3,) under the weight, linearly."""
+    stiffness, kept = _held_stiffness(assembly, free)
+    force = (node_mass[:, None] * gravity).ravel()
+    moved = np.zeros_like(force)
+    moved[kept] = sparse_linalg.spsolve(stiffness, force[kept])
+    return float(node_mass @ moved.reshape(-1, 3) @ gravity / (node_mass.sum() * np.linalg.norm(gravity)))
+
+
 def _first_frequency(assembly: ElasticAssembly, node_mass: np.ndarray, free: np.ndarray) -> float:
     """Smallest angular frequency, rad/s, with the nodes that are not ``free`` (N,) held."""
-    entries = assembly.matrix_entries(assembly.mesh.nodes, stiffness=1.0, damping=0.0)
-    upper = assembly.matrix(entries)
-    kept = np.flatnonzero(np.repeat(free, 3))
-    stiffness = (upper + sparse.triu(upper, 1).T).tocsc()[kept][:, kept]
+    stiffness, kept = _held_stiffness(assembly, free)
     mass = sparse.diags(np.repeat(node_mass, 3)[kept]).tocsc()
     start = np.ones(len(kept))
     value = sparse_linalg.eigsh(stiffness, k=1, M=mass, sigma=0.0, v0=start, return_eigenvectors=False)[0]

@@ -148,6 +148,8 @@ class Jump:
             com_velocity = self._balanced(seen, com_velocity, dt)
             if self.phase is JumpPhase.THRUST:
                 com_velocity[2] = min(com_velocity[2], self._sufficient_speed(seen, dt))
+                forward = (self._landing_com(position)[0] - seen.com[0]) / self.plan.flight_time
+                com_velocity[0] = min(com_velocity[0], max(forward, 0.0))
             return self._stand(state, com_velocity, position, self._start_base, dt)
         return self._land(state, seen, dt)
 
@@ -173,7 +175,7 @@ class Jump:
 
     def _sufficient_speed(self, seen: Measurement, dt: float) -> float:
         """Speed up, m/s, at the end of this step from which free flight reaches the asked height."""
-        rise = self._start_com[2] + self.target.height - seen.com[2]
+        rise = self._start_com[2] + 0.97 * self.target.height - seen.com[2]
         step_gain = self.gravity * dt  # v dt + (v - g dt/2)^2 / 2g = rise, solved for v
         return float(max(-0.5 * step_gain + np.sqrt(max(2.0 * self.gravity * rise, 0.0)), 0.0))
 

@@ -206,22 +206,23 @@ def automatic_muscles(
     height: float,
     strength: float = 4.0,
     max_strain: float = 0.3,
-    sag: float = 0.05,
+    young_modulus: float | None = None,
     max_segments: int = 112,
 ) -> MuscleSet:
     """Muscles for any body: fibres of every kind along each branch of its curve skeleton (DESIGN 6).
 
     ``plane_normal`` (3,) points away from the ground; ``body_weight`` in newtons; ``height`` in metres along the normal;
     ``strength`` is F_max of a segment in body weights. It is lowered where the body is thin: all longitudinal fibres
-    of a section together pull no harder than its area times E, E = body_weight height / (volume sag).
+    of a section together pull no harder than twice its area times E (``young_modulus``, pascals; default that of sag 0.05,
+    body_weight height / (0.05 volume)).
     """
     volume = float(mesh.volumes().sum())
-    young = body_weight * height / (volume * sag)
+    young = young_modulus or body_weight * height / (volume * 0.05)
     fibres = lay_fibres(
         mesh,
         skeleton(mesh, plane_normal),
         max_force=strength * body_weight,
-        max_stress=young,
+        max_stress=2.0 * young,
         max_segments=max_segments,
     )
     return attach_fibres(mesh, fibres, max_strain=max_strain)
