@@ -49,7 +49,7 @@ class Branch:
     ends_freely: bool
     """Its last point is a tip of the body."""
     volume: float
-    """Cubic metres of the body that its sections hold."""
+    """Cubic metres of the body that its own sections hold."""
 
     @property
     def length(self) -> float:
@@ -167,13 +167,23 @@ class _SectionGraph:
         return found
 
     def joined_chains(self) -> list[list[int]]:
-        """Chains; one that comes up alone to a junction is continued by the most voluminous one that leaves it."""
+        """Chains, with the one that alone carries a junction continued by the most voluminous one that leaves it.
+
+        One of several carries it alone if it has twice the volume of the next: a trunk beside a hand that rests on the
+        hip, but no leg of a stool.
+        """
         chains = self.chains() or [[section, section] for section in self.neighbours]
         for junction in sorted(self.neighbours, key=lambda section: (self.level[section], section)):
-            below = [chain for chain in chains if chain[-1] == junction]
+            below = sorted(
+                (chain for chain in chains if chain[-1] == junction),
+                key=lambda chain: (-self._own_volume(chain), chain),
+            )
             above = [chain for chain in chains if chain[0] == junction]
-            if len(below) == 1 and above:
-                onward = max(above, key=lambda chain: (self.volume(chain[1:]), chain))
+            alone = len(below) == 1 or (
+                len(below) > 1 and self._own_volume(below[0]) > 2.0 * self._own_volume(below[1])
+            )
+            if alone and above:
+                onward = max(above, key=lambda chain: (self._own_volume(chain), chain))
                 chains = [chain for chain in chains if chain is not below[0] and chain is not onward]
                 chains.append(below[0] + onward[1:])
         return chains
@@ -196,7 +206,7 @@ class _SectionGraph:
         polyline = np.array(points)
         for _ in range(_SMOOTHING_PASSES):
             polyline[1:-1] = 0.25 * polyline[:-2] + 0.5 * polyline[1:-1] + 0.25 * polyline[2:]
-        return Branch(polyline, np.array(radii), np.array(own), grounded, ends_freely, self.volume(set(chain)))
+        return Branch(polyline, np.array(radii), np.array(own), grounded, ends_freely, self._own_volume(chain))
 
     def _middle(self, members: np.ndarray) -> np.ndarray:
         return np.average(self.samples[members], axis=0, weights=self.sample_volumes[members])
@@ -226,7 +236,10 @@ class _SectionGraph:
 
     def _own(self, chain: list[int]) -> list[int]:
         """The sections of a chain that are not shared with another chain."""
-        return [section for section in chain if len(self.neighbours[section]) <= 2 and not self._is_junction(section)]
+        return [section for section in chain if not self._is_junction(section)]
+
+    def _own_volume(self, chain: list[int]) -> float:
+        return self.volume(set(self._own(chain)))
 
     def _is_junction(self, section: int) -> bool:
         return len(self.neighbours[section]) > 2
