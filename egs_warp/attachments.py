@@ -51,7 +51,7 @@ def attachment_rows(mesh: TetMesh, points: np.ndarray, *, radius: float | None =
         reached = (to_nodes <= 2.0 * radius) & (along_edges[row] <= 3.0 * radius)
         reached[order[:MIN_ATTACHMENT_NODES]] = True
         nodes = np.flatnonzero(reached)
-        scale = max(radius, float(np.sort(to_nodes[nodes])[MIN_ATTACHMENT_NODES // 2]))
+        scale = max(radius, float(np.sort(to_nodes[nodes])[MIN_ATTACHMENT_NODES - 1]))
         columns.append(nodes)
         weights.append(_maximum_entropy_weights((mesh.nodes[nodes] - point) / scale, volumes[nodes]))
         counts.append(len(nodes))

@@ -28,6 +28,7 @@ _SECTION_COUNT = 24
 _SAMPLES_PER_EDGE = 4
 """A tetrahedron is sampled at the points of a lattice with this many along its edge (20 points in all)."""
 _SMOOTHING_PASSES = 3
+_CAP_SECTIONS = 3
 _MIN_BRANCH_VOLUME = 0.01
 """A branch holds at least this part of the body's volume."""
 _MIN_BRANCH_SLENDERNESS = 1.5
@@ -125,10 +126,11 @@ class _SectionGraph:
         self.grounded = {section: bool(grounded[section]) for section in self.level}
         lattice = _tetrahedron_lattice(_SAMPLES_PER_EDGE)
         self.samples = np.einsum("sa,tai->tsi", lattice, mesh.nodes[mesh.tets]).reshape(-1, 3)
-        self.sample_ascent = (ascent[mesh.tets] @ lattice.T).ravel()
         self.sample_volumes = np.repeat(mesh.volumes() / len(lattice), len(lattice))
         tet_from_sample = np.repeat(np.arange(len(mesh.tets)), len(lattice))
-        section_from_sample = section_from_cell[cells.holding(tet_from_sample, self.sample_ascent / self.thickness)]
+        section_from_sample = section_from_cell[
+            cells.holding(tet_from_sample, (ascent[mesh.tets] @ lattice.T).ravel() / self.thickness)
+        ]
         order = np.argsort(section_from_sample, kind="stable")
         starts = np.searchsorted(section_from_sample[order], np.arange(count + 1))
         self.members = {section: order[starts[section] : starts[section + 1]] for section in self.level}
@@ -191,16 +193,24 @@ class _SectionGraph:
     def branch(self, chain: list[int]) -> Branch:
         """The polyline of a chain of sections; a free end is carried on to its tip, a ground end to the base."""
         kept = [section for section in chain if len(self.members[section])] or chain
-        points = [self._middle(self.members[section]) for section in kept]
-        radii = [self._radius(section) for section in kept]
-        own = [not self._is_junction(section) for section in kept]
         grounded, ends_freely = self.grounded[kept[0]], len(self.neighbours[kept[-1]]) <= 1
+        # The last slabs of a blunt end are cut by the mesh's rounding: only together do they have a middle to trust.
+        cap = _CAP_SECTIONS if len(kept) >= 3 * _CAP_SECTIONS else 1
+        groups = [[section] for section in kept]
+        if not grounded and self._is_free(kept[0]):
+            groups[:cap] = [kept[:cap]]
+        if ends_freely:
+            groups[-cap:] = [kept[-cap:]]
+        members = [np.concatenate([self.members[section] for section in group]) for group in groups]
+        points = [self._middle(samples) for samples in members]
+        radii = [float(np.mean([self._radius(section) for section in group])) for group in groups]
+        own = [not any(self._is_junction(section) for section in group) for group in groups]
         if grounded or self._is_free(kept[0]):
-            points.insert(0, self._ground_point(kept[0]) if grounded else self._extreme(kept[0], -1.0))
+            points.insert(0, self._ground_point(kept[0]) if grounded else self._tip(members[0], points[1::-1]))
             radii.insert(0, radii[0])
             own.insert(0, own[0])
         if ends_freely:
-            points.append(self._extreme(kept[-1], 1.0))
+            points.append(self._tip(members[-1], points[-2:]))
             radii.append(radii[-1])
             own.append(own[-1])
         polyline = np.array(points)
@@ -211,11 +221,13 @@ class _SectionGraph:
     def _middle(self, members: np.ndarray) -> np.ndarray:
         return np.average(self.samples[members], axis=0, weights=self.sample_volumes[members])
 
-    def _extreme(self, section: int, sign: float) -> np.ndarray:
-        """Where a free end of the body is: the middle of the part of its last section that is farthest along."""
-        members = self.members[section]
-        ascent = sign * self.sample_ascent[members]
-        return self._middle(members[ascent >= ascent.max() - 0.25 * self.thickness])
+    def _tip(self, members: np.ndarray, last_points: list[np.ndarray]) -> np.ndarray:
+        """Where a free end of the body is: as far on from the last point as its samples reach in the axis' direction."""
+        middle = last_points[-1]
+        onwards = middle - last_points[0]
+        length = float(np.linalg.norm(onwards))
+        onwards = onwards / length if length > 0.0 else self.up
+        return middle + float(((self.samples[members] - middle) @ onwards).max()) * onwards
 
     def _ground_point(self, section: int) -> np.ndarray:
         """The middle of the section's lowest layer, on the ground."""
