@@ -12,7 +12,7 @@ import warp as wp
 from tqdm import tqdm
 
 from egs_warp.base_plane import find_base_plane
-from egs_warp.body import SoftBody, make_body
+from egs_warp.body import BodyState, SoftBody, make_body
 from egs_warp.cage import Cage, build_cage
 from egs_warp.camera import Camera
 from egs_warp.contact import ContactGeometry, contact_geometry
@@ -36,6 +36,8 @@ from egs_warp.trajectory import audit, measure
 
 SHEET_FRAMES = 12
 SPLIT_KEY_FRAMES = 24
+SMALLEST_SAG = 0.004
+"""A body is not made stiffer than this column's sag, whatever it bends."""
 LARGEST_TARGET = 10.0
 """Body heights; a larger target is refused as a slip of the pen."""
 
@@ -69,15 +71,31 @@ class AnimateOptions:
 
 @dataclass(frozen=True)
 class Creature:
-    """A capture with a cage, a body, muscles and a ground; metres."""
+    """A capture with a cage, a body, muscles and a ground, standing; metres."""
 
     cloud: GaussianCloud
     plane: Plane
     metres_per_unit: float
     cage: Cage
-    body: SoftBody
-    muscles: MuscleSet
-    geometry: ContactGeometry
+    stepper: LocomotionStepper
+    """Body, muscles and contact."""
+    start: BodyState
+    """At rest on the ground."""
+
+    @property
+    def body(self) -> SoftBody:
+        """The soft body."""
+        return self.stepper.body
+
+    @property
+    def muscles(self) -> MuscleSet:
+        """Its muscles."""
+        return self.stepper.muscles
+
+    @property
+    def geometry(self) -> ContactGeometry:
+        """Its contact points and planes."""
+        return self.stepper.geometry
 
 
 def make_creature(
@@ -88,7 +106,10 @@ def make_creature(
     metres_per_unit: float | None = None,
     friction: float = 0.8,
 ) -> Creature:
-    """Give a capture (scene units) a body that stands on ``plane``, or on its own base, square to ``up`` (3,)."""
+    """Give a capture (scene units) a body that stands on ``plane``, or on its own base, square to ``up`` (3,).
+
+    A body that its own weight would bend out of shape is made stiffer until it stands.
+    """
     if plane is None:
         if up is None:
             raise UserError("animate: neither up nor a plane is known; give --up or --plane")
@@ -97,10 +118,27 @@ def make_creature(
     cage = build_cage(cloud, plane)
     scale = metres_per_unit or 1.0 / cage.height(plane)
     cloud, plane, cage = cloud.scaled(scale), plane.scaled(scale), cage.scaled(scale)
-    body = make_body(cage.mesh, plane, device=device)
-    muscles = automatic_muscles(cage.mesh, plane.normal, body_weight=body.weight, height=body.height, young_modulus=body.young_modulus)
     geometry = contact_geometry(cloud, cage.mesh, (plane,), friction=friction, device=device)
-    return Creature(cloud, plane, scale, cage, body, muscles, geometry)
+    sag = 0.05
+    while True:
+        body = make_body(cage.mesh, plane, sag=sag, device=device)
+        muscles = automatic_muscles(
+            cage.mesh, plane.normal, body_weight=body.weight, height=body.height, young_modulus=body.young_modulus
+        )
+        stepper = LocomotionStepper(body, muscles, geometry, device=device)
+        start = settle(stepper)
+        if sag < SMALLEST_SAG or _stands(stepper, start):
+            return Creature(cloud, plane, scale, cage, stepper, start)
+        sag *= 0.5
+
+
+def _stands(stepper: LocomotionStepper, start: BodyState) -> bool:
+    body = stepper.body
+    moved = body.centre_of_mass(start.positions) - body.centre_of_mass(body.mesh.nodes)
+    turn = body.best_fit_rotation(start.positions)
+    gaps, _ = stepper.detector.gaps(start.positions)
+    upright = np.trace(turn) > 1.0 + 2.0 * np.cos(np.radians(2.0))
+    return bool(np.linalg.norm(moved) < 0.03 * body.height and upright and gaps.min() > -0.008 * body.height)
 
 
 def animate(
@@ -126,17 +164,12 @@ def animate(
     options = options or AnimateOptions()
     folder = writable_folder(out)
     wp.rand_init(options.seed)
-    with tqdm(total=3, desc="prepare", unit="stage", disable=quiet) as bar:
+    with tqdm(total=1, desc="prepare", unit="capture", disable=quiet) as bar:
         creature = make_creature(
             cloud, up=up, plane=plane, metres_per_unit=options.metres_per_unit, friction=options.friction
         )
         bar.update()
-        stepper = LocomotionStepper(
-            creature.body, creature.muscles, creature.geometry, device=str(creature.cloud.device)
-        )
-        bar.update()
-        start = settle(stepper)
-        bar.update()
+        stepper, start = creature.stepper, creature.start
     ground = Ground.on(creature.plane, _forward(creature), creature.body.centre_of_mass(start.positions))
     height = creature.body.height
     jump = Jump(
