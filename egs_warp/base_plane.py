@@ -85,12 +85,16 @@ def _underside(cloud: GaussianCloud, normal: np.ndarray) -> _Underside:
 def _support_level(underside: _Underside) -> float:
     """Height of the lower edge of the densest low level of the underside."""
     size = underside.size
-    bottoms = underside.bottoms[
-        (underside.bottoms > underside.low - 0.1 * size) & (underside.bottoms < underside.low + _SEARCHED_SHARE * size)
-    ]
+    bottom = underside.low - 0.1 * size
+    # Strays may have pulled the robust lowest height down: search at least up to where 3 % of the mass lies below.
+    top = max(
+        underside.low + _SEARCHED_SHARE * size,
+        _mass_quantile(underside.heights, underside.opacities, 0.03) + 2.0 * _BANDWIDTH * size,
+    )
+    bottoms = underside.bottoms[(underside.bottoms > bottom) & (underside.bottoms < top)]
     if len(bottoms) == 0:
         return underside.low
-    levels = np.linspace(underside.low - 0.1 * size, underside.low + _SEARCHED_SHARE * size, 501)
+    levels = np.linspace(bottom, top, 501)
     density = np.exp(-0.5 * ((levels[:, None] - bottoms[None, :]) / (_BANDWIDTH * size)) ** 2).sum(axis=1)
     # The lowest peak that holds its own against the highest: a bevel above the sole may be the larger of the two.
     inner = density[1:-1]

@@ -92,7 +92,8 @@ def build_cage(
     """Cage of about ``target_nodes`` nodes around the opaque part of ``cloud`` above ``plane``, which it never crosses.
 
     ``dilation`` is in units of the object's longest side; it is raised, and the mesh refined (up to 1.75 times the
-    nodes), until all but 0.07 % of the object's opacity mass is inside. The same input gives the same bits (``CageMethod.VOXEL``). DESIGN section 4.
+    nodes), until all but 0.07 % of the object's opacity mass is inside.
+    The same input gives the same bits (``CageMethod.VOXEL``). DESIGN section 4.
 
     Raises ``UserError`` for an object without volume (flat, tiny, nothing opaque above the plane).
     """
