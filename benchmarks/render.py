@@ -139,7 +139,8 @@ def stage_rows(scene: peers.Scene, camera: Camera, *, repeats: int) -> dict[str,
     cloud, view, device = cloud_of(scene), view_from_camera(camera), "cuda:0"
     background = Background(wp.vec3())
     pixels = camera.width * camera.height
-    gradient = [wp.ones(pixels, dtype=t, device=device) for t in (wp.vec3, wp.float32, wp.float32)]
+    shape = (camera.height, camera.width)
+    gradient = [wp.ones(shape, dtype=t, device=device) for t in (wp.vec3, wp.float32, wp.float32)]
     project_now = lambda: project(cloud, view, antialiased=False, threads=1)  # noqa: E731
     projected = project_now()
     lists = build_tile_lists(projected, view, threads=1)

@@ -14,12 +14,12 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 @wp.kernel
 def pixel_gradients_kernel(
     # In:
-    colour: wp.array[wp.vec3],
-    alpha: wp.array[wp.float32],
-    depth: wp.array[wp.float32],
-    colour_gradient: wp.array[wp.vec3],
-    alpha_gradient: wp.array[wp.float32],
-    depth_gradient: wp.array[wp.float32],
+    colour: wp.array2d[wp.vec3],
+    alpha: wp.array2d[wp.float32],
+    depth: wp.array2d[wp.float32],
+    colour_gradient: wp.array2d[wp.vec3],
+    alpha_gradient: wp.array2d[wp.float32],
+    depth_gradient: wp.array2d[wp.float32],
     # Out:
     sum_gradient_out: wp.array[wp.vec4],
     remaining_out: wp.array[wp.float32],
@@ -30,15 +30,23 @@ def pixel_gradients_kernel(
     dL/dalpha_i = T_i s_i - (sum of w_j s_j over j > i + T dL/dT) / (1 - alpha_i). The bracket for i = 0 is what is
     returned; walking from front to back then needs no second pass and no stored state.
     """
-    i = wp.tid()
+    row, column = wp.tid()
+    i = row * colour.shape[1] + column
+    opaque = alpha[row, column]
+    by_colour = wp.vec3()
+    if colour_gradient.shape[0] > 0:
+        by_colour = colour_gradient[row, column]
+    by_alpha = wp.float32(0.0)
+    if alpha_gradient.shape[0] > 0:
+        by_alpha = alpha_gradient[row, column]
     by_depth_sum = wp.float32(0.0)
-    if alpha[i] > 0.0:
-        by_depth_sum = depth_gradient[i] / alpha[i]
-    g = colour_gradient[i]
-    sum_gradient_out[i] = wp.vec4(g[0], g[1], g[2], by_depth_sum)
-    by_alpha = alpha_gradient[i] - by_depth_sum * depth[i]
+    if depth_gradient.shape[0] > 0 and opaque > 0.0:
+        by_depth_sum = depth_gradient[row, column] / opaque
+    depth_sum = depth[row, column] * opaque
+    sum_gradient_out[i] = wp.vec4(by_colour[0], by_colour[1], by_colour[2], by_depth_sum)
+    by_alpha = by_alpha - by_depth_sum * depth[row, column]
     # colour holds T times the background already; depth times alpha is the weighted sum of depths.
-    remaining_out[i] = wp.dot(g, colour[i]) + depth_gradient[i] * depth[i] - (1.0 - alpha[i]) * by_alpha
+    remaining_out[i] = wp.dot(by_colour, colour[row, column]) + by_depth_sum * depth_sum - (1.0 - opaque) * by_alpha
 
 
 @wp.func

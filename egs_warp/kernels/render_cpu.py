@@ -197,9 +197,9 @@ def composite_tile(
     colour_depth: wp.array[wp.vec4],
     flat_background: wp.vec3,
     background: wp.array[wp.vec3],
-    colour: wp.array[wp.vec3],
-    alpha_out: wp.array[wp.float32],
-    depth: wp.array[wp.float32],
+    colour: wp.array2d[wp.vec3],
+    alpha_out: wp.array2d[wp.float32],
+    depth: wp.array2d[wp.float32],
 ):
     """Front-to-back blend of one tile."""
     ...
@@ -240,9 +240,9 @@ def composite_tile_kernel(
     flat_background: wp.vec3,
     background: wp.array[wp.vec3],
     # Out:
-    colour_out: wp.array[wp.vec3],
-    alpha_out: wp.array[wp.float32],
-    depth_out: wp.array[wp.float32],
+    colour_out: wp.array2d[wp.vec3],
+    alpha_out: wp.array2d[wp.float32],
+    depth_out: wp.array2d[wp.float32],
 ):
     """One thread composites one tile."""
     tile = wp.tid() + first

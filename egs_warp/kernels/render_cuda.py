@@ -328,9 +328,9 @@ def composite_block(
     colour_depth: wp.array[wp.vec4],
     flat_background: wp.vec3,
     background: wp.array[wp.vec3],
-    colour: wp.array[wp.vec3],
-    alpha_out: wp.array[wp.float32],
-    depth: wp.array[wp.float32],
+    colour: wp.array2d[wp.vec3],
+    alpha_out: wp.array2d[wp.float32],
+    depth: wp.array2d[wp.float32],
 ):
     """Front-to-back blend of one tile by its block."""
     ...
@@ -370,9 +370,9 @@ def composite_block_kernel(
     flat_background: wp.vec3,
     background: wp.array[wp.vec3],
     # Out:
-    colour_out: wp.array[wp.vec3],
-    alpha_out: wp.array[wp.float32],
-    depth_out: wp.array[wp.float32],
+    colour_out: wp.array2d[wp.vec3],
+    alpha_out: wp.array2d[wp.float32],
+    depth_out: wp.array2d[wp.float32],
 ):
     """A block of 256 threads composites one tile; the same picture as ``composite_pixel_kernel``."""
     tile = wp.tid() / TILE_PIXELS

@@ -12,7 +12,6 @@ import warp as wp
 from egs_warp.camera import Camera
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
-from egs_warp.render.arrays import zeros
 from egs_warp.render.backward import backward
 from egs_warp.render.compositing import RenderedImage, composite
 from egs_warp.render.projection import ProjectedGaussians, project, view_from_camera
@@ -151,23 +150,16 @@ class _Render(torch.autograd.Function):
         done: _Forward = ctx.forward_pass
         device = wp.device_to_torch(done.cloud.device)
         with _torch_stream(torch.device(device)):
-            by_pixel = []
-            for gradient, dtype, array in zip(
-                pixel_gradients[:3],
-                (wp.vec3, wp.float32, wp.float32),
-                (done.image.colour, done.image.alpha, done.image.depth),
-                strict=True,
-            ):
-                if gradient is None:
-                    by_pixel.append(zeros(array.size, dtype, done.cloud.device))
-                else:
-                    by_pixel.append(wp.from_torch(gradient.detach().contiguous(), dtype=dtype).flatten())
+            by_colour, by_alpha, by_depth = (
+                None if gradient is None else wp.from_torch(gradient.detach().contiguous(), dtype=dtype)
+                for gradient, dtype in zip(pixel_gradients[:3], (wp.vec3, wp.float32, wp.float32), strict=True)
+            )
             with refusing_what_does_not_fit(done.cloud, ctx.options.camera):
                 gradients = backward(
                     *(done.cloud, done.view, done.projected, done.lists, done.image),
-                    colour_gradient=by_pixel[0],
-                    alpha_gradient=by_pixel[1],
-                    depth_gradient=by_pixel[2],
+                    colour_gradient=by_colour,
+                    alpha_gradient=by_alpha,
+                    depth_gradient=by_depth,
                     antialiased=ctx.options.antialiased,
                     want_pose=ctx.want_pose,
                     threads=ctx.options.threads,

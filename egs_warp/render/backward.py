@@ -48,25 +48,22 @@ def backward(
     lists: TileLists,
     image: RenderedImage,
     *,
-    colour_gradient: wp.array,
-    alpha_gradient: wp.array,
-    depth_gradient: wp.array,
+    colour_gradient: wp.array | None,
+    alpha_gradient: wp.array | None,
+    depth_gradient: wp.array | None,
     antialiased: bool,
     want_pose: bool,
     threads: int,
 ) -> CloudGradients:
-    """Gradients for (H * W,) vec3, float32 and float32 gradients of ``image``'s colour, alpha and depth."""
+    """From gradients (H, W) by ``image``'s colour (vec3), alpha and depth (float32); None stands for zero."""
     device, count = cloud.device, cloud.count
     pixels = int(view.width) * int(view.height)
     sum_gradient = empty(pixels, wp.vec4, device)
     remaining = empty(pixels, wp.float32, device)
     wp.launch(
         pixel_gradients_kernel,
-        dim=pixels,
-        inputs=[
-            *(image.colour.flatten(), image.alpha.flatten(), image.depth.flatten()),
-            *(colour_gradient, alpha_gradient, depth_gradient),
-        ],
+        dim=(view.height, view.width),
+        inputs=[image.colour, image.alpha, image.depth, colour_gradient, alpha_gradient, depth_gradient],
         outputs=[sum_gradient, remaining],
         device=device,
     )

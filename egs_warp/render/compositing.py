@@ -52,9 +52,9 @@ def composite(
     """Blend every tile's Gaussians from front to back over ``background``."""
     device: Any = projected.ellipse.device
     width, height = int(view.width), int(view.height)
-    colour = empty(width * height, wp.vec3, device)
-    alpha = empty(width * height, wp.float32, device)
-    depth = empty(width * height, wp.float32, device)
+    colour = empty((height, width), wp.vec3, device)
+    alpha = empty((height, width), wp.float32, device)
+    depth = empty((height, width), wp.float32, device)
     inputs = [
         width,
         height,
@@ -92,8 +92,7 @@ def composite(
             threads=threads,
             work=lists.work,
         )
-    shape = (height, width)
-    return RenderedImage(colour.reshape(shape), alpha.reshape(shape), depth.reshape(shape))
+    return RenderedImage(colour, alpha, depth)
 
 
 def add_geometry(

@@ -89,9 +89,9 @@ def project(cloud: GaussianCloud, view: Any, *, antialiased: bool, threads: int)
     for attribute, first in zip(_ATTRIBUTES, first_bad, strict=True):
         if first < count:
             raise UserError(f"render: {attribute} of Gaussian {first} is not finite; repair or remove it")
-    if slot_count >= 2**31:
+    if slot_count >= 2**30:
         raise UserError(
-            f"render: {count} Gaussians cover {slot_count} tiles of {view.width} x {view.height} pixels, more than 2^31;"
+            f"render: {count} Gaussians cover {slot_count} tiles of {view.width} x {view.height} pixels, more than 2^30;"
             " render a smaller image or fewer Gaussians"
         )
     return ProjectedGaussians(ellipse, falloff, colour_depth, tile_count, slot_count)

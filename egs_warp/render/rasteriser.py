@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
@@ -66,6 +66,11 @@ def refusing_what_does_not_fit(cloud: GaussianCloud, camera: Camera) -> Iterator
         full = device.is_cuda and device.free_memory < 0.05 * device.total_memory
         if isinstance(error, RuntimeError) and not (full or re.search("alloc|out of mem", str(error), re.IGNORECASE)):
             raise
+        if device.is_cuda:
+            # The failure leaves a mark in CUDA's state, which Warp's next scan would take for its own.
+            with suppress(RuntimeError):
+                mark = wp.zeros(1, dtype=wp.int32, device=device)
+                wp.utils.array_scan(mark, mark)
         raise UserError(
             f"render: {cloud.count} Gaussians at {camera.width} x {camera.height} do not fit into the memory of"
             f" {cloud.device}; render a smaller image, fewer Gaussians, or on another device"

@@ -112,7 +112,7 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int) -> T
     )
     if pairs > _LARGE_SORT:
         # The sort takes scratch memory inside Warp, which does not report a failure: see first whether there is any.
-        empty(12 * pairs, wp.uint8, device)
+        empty((pairs, 3), wp.int32, device)
     wp.utils.radix_sort_pairs(keys, slots, pairs, end_bit=depth_bits + max(tiles - 1, 1).bit_length())
     wp.launch(
         tile_starts_kernel,
