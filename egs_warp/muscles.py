@@ -20,6 +20,9 @@ from egs_warp.precision import Vec3, real
 from egs_warp.skeleton import skeleton
 from egs_warp.tetmesh import TetMesh
 
+_MIN_AUTOMATIC_EDGES = 0.25
+"""An automatic fibre with a segment shorter than this many mean edges is left out: its ends share their nodes."""
+
 
 @dataclass(frozen=True)
 class MuscleSet:
@@ -225,4 +228,16 @@ def automatic_muscles(
         max_stress=2.0 * young,
         max_segments=max_segments,
     )
-    return attach_fibres(mesh, fibres, max_strain=max_strain)
+    return attach_fibres(mesh, _long_enough(mesh, fibres), max_strain=max_strain)
+
+
+def _long_enough(mesh: TetMesh, fibres: Sequence[Fibre]) -> list[Fibre]:
+    """The fibres whose segments keep their length when their points are spread over nodes."""
+    attached = attachment_rows(mesh, np.concatenate([fibre.points for fibre in fibres])) @ mesh.nodes
+    polylines = np.split(attached, np.cumsum([len(fibre.points) for fibre in fibres])[:-1])
+    shortest = _MIN_AUTOMATIC_EDGES * mean_edge_length(mesh)
+    return [
+        fibre
+        for fibre, points in zip(fibres, polylines, strict=True)
+        if np.linalg.norm(np.diff(points, axis=0), axis=1).min() >= shortest
+    ]
