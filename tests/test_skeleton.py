@@ -7,6 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from egs_warp.attachments import mean_edge_length
+from egs_warp.fibres import FibreKind
+from egs_warp.muscles import automatic_muscles
 from egs_warp.skeleton import ascent_field, base_nodes, skeleton
 from egs_warp.tetmesh import TetMesh
 
@@ -113,3 +116,18 @@ def test_the_skeleton_follows_its_up_axis_and_its_bits_repeat() -> None:
     for one, same, rotated in zip(first.branches, second.branches, other.branches, strict=True):
         assert np.array_equal(one.points, same.points)
         assert one.volume == pytest.approx(rotated.volume, rel=1e-6)
+
+
+@pytest.mark.parametrize(("make", "branch_count"), [(column, 1), (stool, 4), (figure, 5)])
+def test_every_branch_gets_every_kind_of_fibre(make: Callable[[], TetMesh], branch_count: int) -> None:
+    """DESIGN 6: four or more longitudinal fibres and all other kinds on each branch, within the budget of segments."""
+    mesh = make()
+    muscles = automatic_muscles(mesh, UP, body_weight=100.0, height=1.0)
+    assert muscles.segment_count <= 112
+    assert muscles.rest_lengths.min() >= 0.25 * mean_edge_length(mesh)
+    kinds = np.array([kind.value for kind in muscles.fibre_kinds])
+    assert set(muscles.fibre_groups) == set(range(branch_count))
+    for group in range(branch_count):
+        of_group = kinds[muscles.fibre_groups == group]
+        assert set(of_group) == {kind.value for kind in FibreKind} - {"user"}
+        assert (of_group == "longitudinal").sum() >= 4
