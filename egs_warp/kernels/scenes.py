@@ -41,7 +41,8 @@ def bake_light_kernel(
     helper = wp.where(wp.abs(n[2]) < 0.9, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0))
     t = wp.normalize(wp.cross(helper, n))
     b = wp.cross(n, t)
-    start = points[i] + n * (reach * 2.0e-3)
+    # Clear of the triangles, which cut the corners of creases.
+    start = points[i] + n * (reach * 0.018)
     height = wp.dot(points[i], up) - ground_height
     turn = float(i) * 1.7
 

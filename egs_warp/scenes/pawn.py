@@ -2,22 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from egs_warp.plane import Plane
-from egs_warp.scenes.object import BuiltInObject
-from egs_warp.scenes.surface import (
-    SurfaceSamples,
-    bake_light,
-    flat_gaussians,
-    highlight_directions,
-    lit_colour,
-    sh_from_colour,
-)
+from egs_warp.scenes.object import BuiltInObject, light_and_paint
+from egs_warp.scenes.surface import SurfaceSamples
 
-_LIGHT = np.array([-0.55, -0.62, 0.95])
 _UP = np.array([0.0, 0.0, 1.0])
 
 # Cubic Bezier pieces (r, z) of the turned profile for a pawn one unit tall, from the centre of the base to the crown.
@@ -47,17 +37,9 @@ def pawn(*, gaussian_count: int = 22000, seed: int = 0, device: str | None = Non
     random = np.random.default_rng(seed)
     samples = _turned_surface(gaussian_count, random)
     vertices, faces = _turned_mesh()
-    light = bake_light(samples, vertices, faces, up=_UP, light_direction=_LIGHT, reach=0.35, device=device)
     albedo, gloss = _wood(samples.points)
-    # The unseen underside sits a little inside, so that only its fuzz pokes through the plane.
-    lifted = samples.points + 0.22 * samples.spacing * np.clip(-samples.normals[:, 2:], 0.0, 1.0) * _UP
-    samples = replace(samples, points=lifted)
-    sh = sh_from_colour(
-        lit_colour(albedo, light),
-        highlight_directions(samples.normals, _LIGHT),
-        0.30 * gloss * np.sqrt(np.clip(light.key, 0.0, 1.0)) + 0.03,
-    )
-    return BuiltInObject("pawn", flat_gaussians(samples, sh, random=random, device=device), Plane(_UP, 0.0))
+    cloud = light_and_paint(samples, vertices, faces, albedo, gloss, random=random, device=device)
+    return BuiltInObject("pawn", cloud, Plane(_UP, 0.0))
 
 
 def _profile(points_per_piece: int = 400) -> tuple[np.ndarray, np.ndarray]:
