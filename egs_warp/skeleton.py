@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from egs_warp.attachments import edge_graph
+from egs_warp.level_cells import LevelCells
 from egs_warp.tetmesh import TetMesh
 
 _BASE_FRACTION = 0.02
@@ -114,7 +115,7 @@ class _SectionGraph:
     def __init__(self, mesh: TetMesh, ascent: np.ndarray, up: np.ndarray) -> None:
         self.thickness = float(ascent.max()) / _SECTION_COUNT
         self.up = up
-        cells = _Cells.cut(mesh.tets, ascent / self.thickness)
+        cells = LevelCells.cut(mesh.tets, ascent / self.thickness, level_count=_SECTION_COUNT)
         joined = sp.coo_matrix((np.ones(len(cells.touching)), cells.touching.T), shape=(cells.count,) * 2)
         count, section_from_cell = connected_components(joined, directed=False)
         self.level = dict.fromkeys(range(count), 0)
@@ -297,66 +298,6 @@ class _SectionGraph:
                 self.neighbours[other].add(kept)
                 self.neighbours[kept].add(other)
         del self.level[gone]
-
-
-@dataclass(frozen=True)
-class _Cells:
-    """The pieces into which slabs of equal ascent cut the tetrahedra; each tetrahedron holds a run of levels."""
-
-    tet_from_cell: np.ndarray
-    level_from_cell: np.ndarray
-    touching: np.ndarray
-    """(., 2) cells of one level that share part of a face."""
-    stacked: np.ndarray
-    """(., 2) cells of one tetrahedron on consecutive levels."""
-    first_cell: np.ndarray
-    """(T,) the cell of each tetrahedron's lowest level."""
-    first_level: np.ndarray
-    """(T,)."""
-
-    @property
-    def count(self) -> int:
-        return len(self.tet_from_cell)
-
-    @classmethod
-    def cut(cls, tets: np.ndarray, level_field: np.ndarray) -> _Cells:
-        """Cut where ``level_field`` (N,), given at the nodes and linear inside each tetrahedron, is a whole number."""
-        first, last = _level_range(level_field[tets])
-        tet_from_cell, level_from_cell = _runs(first, last)
-        first_cell = np.concatenate([[0], np.cumsum(last - first + 1)[:-1]])
-        sides, corners = _inner_faces(tets)
-        face_from_run, level = _runs(*_level_range(level_field[corners]))
-        owners = sides[face_from_run]
-        touching = first_cell[owners] + level[:, None] - first[owners]
-        below = np.flatnonzero(tet_from_cell[1:] == tet_from_cell[:-1])
-        return cls(tet_from_cell, level_from_cell, touching, np.stack([below, below + 1], axis=1), first_cell, first)
-
-    def holding(self, tets: np.ndarray, level_field: np.ndarray) -> np.ndarray:
-        """The cell of tetrahedron ``tets`` (S,) that holds the point where the field is ``level_field`` (S,)."""
-        last_level = np.append(self.first_cell[1:], self.count) - self.first_cell + self.first_level - 1
-        level = np.clip(np.floor(level_field).astype(int), self.first_level[tets], last_level[tets])
-        return self.first_cell[tets] + level - self.first_level[tets]
-
-
-def _level_range(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First and last level (rows,) that each row of corner values (rows, corners) passes through."""
-    first = np.clip(np.floor(values.min(axis=1)).astype(int), 0, _SECTION_COUNT - 1)
-    return first, np.clip(np.ceil(values.max(axis=1)).astype(int) - 1, first, _SECTION_COUNT - 1)
-
-
-def _runs(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Row number and level of every level first .. last of each row."""
-    counts = last - first + 1
-    row = np.repeat(np.arange(len(first)), counts)
-    return row, np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts) + first[row]
-
-
-def _inner_faces(tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The two tetrahedra (I, 2) on either side of every inner face, and its three nodes (I, 3)."""
-    faces = np.sort(tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
-    order = np.lexsort(faces.T)
-    same = np.flatnonzero((faces[order[1:]] == faces[order[:-1]]).all(axis=1))
-    return np.stack([order[same], order[same + 1]], axis=1) // 4, faces[order[same]]
 
 
 def _tetrahedron_lattice(per_edge: int) -> np.ndarray:
