@@ -14,7 +14,7 @@ _SEAT = 0.56
 
 
 def stool(*, gaussian_count: int = 24000, seed: int = 0, device: str | None = None) -> BuiltInObject:
-    """A stool one unit tall on the plane z = 0, its back towards -y; SH degree 3. Same arguments, same bits."""
+    """A stool one unit tall on the plane z = 0, facing -y; SH degree 3. Same arguments, same bits."""
     random = np.random.default_rng(seed)
     vertices, faces = surface_mesh(_distance, _LOW, _HIGH, 0.012)
     samples = even_samples(_distance, vertices, faces, gaussian_count, random)
@@ -30,10 +30,10 @@ def _frame(points: np.ndarray) -> np.ndarray:
     leg = tapered_rod(folded, np.array([0.30, 0.30, -0.06]), np.array([0.225, 0.225, _SEAT]), 0.040, 0.052)
     board = rounded_box(points, np.array([0.0, 0.0, _SEAT]), np.array([0.30, 0.30, 0.042]), 0.03)
     sides = np.column_stack([np.abs(points[:, 0]), points[:, 1:]])
-    post = tapered_rod(sides, np.array([0.225, -0.25, _SEAT]), np.array([0.235, -0.32, 0.93]), 0.042, 0.036)
+    post = tapered_rod(sides, np.array([0.225, 0.25, _SEAT]), np.array([0.235, 0.32, 0.93]), 0.042, 0.036)
     # The rail bows backwards.
-    bowed = points + np.outer(1.0 - (points[:, 0] / 0.27) ** 2, [0.0, 0.035, 0.0])
-    rail = rounded_box(bowed, np.array([0.0, -0.315, 0.90]), np.array([0.275, 0.034, 0.098]), 0.03)
+    bowed = points + np.outer(1.0 - (points[:, 0] / 0.27) ** 2, [0.0, -0.035, 0.0])
+    rail = rounded_box(bowed, np.array([0.0, 0.315, 0.90]), np.array([0.275, 0.034, 0.098]), 0.03)
     frame = smooth_union(smooth_union(leg, board, 0.03), post, 0.03)
     return smooth_union(frame, rail, 0.025)
 
@@ -44,7 +44,7 @@ def _cushion(points: np.ndarray) -> np.ndarray:
         * np.cos(np.clip(points[:, 0] / 0.27, -1, 1) * np.pi / 2)
         * np.cos(np.clip(points[:, 1] / 0.24, -1, 1) * np.pi / 2)
     )
-    box = rounded_box(points, np.array([0.0, 0.02, _SEAT + 0.068]), np.array([0.265, 0.235, 0.04]), 0.038)
+    box = rounded_box(points, np.array([0.0, -0.02, _SEAT + 0.068]), np.array([0.265, 0.235, 0.04]), 0.038)
     return box - puff
 
 
