@@ -3,6 +3,9 @@
 Aims: ``cuda_beats_gswarp`` (faster in every cell), ``cuda_within_1_3_of_gsplat`` (geometric mean of all cells),
 ``same_picture`` (mean difference below 1e-5, and below 1e-3 off the alpha-cut boundaries), ``cpu_vs_twin`` (20 times a
 tile-batched PyTorch rasteriser with the same culling), ``cpu_two_threads`` (1.7 times one thread).
+
+CPU peers that were tried and do not run on one: splax 0.2.3 (JAX refuses its Warp calls on a CPU) and taichi-splatting
+0.13 (its taichi-nightly is in no index; with taichi 1.7.4 its import asks for a CUDA toolkit).
 """
 
 from __future__ import annotations

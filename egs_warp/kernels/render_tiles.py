@@ -12,6 +12,33 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
+def gather_ranks_kernel(
+    first: wp.int32,
+    # In:
+    height: wp.int32,
+    gaussian_from_rank: wp.array[wp.int32],
+    slot_end: wp.array[wp.int64],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    # Out:
+    rows_out: wp.array[wp.vec2i],
+    slot_out: wp.array[wp.int32],
+    ellipse_out: wp.array[wp.vec4],
+    falloff_out: wp.array[wp.vec2],
+):
+    """What the walk from front to back needs of each Gaussian, in the order in which it needs it (CPU)."""
+    rank = wp.tid() + first
+    g = gaussian_from_rank[rank]
+    slot = wp.int32(0)
+    if g > 0:
+        slot = wp.int32(slot_end[g - 1])
+    rows_out[rank] = tile_rows(ellipse[g], falloff[g], height)
+    slot_out[rank] = slot
+    ellipse_out[rank] = ellipse[g]
+    falloff_out[rank] = falloff[g]
+
+
+@wp.kernel
 def band_lists_kernel(
     first: wp.int32,
     # In:
@@ -21,7 +48,8 @@ def band_lists_kernel(
     visible_count: wp.int32,
     fill: wp.int32,
     gaussian_from_rank: wp.array[wp.int32],
-    slot_end: wp.array[wp.int64],
+    rows: wp.array[wp.vec2i],
+    slot: wp.array[wp.int32],
     ellipse: wp.array[wp.vec4],
     falloff: wp.array[wp.vec2],
     # Out:
@@ -35,25 +63,27 @@ def band_lists_kernel(
     top = band * band_rows
     bottom = wp.min(top + band_rows, (height + TILE - 1) / TILE) - 1
     for rank in range(visible_count):
-        g = gaussian_from_rank[rank]
-        e = ellipse[g]
-        f = falloff[g]
-        rows = tile_rows(e, f, height)
-        if rows[0] <= bottom and rows[1] >= top:
-            pair = wp.int32(0)
-            if g > 0:
-                pair = wp.int32(slot_end[g - 1])
-            for row in range(rows[0], wp.min(rows[1], bottom) + 1):
+        reach = rows[rank]
+        if reach[0] <= bottom and reach[1] >= top:
+            e = ellipse[rank]
+            f = falloff[rank]
+            g = gaussian_from_rank[rank]
+            pair = slot[rank]
+            start = reach[0]
+            if fill == 0:
+                # Counting needs no slots, so rows above the band are of no interest.
+                start = wp.max(start, top)
+            for row in range(start, wp.min(reach[1], bottom) + 1):
                 span = tile_columns(e, f, row, width, height)
-                for column in range(span[0], span[1] + 1):
-                    if row >= top:
+                if row >= top:
+                    for column in range(span[0], span[1] + 1):
                         tile = row * columns + column
                         i = cursor_out[tile]
                         cursor_out[tile] = i + 1
                         if fill != 0:
                             gaussian_from_intersection_out[i] = g
-                            slot_from_intersection_out[i] = pair
-                    pair += 1
+                            slot_from_intersection_out[i] = pair + column - span[0]
+                pair += span[1] - span[0] + 1
 
 
 @wp.kernel

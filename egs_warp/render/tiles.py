@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from egs_warp.kernels.render_ellipse import TILE
-from egs_warp.kernels.render_tiles import band_lists_kernel, emit_tiles_kernel, tile_starts_kernel
+from egs_warp.kernels.render_tiles import band_lists_kernel, emit_tiles_kernel, gather_ranks_kernel, tile_starts_kernel
 from egs_warp.render.arrays import empty, zeros
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.threads import launch_ranges
@@ -58,16 +58,24 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, columns: int, r
     order.numpy()[:visible_count] = gaussian_from_visible
     wp.utils.radix_sort_pairs(keys, order, visible_count)
 
-    band_rows = max(1, -(-rows // (2 * threads))) if threads > 1 else rows
+    in_order = [empty(max(visible_count, 1), dtype, device) for dtype in (wp.vec2i, wp.int32, wp.vec4, wp.vec2)]
+    launch_ranges(
+        gather_ranks_kernel,
+        visible_count,
+        inputs=[view.height, order, projected.slot_end, projected.ellipse, projected.falloff],
+        outputs=in_order,
+        device=device,
+        threads=threads,
+    )
+    band_rows = max(1, -(-rows // (4 * threads))) if threads > 1 else rows
     gaussians = empty(max(projected.slot_count, 1), wp.int32, device)
     slots = empty(max(projected.slot_count, 1), wp.int32, device)
 
     def walk(cursor: wp.array, fill: int) -> None:
-        shared = [order, projected.slot_end, projected.ellipse, projected.falloff]
         launch_ranges(
             band_lists_kernel,
             -(-rows // band_rows),
-            inputs=[band_rows, view.width, view.height, visible_count, fill, *shared],
+            inputs=[band_rows, view.width, view.height, visible_count, fill, order, *in_order],
             outputs=[cursor, gaussians, slots],
             device=device,
             threads=threads,
