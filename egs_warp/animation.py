@@ -12,7 +12,7 @@ import warp as wp
 from tqdm import tqdm
 
 from egs_warp.base_plane import find_base_plane
-from egs_warp.body import BodyState, SoftBody, make_body
+from egs_warp.body import DEFAULT_SAG, BodyState, SoftBody, make_body
 from egs_warp.cage import Cage, build_cage
 from egs_warp.camera import Camera
 from egs_warp.contact import ContactGeometry, contact_geometry
@@ -119,11 +119,16 @@ def make_creature(
     scale = metres_per_unit or 1.0 / cage.height(plane)
     cloud, plane, cage = cloud.scaled(scale), plane.scaled(scale), cage.scaled(scale)
     geometry = contact_geometry(cloud, cage.mesh, (plane,), friction=friction, device=device)
-    sag = 0.05
+    sag = DEFAULT_SAG
     while True:
         body = make_body(cage.mesh, plane, sag=sag, device=device)
         muscles = automatic_muscles(
-            cage.mesh, plane.normal, body_weight=body.weight, height=body.height, young_modulus=body.young_modulus
+            cage.mesh,
+            plane.normal,
+            body_weight=body.weight,
+            height=body.height,
+            strength=4.0 * body.stiffening,
+            young_modulus=body.young_modulus,
         )
         stepper = LocomotionStepper(body, muscles, geometry, device=device)
         start = settle(stepper)
@@ -137,8 +142,8 @@ def _stands(stepper: LocomotionStepper, start: BodyState) -> bool:
     moved = body.centre_of_mass(start.positions) - body.centre_of_mass(body.mesh.nodes)
     turn = body.best_fit_rotation(start.positions)
     gaps, _ = stepper.detector.gaps(start.positions)
-    upright = np.trace(turn) > 1.0 + 2.0 * np.cos(np.radians(2.0))
-    return bool(np.linalg.norm(moved) < 0.03 * body.height and upright and gaps.min() > -0.008 * body.height)
+    upright = np.trace(turn) > 1.0 + 2.0 * np.cos(np.radians(10.0))
+    return bool(np.linalg.norm(moved) < 0.04 * body.height and upright and gaps.min() > -0.01 * body.height)
 
 
 def animate(

@@ -14,6 +14,8 @@ from egs_warp.tetmesh import TetMesh
 
 GRAVITY = 9.81
 """m/s^2."""
+DEFAULT_SAG = 0.05
+"""rho g H / E of a column."""
 LARGEST_SINK = 0.02
 """Body heights by which the centre of mass may sink from the unloaded to the standing body."""
 
@@ -40,6 +42,11 @@ class SoftBody:
     def young_modulus(self) -> float:
         """Pascals."""
         return self.assembly.material.young_modulus
+
+    @property
+    def stiffening(self) -> float:
+        """E over that of a column of the same height with the default sag."""
+        return self.young_modulus * DEFAULT_SAG / (self.assembly.material.density * GRAVITY * self.height)
 
     @property
     def weight(self) -> float:
@@ -91,7 +98,7 @@ def make_body(
     mesh: TetMesh,
     plane: Plane,
     *,
-    sag: float = 0.05,
+    sag: float = DEFAULT_SAG,
     poisson_ratio: float = 0.4,
     density: float = 1000.0,
     damping_ratio: float = 0.05,

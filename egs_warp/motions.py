@@ -52,7 +52,14 @@ class JumpPlan:
 
 
 def plan_jump(
-    target: JumpTarget, *, height: float, com_height: float, support_behind: float, support_ahead: float, gravity: float, step: float
+    target: JumpTarget,
+    *,
+    height: float,
+    com_height: float,
+    support_behind: float,
+    support_ahead: float,
+    gravity: float,
+    step: float,
 ) -> JumpPlan:
     """Stroke, times and take-off velocity for a jump of ``target`` by a body of ``height`` H (DESIGN 9)."""
     time_unit = np.sqrt(height / gravity)
