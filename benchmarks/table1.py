@@ -160,7 +160,7 @@ def main() -> None:
     parser.add_argument("--nodes", type=int, default=500, help="nodes of the cage")
     parser.add_argument("--cage", default="tight", choices=["tight", "box"], help="around the object, or a lattice")
     parser.add_argument("--rule", default=SplitRule.MEASURED.value, choices=[rule.value for rule in SplitRule])
-    parser.add_argument("--threshold", type=float, default=15.0)
+    parser.add_argument("--threshold", type=float, default=9.0)
     parser.add_argument("--depth", type=int, default=3)
     options = parser.parse_args()
     options.gaussians = options.gaussians or (2000 if options.quick else 40_000)

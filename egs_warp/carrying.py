@@ -45,7 +45,7 @@ def carry(
     *,
     method: CarryMethod = CarryMethod.BIDIRECTIONAL,
     rule: SplitRule = SplitRule.MEASURED,
-    threshold_degrees: float = 15.0,
+    threshold_degrees: float = 9.0,
     max_depth: int = 3,
 ) -> list[GaussianCloud]:
     """The cloud in each of ``frames``: node positions (N, 3) or (N,) vec3d, metres, of the cage ``mesh``.

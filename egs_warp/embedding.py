@@ -14,6 +14,9 @@ from egs_warp.launching import launch_rows
 from egs_warp.precision import Mat33, Vec3, Vec4
 from egs_warp.tetmesh import TetMesh
 
+UNSCENTED_GAMMA = 3.0**0.5
+"""Arm length in standard deviations for which the seven points integrate cubics over the Gaussian exactly."""
+
 LEAST_ARM = 1e-6
 """Shortest arm over the cage's diagonal: even float64 differences over a scale of e^-16 would be mostly rounding."""
 
@@ -182,9 +185,13 @@ class GaussianEmbedding:
         return self.arms.shape[0]
 
 
-def embed_gaussians(cloud: GaussianCloud, mesh: TetMesh | CageLocator, *, gamma: float = 3.0) -> GaussianEmbedding:
+def embed_gaussians(
+    cloud: GaussianCloud, mesh: TetMesh | CageLocator, *, gamma: float = UNSCENTED_GAMMA
+) -> GaussianEmbedding:
     """Embed the mean and the six axis ends m +- ``gamma`` s_j r_j of every Gaussian in the rest cage (Eq. 3).
 
+    The paper's gamma is 3. At sqrt 3 the seven points are the cubature of degree three for the Gaussian's mass, which
+    follows the kinks of a coarse cage better (measured in benchmarks/table1.py).
     Where an end's barycentric weights would leave [-1, 2] its arm is shortened until they do not. Pass a
     ``CageLocator`` to embed several clouds in one cage.
     """

@@ -98,7 +98,7 @@ def split_bent(
     embedding: GaussianEmbedding,
     bend: BendMeasure,
     *,
-    threshold_degrees: float = 15.0,
+    threshold_degrees: float = 9.0,
     min_error: float | None = None,
     rule: SplitRule = SplitRule.MEASURED,
     parents: np.ndarray | None = None,
@@ -110,7 +110,8 @@ def split_bent(
 
     ``MEASURED`` marks an axis whose ends are turned against each other by more than ``threshold_degrees``, if the affine
     motion is wrong by more than ``min_error`` metres at one standard deviation (default: 1e-3 of the cage's diagonal: of
-    2e-4 to 2e-3, best in benchmarks/table1.py). ``PAPER`` marks theta of Eq. (16) alone. ``parents`` and ``depths``
+    2e-4 to 2e-3, best in benchmarks/table1.py). Angles grow with the arms: 9 degrees at gamma sqrt 3 are the paper's 15
+    at gamma 3. ``PAPER`` marks theta of Eq. (16) alone. ``parents`` and ``depths``
     (n,) are those of an earlier call; a Gaussian of ``max_depth`` is not split again. Where there would be more than
     ``max_count`` Gaussians, those with the largest misfit are split.
     """
@@ -158,7 +159,7 @@ def split_for_motion(
     embedding: GaussianEmbedding,
     frames: Sequence[wp.array | np.ndarray],
     *,
-    threshold_degrees: float = 15.0,
+    threshold_degrees: float = 9.0,
     min_error: float | None = None,
     rule: SplitRule = SplitRule.MEASURED,
     max_depth: int = 3,

@@ -89,8 +89,11 @@ def test_splitting_for_a_motion_makes_every_part_nearly_affine() -> None:
     result = split_for_motion(cloud, embedding, frames, max_growth=20.0)
     after = Deformer(result.cloud, result.embedding).measure_bend(frames)
     visible = result.cloud.opacities() > 0.01
-    assert after.fit_error[visible].max() < 0.5 * before.fit_error[cloud.opacities() > 0.05].max()
-    wrong = (after.curl_degrees > 15.0) & (after.fit_error > 1e-3 * embedding.cage.extent)
+    # Ends of tilted needles stick out of the bar, where a misfit is that of the extrapolation.
+    within, before_within = (e.points.inside.numpy().reshape(-1, 7).all(axis=1) for e in (result.embedding, embedding))
+    assert within.mean() > 0.5
+    assert after.fit_error[visible & within].max() < 0.6 * before.fit_error[before_within].max()
+    wrong = (after.curl_degrees > 9.0) & (after.fit_error > 1e-3 * embedding.cage.extent)
     assert not (wrong.any(axis=1) & (result.depths < 3) & visible).any()
     capped = split_for_motion(cloud, embedding, frames, max_growth=1.5)
     assert cloud.count < capped.cloud.count <= 1.5 * cloud.count

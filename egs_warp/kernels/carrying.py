@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from egs_warp.kernels.deformation import exponential, interpolated, single, single_matrix, write_gaussian
+from egs_warp.kernels.deformation import exponential, interpolated, single, single_matrix, turn_of, write_gaussian
 from egs_warp.kernels.embedding import axes_from_quaternion
 from egs_warp.precision import Mat33, Vec3, Vec4, real
 
@@ -79,7 +79,7 @@ def carry_local_tetrahedron_kernel(
         moments += wp.outer(real(0.25) * (corners[4 * row + j] - centre), local_corner(j))
     one = real(1.0)
     stretched = single_matrix(moments * wp.diag(Vec3(one / lengths[0], one / lengths[1], one / lengths[2])))
-    axes = single_matrix(axes_from_quaternion(rotations[row]))
+    axes = turn_of(rotations[row])
     means_out[row] = single(centre)
     write_gaussian(row, stretched, axes, exponential(log_scales[row]), rotations_out, log_scales_out, turns_out)
 
@@ -103,7 +103,7 @@ def carry_gradient_kernel(
 ):
     """One F, that of the tetrahedron which holds the mean (PhysGaussian)."""
     row = first_row + wp.tid()
-    axes = single_matrix(axes_from_quaternion(rotations[row]))
+    axes = turn_of(rotations[row])
     means_out[row] = single(interpolated(nodes[row], weights[row], positions))
     stretched = gradients[tet_from_mean[row]] * axes
     write_gaussian(row, stretched, axes, exponential(log_scales[row]), rotations_out, log_scales_out, turns_out)
@@ -138,7 +138,7 @@ def carry_surface_kernel(
     before = triangle_frame(rest[f[0]], rest[f[1]], rest[f[2]])
     after = triangle_frame(positions[f[0]], positions[f[1]], positions[f[2]])
     gradient = after * wp.inverse(before)
-    axes = single_matrix(axes_from_quaternion(rotations[row]))
+    axes = turn_of(rotations[row])
     means_out[row] = single(positions[f[0]] + gradient * (double(means[row]) - rest[f[0]]))
     stretched = single_matrix(gradient) * axes
     write_gaussian(row, stretched, axes, exponential(log_scales[row]), rotations_out, log_scales_out, turns_out)

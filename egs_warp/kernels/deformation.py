@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from egs_warp.kernels.embedding import axes_from_quaternion
 from egs_warp.precision import Mat33, Vec3, Vec4, real
 
 wp.set_module_options({"enable_backward": False})
@@ -10,6 +9,12 @@ wp.set_module_options({"enable_backward": False})
 MAX_SWEEPS = wp.constant(8)
 ORTHOGONAL = wp.constant(wp.float32(3.0e-7))
 LEAST_SCALE = wp.constant(wp.float32(1.0e-12))
+
+
+@wp.func
+def turn_of(q: wp.vec4) -> wp.mat33:
+    """Rotation matrix [r1 r2 r3] of a w, x, y, z quaternion."""
+    return wp.quat_to_matrix(wp.normalize(wp.quat(q[1], q[2], q[3], q[0])))
 
 
 @wp.struct
@@ -389,15 +394,24 @@ def deform_kernel(
     log_scales_out: wp.array[wp.vec3],
     turns_out: wp.array[wp.mat33],
 ):
-    """F = (F+ + F-)/2 (Eq. 14), or the F of the mean's tetrahedron where det F <= 0, then Eq. (15)."""
+    """F = (F+ + F-)/2 (Eq. 14), or the F of the mean's tetrahedron where det F <= 0, then Eq. (15).
+
+    The mean goes where the Gaussian's mass goes, to second order (beyond the paper, which carries the mean as a point):
+    E[x(m + sum z_k s_k r_k)] = x(m) + sum s_k^2 x_kk / 2, and x_kk is seen from the difference of the two arms.
+    """
     row = first_row + wp.tid()
-    axes = single_matrix(axes_from_quaternion(rotations[row]))
+    axes = turn_of(rotations[row])
     both = carried_arms(row, axes, max_stretch, positions, tets, gradients, point_tets, weights, arms)
+    scales = exponential(log_scales[row])
+    bulge = wp.vec3(0.0)
+    for k in range(3):
+        reach = wp.max(arms[row, k] + arms[row, 3 + k], 3.0 * scales[k])
+        bulge += (scales[k] * scales[k] / reach) * (column(both.plus, k) - column(both.minus, k))
     stretched = 0.5 * (both.plus + both.minus)
     if wp.determinant(stretched) <= 0.0:
         stretched = gradients[point_tets[7 * row]] * axes
-    means_out[row] = single(both.mean)
-    write_gaussian(row, stretched, axes, exponential(log_scales[row]), rotations_out, log_scales_out, turns_out)
+    means_out[row] = single(both.mean) + bulge
+    write_gaussian(row, stretched, axes, scales, rotations_out, log_scales_out, turns_out)
 
 
 @wp.func
@@ -444,7 +458,7 @@ def measure_bend_kernel(
     """
     row = first_row + wp.tid()
     scales = exponential(log_scales[row])
-    axes = single_matrix(axes_from_quaternion(rotations[row]))
+    axes = turn_of(rotations[row])
     both = carried_arms(row, axes, max_stretch, positions, tets, gradients, point_tets, weights, arms)
     between = wp.transpose(bend_frame(both.plus, scales)) * bend_frame(both.minus, scales)
     twice_sine = wp.length(
