@@ -21,6 +21,12 @@ _MAX_MASS_BELOW = 0.015
 """Share of the opacity mass that may lie below the plane: half of what contact can leave out."""
 
 
+_AXIS_NAMES = "xyz"
+_HABIT = {1: 0.10, 2: 0.05, 0: 0.0}
+"""Trainers and generators put up along y most often (COLMAP: -y, glTF: +y), then along z, hardly ever along x."""
+_CLEAR_MARGIN = 0.3
+
+
 @dataclass(frozen=True)
 class _Underside:
     """What the object looks like from below."""
@@ -37,6 +43,9 @@ class _Underside:
     columns: np.ndarray
     """(c, 2) integer position of each column."""
     column_width: float
+    """Scene units."""
+    centre: np.ndarray
+    """(2,) centre of opacity, in columns."""
 
     @property
     def size(self) -> float:
@@ -79,7 +88,10 @@ def _underside(cloud: GaussianCloud, normal: np.ndarray) -> _Underside:
     columns, of = np.unique(column[near], axis=0, return_inverse=True)
     bottoms = np.full(len(columns), np.inf)
     np.minimum.at(bottoms, of.ravel(), heights[visible][near])
-    return _Underside(heights, opacities, low, high, bottoms, columns, width)
+    held = np.all((across >= box[:, 0]) & (across <= box[:, 1]), axis=1)
+    weights = np.where(held, opacities, 0.0)
+    centre = (weights @ across / max(float(weights.sum()), 1e-30) - box[:, 0]) / width - 0.5
+    return _Underside(heights, opacities, low, high, bottoms, columns, width, centre)
 
 
 def _support_level(underside: _Underside) -> float:
@@ -111,17 +123,12 @@ def _mass_quantile(values: np.ndarray, masses: np.ndarray, share: float) -> floa
     return float(values[order][min(int(np.searchsorted(mass, share * mass[-1])), len(values) - 1)])
 
 
-_AXIS_NAMES = "xyz"
-_HABIT = {1: 0.10, 2: 0.05, 0: 0.0}
-"""Trainers and generators put up along y most often (COLMAP: -y, glTF: +y), then along z, hardly ever along x."""
-_CLEAR_MARGIN = 0.3
-
-
 def guess_up(cloud: GaussianCloud, capture_format_up: np.ndarray | None = None) -> tuple[np.ndarray, str]:
     """Up (3,), unit, and the reason, for the user: the format's own up if it has one, else the best of the six axes.
 
-    An object rests on the side where it is supported widely and at one level. Each axis scores the area of its support
-    polygon, as a share of the silhouette seen along the axis, plus the share of its low columns that end at one level.
+    An object rests on the side where it is supported widely, at one level, and with its weight well inside. Each axis
+    scores the area of its support polygon, as a share of the silhouette seen along the axis, plus the share of its low
+    columns that end at one level, plus how deep the centre of opacity lies inside the polygon.
     """
     if capture_format_up is not None:
         return np.asarray(capture_format_up, dtype=np.float64), "the file format defines it"
@@ -130,16 +137,16 @@ def guess_up(cloud: GaussianCloud, capture_format_up: np.ndarray | None = None) 
         for sign in (1.0, -1.0):
             up = np.zeros(3)
             up[axis] = sign
-            polygon, level = _support_shape(cloud, up)
-            scores.append((polygon + level + _HABIT[axis], polygon, level, up))
+            shape = _support_shape(cloud, up)
+            scores.append((shape.polygon + shape.level + shape.depth + _HABIT[axis], shape, up))
     # Python's sort is stable, so a tie goes to the earlier axis.
     scores.sort(key=lambda entry: -entry[0])
-    (best, polygon, level, up), (second, _, _, other) = scores[0], scores[1]
-    margin = best - second
-    sure = "clearly" if margin > _CLEAR_MARGIN else "narrowly"
+    (best, shape, up), (second, _, other) = scores[0], scores[1]
+    sure = "clearly" if best - second > _CLEAR_MARGIN else "narrowly"
     reason = (
-        f"guessed: its support polygon there is {100 * polygon:.0f} % of the silhouette and {100 * level:.0f} % of the "
-        f"low parts end at one level; {sure} ahead of {_name(other)}, score {best:.2f} to {second:.2f}"
+        f"guessed: its support polygon there is {100 * shape.polygon:.0f} % of the silhouette and "
+        f"{100 * shape.level:.0f} % of the low parts end at one level; {sure} ahead of {_name(other)}, "
+        f"score {best:.2f} to {second:.2f}"
     )
     return up, reason
 
@@ -149,16 +156,33 @@ def _name(up: np.ndarray) -> str:
     return f"{'-' if up[axis] < 0 else '+'}{_AXIS_NAMES[axis]}"
 
 
-def _support_shape(cloud: GaussianCloud, up: np.ndarray) -> tuple[float, float]:
-    """Area of the support polygon over that of the silhouette, and the share of low columns at support level."""
-    underside = _underside(cloud, up)
+@dataclass(frozen=True)
+class _Support:
+    """How an object would stand on one side; each 0 to 1."""
+
+    polygon: float
+    """Area of the support polygon over that of the silhouette."""
+    level: float
+    """Share of the low columns that end at the support's level."""
+    depth: float
+    """Distance of the centre of opacity from the polygon's edge over the radius of the disc of its area; 0 outside."""
+
+
+def _support_shape(cloud: GaussianCloud, up: np.ndarray) -> _Support:
+    try:
+        underside = _underside(cloud, up)
+    except UserError:  # flat along this axis
+        return _Support(0.0, 0.0, 0.0)
     extent = max(underside.size, _COLUMNS * underside.column_width)
     above = underside.bottoms - _support_level(underside)
     support, low = np.abs(above) < 0.02 * extent, above < 0.12 * extent
     if not low.any():
-        return 0.0, 0.0
+        return _Support(0.0, 0.0, 0.0)
+    level = float(np.sum(support) / np.sum(low))
     try:
-        area = float(ConvexHull(underside.columns[support]).volume)
+        hull = ConvexHull(underside.columns[support])
     except (QhullError, ValueError):  # fewer than three columns, or all in one line
-        area = 0.0
-    return min(area / len(above), 1.0), float(np.sum(support) / np.sum(low))
+        return _Support(0.0, level, 0.0)
+    inside = -(hull.equations[:, :2] @ underside.centre + hull.equations[:, 2]).max()
+    depth = float(np.clip(inside / np.sqrt(hull.volume / np.pi), 0.0, 1.0))
+    return _Support(min(float(hull.volume) / len(above), 1.0), level, depth)
