@@ -71,7 +71,7 @@ def _digest(mesh: TetMesh) -> str:
 
 
 def test_pawn_cage(device: str) -> None:
-    """The built-in pawn: all promises, and every device gives the same mesh."""
+    """The built-in pawn: all promises, on every device."""
     thing = pawn(device=device)
     cage = build_cage(thing.cloud, thing.plane)
     _check(cage, thing.plane)
