@@ -11,14 +11,22 @@ from egs_warp.kernels.render_ellipse import TILE
 wp.set_module_options({"enable_backward": False})
 
 _SHARED = """
+    #pragma clang fp contract(fast)
     constexpr float LOG_255 = 5.541263545158426f;
     constexpr float CUT = 1.0f / 255.0f;
     constexpr float LIMIT = 0.999f;
     constexpr float STOP = 1.0e-4f;
     const int tile_width = width - left < 16 ? width - left : 16;
     const int tile_height = height - top < 16 ? height - top : 16;
+    // Pixels not yet full, by eights.
+    int open_in_half[32];
+    for (int i = 0; i < 32; ++i) {
+        const int columns = tile_width - 8 * (i & 1);
+        open_in_half[i] = (i >> 1) < tile_height && columns > 0 ? (columns < 8 ? columns : 8) : 0;
+    }
     // e^x for x <= 0 to 2e-7: 2^whole times a polynomial for 2^part, part in (-1, 0].
     auto exponential = [](float x) -> float {
+        #pragma clang fp contract(fast)
         float t = x * 1.4426950408889634f;
         t = t < -100.0f ? -100.0f : t;
         const int whole = (int)t;
@@ -59,6 +67,7 @@ _EACH_ROW = """
             const int half_first = leftmost <= 7.0f ? 0 : 1;
             const int half_last = rightmost >= 8.0f ? 1 : 0;
             for (int half = half_first; half <= half_last; ++half) {
+                if (open_in_half[2 * row + half] == 0) continue;
                 const int at = row * 16 + half * 8;
                 const float origin = (float)(half * 8) - middle;
 """
@@ -97,6 +106,7 @@ _FORWARD = (
                     far[at + k] += weight * c[3];
                 }
                 open_pixels -= closed;
+                open_in_half[2 * row + half] -= closed;
             }
         }
     }
@@ -169,6 +179,7 @@ _BACKWARD = (
                     sums[9][k] += weight * by_blue[at + k];
                 }
                 open_pixels -= closed;
+                open_in_half[2 * row + half] -= closed;
             }
         }
         float* out = (float*)moments.data + 12 * (size_t)slots.data[i];
