@@ -118,34 +118,45 @@ def rotate_sh_kernel(
         sh_out[row, 1] = -(turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z)
         sh_out[row, 2] = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z
     if degree >= 2:
+        # Each coefficient is read once: a row is 192 bytes, and neighbouring threads share no cache line.
+        red2 = Vec5()
+        green2 = Vec5()
+        blue2 = Vec5()
+        for j in range(5):
+            c2 = sh[row, 4 + j]
+            red2[j] = c2[0]
+            green2[j] = c2[1]
+            blue2[j] = c2[2]
         values_red = Vec5()
         values_green = Vec5()
         values_blue = Vec5()
         for i in range(5):
             basis = band_2(back * wp.vec3(DIRECTIONS[i, 0], DIRECTIONS[i, 1], DIRECTIONS[i, 2]))
-            value = wp.vec3(0.0)
-            for j in range(5):
-                value += basis[j] * sh[row, 4 + j]
-            values_red[i] = value[0]
-            values_green[i] = value[1]
-            values_blue[i] = value[2]
-        red = BAND_2_FROM_VALUES * values_red
-        green = BAND_2_FROM_VALUES * values_green
-        blue = BAND_2_FROM_VALUES * values_blue
+            values_red[i] = wp.dot(basis, red2)
+            values_green[i] = wp.dot(basis, green2)
+            values_blue[i] = wp.dot(basis, blue2)
+        red2 = BAND_2_FROM_VALUES * values_red
+        green2 = BAND_2_FROM_VALUES * values_green
+        blue2 = BAND_2_FROM_VALUES * values_blue
         for j in range(5):
-            sh_out[row, 4 + j] = wp.vec3(red[j], green[j], blue[j])
+            sh_out[row, 4 + j] = wp.vec3(red2[j], green2[j], blue2[j])
     if degree >= 3:
+        red3 = Vec7()
+        green3 = Vec7()
+        blue3 = Vec7()
+        for j in range(7):
+            c3 = sh[row, 9 + j]
+            red3[j] = c3[0]
+            green3[j] = c3[1]
+            blue3[j] = c3[2]
         values3_red = Vec7()
         values3_green = Vec7()
         values3_blue = Vec7()
         for i in range(7):
             basis3 = band_3(back * wp.vec3(DIRECTIONS[i, 0], DIRECTIONS[i, 1], DIRECTIONS[i, 2]))
-            value3 = wp.vec3(0.0)
-            for j in range(7):
-                value3 += basis3[j] * sh[row, 9 + j]
-            values3_red[i] = value3[0]
-            values3_green[i] = value3[1]
-            values3_blue[i] = value3[2]
+            values3_red[i] = wp.dot(basis3, red3)
+            values3_green[i] = wp.dot(basis3, green3)
+            values3_blue[i] = wp.dot(basis3, blue3)
         red3 = BAND_3_FROM_VALUES * values3_red
         green3 = BAND_3_FROM_VALUES * values3_green
         blue3 = BAND_3_FROM_VALUES * values3_blue
