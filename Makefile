@@ -1,7 +1,7 @@
 # Plain venv + pip; constraints.txt pins every package.
 PYTHON ?= python3
 VENV := .venv
-FRAMES ?= 110
+FRAMES ?= 120
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 

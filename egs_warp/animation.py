@@ -48,7 +48,7 @@ class AnimateOptions:
 
     distance: float = 0.5
     height: float = 0.2
-    frames: int = 110
+    frames: int = 120
     size: int = 512
     """Pixels, both sides."""
     seed: int = 0

@@ -13,7 +13,7 @@ def main() -> None:
     """Run the example."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/jump"))
-    parser.add_argument("--frames", type=int, default=110)
+    parser.add_argument("--frames", type=int, default=120)
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
