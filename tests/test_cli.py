@@ -1,0 +1,65 @@
+"""The command: bad input is one line and exit status 2, and loses nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egs_warp.cli import main, parse_plane, parse_up
+from egs_warp.errors import UserError
+from egs_warp.gaussians import GaussianCloud
+from egs_warp.io import write_ply
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--distance", "nan"], "--distance nan: give a number of body heights from 0 to 10"),
+        (["--distance", "-1"], "--distance -1.0: give a number of body heights from 0 to 10"),
+        (["--height", "11"], "--height 11.0: give a number of body heights from 0 to 10"),
+        (["--height", "0"], "--height 0: a jump needs a height above 0 body heights"),
+        (["--frames", "0"], "--frames 0: give a whole number of at least 1"),
+        (["--metres-per-unit", "-2"], "--metres-per-unit -2.0: give a positive number"),
+        (["--up", "w"], "--up w: give one of x, y, z, -x, -y, -z (write --up=-y)"),
+        (["--plane", "0,0,0,1"], "give four finite numbers nx,ny,nz,d with a normal that is not zero"),
+        (["--plane", "1,2"], "--plane 1,2: give four numbers nx,ny,nz,d"),
+        (["--device", "tpu"], "--device tpu: this machine has cpu"),
+        ([], "nothing.ply"),
+    ],
+)
+def test_bad_input_is_one_line(
+    flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status = main(["animate", str(tmp_path / "nothing.ply"), "--out", str(tmp_path / "out"), *flags])
+    error = capsys.readouterr().err
+    assert status == 2
+    assert message in error
+    assert error.startswith("egs-warp: ") and error.count("\n") == 1
+
+
+def test_flat_object_leaves_an_earlier_result_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(0)
+    flat = np.column_stack([rng.uniform(-1, 1, (500, 2)), np.zeros(500)])
+    cloud = GaussianCloud.from_numpy(
+        flat, np.tile([1.0, 0, 0, 0], (500, 1)), np.full((500, 3), -6.0), np.full(500, 3.0), np.zeros((500, 1, 3))
+    )
+    write_ply(tmp_path / "flat.ply", cloud)
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "jump.mp4").write_bytes(b"precious")
+    status = main(["animate", str(tmp_path / "flat.ply"), "--up", "z", "--out", str(out)])
+    assert status == 2
+    assert "Traceback" not in capsys.readouterr().err
+    assert (out / "jump.mp4").read_bytes() == b"precious"
+    assert [path.name for path in out.iterdir()] == ["jump.mp4"]
+
+
+def test_axes_and_planes_are_read() -> None:
+    assert np.array_equal(parse_up("-y"), [0.0, -1.0, 0.0])
+    assert np.array_equal(parse_up("+Z"), [0.0, 0.0, 1.0])
+    plane = parse_plane("0,2,0,-4")
+    assert np.array_equal(plane.normal, [0.0, 1.0, 0.0]) and plane.offset == -2.0
+    with pytest.raises(UserError, match="give one of x, y, z"):
+        parse_up("up")
