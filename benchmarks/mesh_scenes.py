@@ -135,8 +135,9 @@ def bar(cell: float = 0.125) -> PaintedMesh:
     vertices, faces = _subdivided(corners, faces, 0.02)
 
     def paint(points: np.ndarray) -> np.ndarray:
-        # Half a cell away from the surface, so that rounding does not choose the colour of a face.
-        parity = np.floor((0.999 * points + 1e-3) / cell).astype(int).sum(axis=1) % 2
+        # Faces lie on borders between cells; looked up a little inside, so that rounding does not choose their colour.
+        inside = (points - [0.0, 0.0, 0.5]) * 0.99 + [0.0, 0.0, 0.5]
+        parity = np.floor(inside / cell).astype(int).sum(axis=1) % 2
         return np.where(parity[:, None] == 0, [[0.9, 0.9, 0.85]], [[0.15, 0.2, 0.45]])
 
     return PaintedMesh("bar", vertices, faces, paint)
