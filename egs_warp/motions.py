@@ -182,7 +182,7 @@ class Jump:
 
     def _sufficient_speed(self, seen: Measurement, dt: float) -> float:
         """Speed up, m/s, at the end of this step from which free flight reaches the asked height."""
-        rise = self._start_com[2] + 0.97 * self.target.height - seen.com[2]
+        rise = self._start_com[2] + 0.95 * self.target.height - seen.com[2]
         step_gain = self.gravity * dt  # v dt + (v - g dt/2)^2 / 2g = rise, solved for v
         return float(max(-0.5 * step_gain + np.sqrt(max(2.0 * self.gravity * rise, 0.0)), 0.0))
 
@@ -190,7 +190,7 @@ class Jump:
         """Whether the centre of mass, in free flight from here, would reach the asked height."""
         speed = max(seen.velocity[2] - 0.5 * self.gravity * dt, 0.0)
         apex = seen.com[2] + speed**2 / (2.0 * self.gravity)
-        return bool(apex >= self._start_com[2] + 0.9 * self.target.height)
+        return bool(apex >= self._start_com[2] + 0.88 * self.target.height)
 
     def _stance_reference(self, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
         """Position and velocity (3,) of the centre of mass, ground coordinates, ``elapsed`` seconds into the phase."""
