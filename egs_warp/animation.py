@@ -52,6 +52,7 @@ class AnimateOptions:
     size: int = 512
     """Pixels, both sides."""
     seed: int = 0
+    """Written to the report; nothing in a jump is random, so it changes no result."""
     metres_per_unit: float | None = None
     """None: such that the body is 1 m tall."""
     friction: float = 0.8
@@ -168,7 +169,6 @@ def animate(
         raise UserError(f"--motion {motion}: known motions are: jump")
     options = options or AnimateOptions()
     folder = writable_folder(out)
-    wp.rand_init(options.seed)
     with tqdm(total=1, desc="prepare", unit="capture", disable=quiet) as bar:
         creature = make_creature(
             cloud, up=up, plane=plane, metres_per_unit=options.metres_per_unit, friction=options.friction

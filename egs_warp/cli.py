@@ -42,7 +42,7 @@ def _parser() -> argparse.ArgumentParser:
     animate.add_argument("--height", type=float, help="rise of the centre of mass, body heights (0.2)")
     animate.add_argument("--frames", type=int, help="length of the video at 60 Hz (120)")
     animate.add_argument("--size", type=int, help="pixels, both sides (512)")
-    animate.add_argument("--seed", type=int, help="of everything random (0)")
+    animate.add_argument("--seed", type=int, help="recorded in the report; a jump has nothing random (0)")
     animate.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
     animate.add_argument("--metres-per-unit", type=float, help="true scale; else the body is 1 m tall")
     animate.add_argument("--friction", type=float, help="Coulomb coefficient (0.8)")

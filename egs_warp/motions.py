@@ -74,9 +74,9 @@ def plan_jump(
     # A body that comes in with speed v stops over its base if that is ahead by v sqrt(h/g) (the capture point); the
     # front of the footprint helps.
     capture_time = np.sqrt(com_height / (1.3 * gravity))
-    help_ = min(0.3 * support_ahead, 0.5 * target.distance * capture_time / flight_time)
-    speed_forward = (target.distance - lean + help_) / (flight_time + capture_time + 0.5 * thrust_time)
-    landing_lag = speed_forward * capture_time - help_
+    footprint_help = min(0.3 * support_ahead, 0.5 * target.distance * capture_time / flight_time)
+    speed_forward = (target.distance - lean + footprint_help) / (flight_time + capture_time + 0.5 * thrust_time)
+    landing_lag = speed_forward * capture_time - footprint_help
     return JumpPlan(
         crouch_depth=stroke - extension,
         extension=extension,
