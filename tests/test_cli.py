@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from egs_warp.cli import main, parse_plane, parse_up
+from egs_warp.cli import main
+from egs_warp.cli_input import parse_plane, parse_up
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.io import write_ply

@@ -1,0 +1,38 @@
+"""Reading of flags that several commands share."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from egs_warp.errors import UserError
+
+_AXES = {"x": 0, "y": 1, "z": 2}
+
+
+def parse_up(text: str) -> np.ndarray:
+    """(3,) unit vector of an axis name such as ``-y``. Raises ``UserError`` otherwise."""
+    name = text.strip().lower().lstrip("+-")
+    if name not in _AXES:
+        raise UserError(f"--up {text}: give one of x, y, z, -x, -y, -z (write --up=-y)")
+    up = np.zeros(3)
+    up[_AXES[name]] = -1.0 if text.strip().startswith("-") else 1.0
+    return up
+
+
+def parse_plane(text: str):
+    """Plane from ``nx,ny,nz,d``. Raises ``UserError`` otherwise."""
+    from egs_warp.plane import Plane
+
+    try:
+        nx, ny, nz, d = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise UserError(f"--plane {text}: give four numbers nx,ny,nz,d") from error
+    return Plane.from_coefficients(nx, ny, nz, d)
+
+
+def check_device(name: str) -> None:
+    """Raises ``UserError`` where Warp sees no such device."""
+    import warp as wp
+
+    if name not in (devices := [str(device) for device in wp.get_devices()]):
+        raise UserError(f"--device {name}: this machine has {', '.join(devices)}")
