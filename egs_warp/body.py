@@ -78,7 +78,7 @@ class SoftBody:
     def mechanical_energy(self, positions: np.ndarray, velocities: np.ndarray) -> float:
         """Kinetic + elastic + gravitational energy, joules."""
         kinetic = 0.5 * float(self.node_mass @ (velocities**2).sum(axis=1))
-        elastic = self.assembly.energy(positions, np.zeros_like(positions), 0.0)
+        elastic = self.assembly.energy(positions)
         return kinetic + elastic - self.mass * float(self.gravity @ self.centre_of_mass(positions))
 
 
@@ -128,7 +128,7 @@ def make_body(
 
 def _held_stiffness(assembly: ElasticAssembly, free: np.ndarray) -> tuple[sparse.csc_matrix, np.ndarray]:
     """Stiffness at rest of the ``free`` (N,) nodes, and the indices of their coordinates."""
-    upper = assembly.matrix(assembly.matrix_entries(assembly.mesh.nodes, stiffness=1.0, damping=0.0))
+    upper = assembly.matrix(assembly.matrix_entries(assembly.mesh.nodes))
     kept = np.flatnonzero(np.repeat(free, 3))
     return (upper + sparse.triu(upper, 1).T).tocsc()[kept][:, kept], kept
 

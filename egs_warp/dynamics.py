@@ -81,7 +81,7 @@ class Factorisation:
 class ImplicitStep:
     """The function Phi of one step (DESIGN 5) and its minimisation; forces are constant over the step.
 
-    Phi(v) = 1/2 (v-v0)^T M (v-v0) + Psi(p + dt v) + dt/2 v^T C v - dt v^T f
+    Phi(v) = 1/2 (v-v0)^T M (v-v0) + Psi(p + dt v) + dt beta/2 sum V E':C:E' - dt v^T f, E' the mean strain rate of the step
     """
 
     body: SoftBody
@@ -107,22 +107,22 @@ class ImplicitStep:
     def energy(self, velocities: np.ndarray, force: np.ndarray) -> float:
         """Phi, joules; infinite where an element is inverted."""
         change = velocities - self.state.velocities
-        elastic = self.body.assembly.energy(self.end_positions(velocities), velocities, self.dt)
+        elastic = self.body.assembly.energy(self.end_positions(velocities), self.dt)
         inertia = 0.5 * float((self._mass * change**2).sum())
         drag = 0.5 * self.dt * self.drag * float((self._mass * velocities**2).sum())
         return inertia + elastic + drag - self.dt * float((velocities * force).sum())
 
     def gradient(self, velocities: np.ndarray, force: np.ndarray) -> np.ndarray:
         """(N, 3) dPhi/dv, N s."""
-        internal = self.body.assembly.gradient(self.end_positions(velocities), velocities)
+        internal = self.body.assembly.gradient(self.end_positions(velocities), self.dt)
         inertia = self._mass * (velocities - self.state.velocities + self.dt * self.drag * velocities)
         return inertia + self.dt * (internal - force)
 
     def matrix_entries(self, velocities: np.ndarray, *, projected: bool) -> np.ndarray:
-        """Upper entries of S = (1 + dt alpha) M + dt C + dt^2 K at the end positions of ``velocities``."""
+        """Upper entries of S = (1 + dt alpha) M + dt C + dt^2 K, the second derivative of Phi, at the end positions of ``velocities``."""
         assembly = self.body.assembly
         entries = assembly.matrix_entries(
-            self.end_positions(velocities), stiffness=self.dt**2, damping=self.dt, projected=projected
+            self.end_positions(velocities), self.dt, factor=self.dt**2, projected=projected
         )
         entries[assembly.diagonal_entries] += (1.0 + self.dt * self.drag) * np.repeat(self.body.node_mass, 3)
         return entries

@@ -50,13 +50,11 @@ class ElasticAssembly:
         self._volumes = wp.array(mesh.volumes(), dtype=real, device=device)
         self._start_gradients = wp.array(np.tile(np.eye(3), (tet_count, 1, 1)), dtype=Mat33, device=device)
         self._positions = wp.zeros(node_count, dtype=Vec3, device=device)
-        self._velocities = wp.zeros(node_count, dtype=Vec3, device=device)
         self._energies = wp.zeros(tet_count, dtype=real, device=device)
         self._determinants = wp.zeros(tet_count, dtype=real, device=device)
         self._corner_gradients = wp.zeros((tet_count, 4), dtype=Vec3, device=device)
         self._node_gradients = wp.zeros(node_count, dtype=Vec3, device=device)
-        self._stiffness_blocks = wp.zeros((tet_count, 16), dtype=Mat33, device=device)
-        self._damping_blocks = wp.zeros((tet_count, 16), dtype=Mat33, device=device)
+        self._blocks = wp.zeros((tet_count, 16), dtype=Mat33, device=device)
         self._index_corners()
         self._index_matrix()
 
@@ -109,10 +107,11 @@ class ElasticAssembly:
 
     @property
     def _model(self) -> list:
-        return [self._tets, self._rest_inverses, self._volumes, self.material.mu, self.material.lam]
+        material = self.material
+        return [self._tets, self._rest_inverses, self._volumes, material.mu, material.lam, material.damping_time]
 
     def begin_step(self, positions: np.ndarray) -> None:
-        """Freeze the deformation gradients and the damping matrix of the step's start (DESIGN 5)."""
+        """Remember the deformation gradients of the step's start: damping resists the change of strain from here (DESIGN 5)."""
         self._upload(self._positions, positions)
         wp.launch(
             kernels.deformation_gradients_kernel,
@@ -121,47 +120,35 @@ class ElasticAssembly:
             outputs=[self._start_gradients],
             device=self.device,
         )
-        wp.launch(
-            kernels.element_damping_kernel,
-            dim=len(self.mesh.tets),
-            inputs=[*self._model[1:], self.material.damping_time, self._start_gradients],
-            outputs=[self._damping_blocks],
-            device=self.device,
-        )
 
     def determinants(self, positions: np.ndarray) -> np.ndarray:
         """(T,) J = det F; not positive where an element is inverted."""
-        self.energy(positions, np.zeros_like(positions), 0.0)
+        self.energy(positions)
         return self._determinants.numpy().copy()
 
-    def energy(self, positions: np.ndarray, velocities: np.ndarray, dt: float) -> float:
-        """Psi(positions) + dt/2 v^T C v, joules; infinite if an element is inverted."""
+    def energy(self, positions: np.ndarray, dt: float = 0.0) -> float:
+        """Psi(positions), joules; infinite if an element is inverted.
+
+        With ``dt``, plus dt beta/2 sum V E':C:E', where E' = (F^T F - F0^T F0) / (2 dt) is the mean strain rate since
+        ``begin_step``. It is blind to rotations however large, so a spin is not damped (DESIGN 5).
+        """
         self._upload(self._positions, positions)
-        self._upload(self._velocities, velocities)
         wp.launch(
             kernels.element_energies_kernel,
             dim=len(self.mesh.tets),
-            inputs=[
-                *self._model,
-                self.material.damping_time,
-                self._start_gradients,
-                self._positions,
-                self._velocities,
-                dt,
-            ],
+            inputs=[*self._model, self._start_gradients, self._positions, dt],
             outputs=[self._energies, self._determinants],
             device=self.device,
         )
         return float(self._energies.numpy().sum())
 
-    def gradient(self, positions: np.ndarray, velocities: np.ndarray) -> np.ndarray:
-        """(N, 3) newtons: dPsi/dx + C v, minus the internal force."""
+    def gradient(self, positions: np.ndarray, dt: float = 0.0) -> np.ndarray:
+        """(N, 3) newtons: the derivative of ``energy`` by the positions, minus the internal force."""
         self._upload(self._positions, positions)
-        self._upload(self._velocities, velocities)
         wp.launch(
             kernels.element_gradients_kernel,
             dim=len(self.mesh.tets),
-            inputs=[*self._model, self.material.damping_time, self._start_gradients, self._positions, self._velocities],
+            inputs=[*self._model, self._start_gradients, self._positions, dt],
             outputs=[self._corner_gradients],
             device=self.device,
         )
@@ -175,19 +162,19 @@ class ElasticAssembly:
         return self._node_gradients.numpy().copy()
 
     def matrix_entries(
-        self, positions: np.ndarray, *, stiffness: float, damping: float, projected: bool = False
+        self, positions: np.ndarray, dt: float = 0.0, *, factor: float = 1.0, projected: bool = False
     ) -> np.ndarray:
-        """Entries of ``stiffness`` K(positions) + ``damping`` C in the order of ``upper_pattern``.
+        """Entries of ``factor`` times the second derivative of ``energy`` in the order of ``upper_pattern``.
 
-        ``projected``: each element's K has its negative eigenvalues removed.
+        ``projected``: each element's part is made positive semi-definite.
         """
         self._upload(self._positions, positions)
         hessian = kernels.element_projected_hessians_kernel if projected else kernels.element_hessians_kernel
         wp.launch(
             hessian,
             dim=len(self.mesh.tets),
-            inputs=[*self._model, self._positions],
-            outputs=[self._stiffness_blocks],
+            inputs=[*self._model, self._start_gradients, self._positions, dt],
+            outputs=[self._blocks],
             device=self.device,
         )
         wp.launch(
@@ -197,10 +184,8 @@ class ElasticAssembly:
                 self._contribution_offsets,
                 self._block_from_contribution,
                 self._entry_from_block,
-                self._stiffness_blocks,
-                stiffness,
-                self._damping_blocks,
-                damping,
+                self._blocks,
+                factor,
             ],
             outputs=[self._entries],
             device=self.device,

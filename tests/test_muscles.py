@@ -145,7 +145,7 @@ def column_muscles(column_body: SoftBody) -> MuscleSet:
 
 def linear_response(body: SoftBody, muscles: MuscleSet, segments: np.ndarray) -> np.ndarray:
     """(N, 3) static displacement when ``segments`` contract by 2 % of their lengths and the base is clamped."""
-    upper = body.assembly.matrix(body.assembly.matrix_entries(COLUMN.nodes, stiffness=1.0, damping=0.0))
+    upper = body.assembly.matrix(body.assembly.matrix_entries(COLUMN.nodes))
     stiffness = (upper + sparse.triu(upper, 1).T).tocsc()
     activation = np.zeros(muscles.segment_count)
     activation[segments] = 0.02 * muscles.rest_lengths[segments]

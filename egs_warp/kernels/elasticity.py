@@ -22,13 +22,21 @@ def shape_gradient(rest_inverse: Mat33, corner: int) -> Vec3:
 
 
 @wp.func
-def damping_stress(start_gradient: Mat33, rate: Mat33, mu: real, lam: real) -> Mat33:
-    """First Piola stress F (2 mu E' + lambda tr(E') I) of E' = sym(F^T F'), F at the start of the step."""
-    product = wp.transpose(start_gradient) * rate
-    strain_rate = real(0.5) * (product + wp.transpose(product))
-    return start_gradient * (
-        real(2.0) * mu * strain_rate + lam * wp.trace(strain_rate) * wp.identity(n=3, dtype=wp.float64)
+def damping_stress(start_gradient: Mat33, gradient: Mat33, dt: real, mu: real, lam: real) -> Mat33:
+    """Second Piola stress 2 mu E' + lambda tr(E') I of E' = (F^T F - F0^T F0) / (2 dt), F0 at the start of the step."""
+    strain_rate = (wp.transpose(gradient) * gradient - wp.transpose(start_gradient) * start_gradient) / (real(2.0) * dt)
+    return real(2.0) * mu * strain_rate + lam * wp.trace(strain_rate) * wp.identity(n=3, dtype=wp.float64)
+
+
+@wp.func
+def damping_block(gradient: Mat33, stress: Mat33, g_a: Vec3, g_b: Vec3, dt: real, mu: real, lam: real) -> Mat33:
+    """Block (a, b) of the derivative of F S by the corners, g_a.S g_b I from the turning of F and the rest from S itself."""
+    f_a = gradient * g_a
+    f_b = gradient * g_b
+    material = mu * (wp.dot(g_a, g_b) * (gradient * wp.transpose(gradient)) + wp.outer(f_b, f_a)) + lam * wp.outer(
+        f_a, f_b
     )
+    return material / dt + wp.dot(g_a, stress * g_b) * wp.identity(n=3, dtype=wp.float64)
 
 
 @wp.kernel
@@ -57,13 +65,12 @@ def element_energies_kernel(
     # In:
     start_gradients: wp.array[Mat33],
     positions: wp.array[Vec3],
-    velocities: wp.array[Vec3],
     dt: real,
     # Out:
     energies_out: wp.array[real],
     determinants_out: wp.array[real],
 ):
-    """Eq. (5) plus dt times half the dissipated power; infinite where an element is inverted."""
+    """Eq. (5) plus dt times half the dissipated power (none if dt is 0); infinite where an element is inverted."""
     e = wp.tid()
     f = deformation_gradient(positions, tets[e], rest_inverses[e])
     j = wp.determinant(f)
@@ -73,9 +80,12 @@ def element_energies_kernel(
     else:
         log_j = wp.log(j)
         density = real(0.5) * mu * (wp.ddot(f, f) - real(3.0)) - mu * log_j + real(0.5) * lam * log_j * log_j
-        rate = deformation_gradient(velocities, tets[e], rest_inverses[e])
-        dissipation = real(0.5) * damping_time * wp.ddot(rate, damping_stress(start_gradients[e], rate, mu, lam))
-        energies_out[e] = volumes[e] * (density + dt * dissipation)
+        if dt > real(0.0):
+            f0 = start_gradients[e]
+            stress = damping_stress(f0, f, dt, mu, lam)
+            strain = real(0.5) * (wp.transpose(f) * f - wp.transpose(f0) * f0)
+            density += real(0.5) * damping_time * wp.ddot(strain, stress)
+        energies_out[e] = volumes[e] * density
 
 
 @wp.kernel
@@ -90,7 +100,7 @@ def element_gradients_kernel(
     # In:
     start_gradients: wp.array[Mat33],
     positions: wp.array[Vec3],
-    velocities: wp.array[Vec3],
+    dt: real,
     # Out:
     corner_gradients_out: wp.array2d[Vec3],
 ):
@@ -100,9 +110,8 @@ def element_gradients_kernel(
     inverse_transpose = wp.transpose(wp.inverse(f))
     log_j = wp.log(wp.determinant(f))
     stress = mu * (f - inverse_transpose) + lam * log_j * inverse_transpose
-    if damping_time > real(0.0):
-        rate = deformation_gradient(velocities, tets[e], rest_inverses[e])
-        stress += damping_time * damping_stress(start_gradients[e], rate, mu, lam)
+    if dt > real(0.0):
+        stress += damping_time * (f * damping_stress(start_gradients[e], f, dt, mu, lam))
     for a in range(4):
         corner_gradients_out[e, a] = volumes[e] * (stress * shape_gradient(rest_inverses[e], a))
 
@@ -133,17 +142,26 @@ def element_hessians_kernel(
     volumes: wp.array[real],
     mu: real,
     lam: real,
+    damping_time: real,
     # In:
+    start_gradients: wp.array[Mat33],
     positions: wp.array[Vec3],
+    dt: real,
     # Out:
     blocks_out: wp.array2d[Mat33],
 ):
-    """True Hessian of Eq. (5): block (a, b) = V [mu g_a.g_b I + (mu - lambda ln J) h_b h_a^T + lambda h_a h_b^T], h = F^-T g."""
+    """True Hessian of Eq. (5): block (a, b) = V [mu g_a.g_b I + (mu - lambda ln J) h_b h_a^T + lambda h_a h_b^T], h = F^-T g.
+
+    Plus that of the damping (Eq. 6) over a step of dt, if dt is not 0.
+    """
     e = wp.tid()
     rest_inverse = rest_inverses[e]
     f = deformation_gradient(positions, tets[e], rest_inverse)
     inverse_transpose = wp.transpose(wp.inverse(f))
     cross_term = mu - lam * wp.log(wp.determinant(f))
+    stress = Mat33()
+    if dt > real(0.0):
+        stress = damping_stress(start_gradients[e], f, dt, mu, lam)
     for a in range(4):
         g_a = shape_gradient(rest_inverse, a)
         h_a = inverse_transpose * g_a
@@ -155,6 +173,8 @@ def element_hessians_kernel(
                 + cross_term * wp.outer(h_b, h_a)
                 + lam * wp.outer(h_a, h_b)
             )
+            if dt > real(0.0):
+                block += damping_time * damping_block(f, stress, g_a, g_b, dt, mu, lam)
             blocks_out[e, 4 * a + b] = volumes[e] * block
 
 
@@ -166,8 +186,11 @@ def element_projected_hessians_kernel(
     volumes: wp.array[real],
     mu: real,
     lam: real,
+    damping_time: real,
     # In:
+    start_gradients: wp.array[Mat33],
     positions: wp.array[Vec3],
+    dt: real,
     # Out:
     blocks_out: wp.array2d[Mat33],
 ):
@@ -175,7 +198,8 @@ def element_projected_hessians_kernel(
 
     In the frames of F = U diag(s) V^T the Hessian splits into the 3x3 block d2Psi/ds_i ds_j and, for each pair i < k, a twist
     eigenvalue (Psi_i + Psi_k)/(s_i + s_k) and a flip eigenvalue (Psi_i - Psi_k)/(s_i - s_k) (Smith, de Goes, Kim 2019). For
-    Eq. (5) these are mu + (lambda ln J - mu)/(s_i s_k) and mu - (lambda ln J - mu)/(s_i s_k).
+    Eq. (5) these are mu + (lambda ln J - mu)/(s_i s_k) and mu - (lambda ln J - mu)/(s_i s_k). Of the damping the semi-definite
+    part is added: without the turning of F.
     """
     e = wp.tid()
     rest_inverse = rest_inverses[e]
@@ -223,32 +247,12 @@ def element_projected_hessians_kernel(
                     if i != k:
                         block[i, i] += direct[i, k] * g_a[k] * g_b[k]
                         block[i, k] += scaling[i, k] * g_a[i] * g_b[k] + swapped[i, k] * g_a[k] * g_b[i]
-            blocks_out[e, 4 * a + b] = volumes[e] * (u * block * wp.transpose(u))
-
-
-@wp.kernel
-def element_damping_kernel(
-    # Model:
-    rest_inverses: wp.array[Mat33],
-    volumes: wp.array[real],
-    mu: real,
-    lam: real,
-    damping_time: real,
-    # In:
-    start_gradients: wp.array[Mat33],
-    # Out:
-    blocks_out: wp.array2d[Mat33],
-):
-    """Matrix C of the damping force -C v of ``damping_stress``: symmetric, positive semi-definite, zero for rigid velocities."""
-    e = wp.tid()
-    f = start_gradients[e]
-    metric = f * wp.transpose(f)
-    for a in range(4):
-        g_a = shape_gradient(rest_inverses[e], a)
-        for b in range(4):
-            g_b = shape_gradient(rest_inverses[e], b)
-            block = mu * (wp.dot(g_a, g_b) * metric + wp.outer(f * g_b, f * g_a)) + lam * wp.outer(f * g_a, f * g_b)
-            blocks_out[e, 4 * a + b] = (damping_time * volumes[e]) * block
+            block = u * block * wp.transpose(u)
+            if dt > real(0.0):
+                rest_a = shape_gradient(rest_inverse, a)
+                rest_b = shape_gradient(rest_inverse, b)
+                block += damping_time * damping_block(f, Mat33(), rest_a, rest_b, dt, mu, lam)
+            blocks_out[e, 4 * a + b] = volumes[e] * block
 
 
 @wp.kernel
@@ -258,20 +262,17 @@ def gather_matrix_kernel(
     block_from_contribution: wp.array[int],
     entry_from_block: wp.array2d[int],
     # In:
-    stiffness_blocks: wp.array2d[Mat33],
-    stiffness_factor: real,
-    damping_blocks: wp.array2d[Mat33],
-    damping_factor: real,
+    blocks: wp.array2d[Mat33],
+    factor: real,
     # Out:
     entries_out: wp.array[real],
 ):
-    """Upper-triangular matrix entries of stiffness_factor K + damping_factor C, one thread a 3x3 block."""
+    """Upper-triangular matrix entries of ``factor`` times the sum of the elements' blocks, one thread a 3x3 block."""
     block_index = wp.tid()
     total = Mat33()
     for slot in range(contribution_offsets[block_index], contribution_offsets[block_index + 1]):
         source = block_from_contribution[slot]
-        total += stiffness_factor * stiffness_blocks[source // 16, source % 16]
-        total += damping_factor * damping_blocks[source // 16, source % 16]
+        total += factor * blocks[source // 16, source % 16]
     for i in range(3):
         for k in range(3):
             entry = entry_from_block[block_index, 3 * i + k]
