@@ -224,16 +224,20 @@ class Jump:
         return np.array([ahead, position[1], self._start_com[2]])
 
     def _fly(self, state: BodyState, seen: Measurement, dt: float) -> list[Objective | SpinObjective]:
+        touch_down, left, velocity = self._falling(seen, dt)
+        pose = self.pose.over_base(touch_down, self._goal_base)
+        spin = self.pose.turn_towards(state, pose) / left
+        return self._write(state, velocity, pose, spin, dt)
+
+    def _falling(self, seen: Measurement, dt: float) -> tuple[np.ndarray, float, np.ndarray]:
+        """Where the centre of mass (3,) will touch down, the seconds left until then, and its velocity (3,) after this step."""
         drop = max(seen.com[2] - self._start_com[2], 0.0)
         speed = seen.velocity[2]
         left = (speed + np.sqrt(max(speed**2 + 2.0 * self.gravity * drop, 0.0))) / self.gravity
         left = max(left, dt)
         touch_down = seen.com + np.array([*(seen.velocity[:2] * left), 0.0])
         touch_down[2] = self._start_com[2]
-        pose = self.pose.over_base(touch_down, self._goal_base)
-        velocity = seen.velocity - np.array([0.0, 0.0, self.gravity * dt])
-        spin = self.pose.turn_towards(state, pose) / left
-        return self._write(state, velocity, pose, spin, dt)
+        return touch_down, left, seen.velocity - np.array([0.0, 0.0, self.gravity * dt])
 
     def _land(self, state: BodyState, seen: Measurement, dt: float) -> list[Objective | SpinObjective]:
         rate = self.plan.landing_rate
