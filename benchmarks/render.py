@@ -31,11 +31,11 @@ import render_peers as peers
 
 from egs_warp.camera import Camera
 from egs_warp.gaussians import GaussianCloud
+from egs_warp.launching import available_threads
 from egs_warp.render import render
 from egs_warp.render.backward import backward
 from egs_warp.render.compositing import Background, composite
 from egs_warp.render.projection import project, view_from_camera
-from egs_warp.render.threads import available_threads
 from egs_warp.render.tiles import build_tile_lists
 
 CELLS = ((1, 648, 420), (1, 1944, 1260), (5, 648, 420), (5, 1944, 1260), (11, 648, 420))

@@ -1,7 +1,7 @@
-"""Launch a kernel over many independent rows with every core of a CPU.
+"""Launch a kernel over many independent rows: at once on a GPU, with every core on a CPU.
 
 On a CPU, Warp runs one launch on one thread but releases the interpreter lock while it runs, so launches over disjoint
-rows from a thread pool run side by side.
+rows from several threads run side by side.
 """
 
 from __future__ import annotations
@@ -13,40 +13,76 @@ from functools import cache
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 _MIN_ROWS_PER_CHUNK = 2048
-"""Below this a launch's own cost (about 20 us) is no longer small against its work."""
+"""Below this many light rows a launch's own cost (about 20 us) is no longer small against its work."""
 
 _CHUNKS_PER_THREAD = 4
-"""Rows differ in cost (outside points search longer), so give the pool more chunks than threads."""
+"""Rows differ in cost, so there are more chunks than threads."""
+
+
+def available_threads() -> int:
+    """Number of processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
 def launch_rows(
-    kernel: wp.Kernel, row_count: int, *, inputs: Sequence[Any], outputs: Sequence[Any], device: wp.Device
+    kernel: Any,
+    row_count: int,
+    *,
+    inputs: Sequence[Any],
+    outputs: Sequence[Any],
+    device: Any,
+    threads: int | None = None,
+    work: np.ndarray | None = None,
 ) -> None:
     """Run ``kernel`` over rows 0 .. ``row_count`` - 1.
 
     The kernel's first parameter must be ``first_row: wp.int32`` and its row ``first_row + wp.tid()``; each row may
     write only what belongs to it, so that the result does not depend on how rows are shared out. ``inputs`` and
-    ``outputs`` are the remaining parameters.
+    ``outputs`` are the remaining parameters. ``threads`` (a CPU only) defaults to the available cores. ``work``
+    (row_count,) is the expected effort of heavy rows, any unit; without it rows are light and alike.
     """
-    thread_count = os.cpu_count() or 1
-    chunk_count = min(thread_count * _CHUNKS_PER_THREAD, row_count // _MIN_ROWS_PER_CHUNK)
-    if not device.is_cpu or thread_count == 1 or chunk_count < 2:
+    if not device.is_cpu:
+        wp.launch(kernel, dim=row_count, inputs=[0, *inputs], outputs=list(outputs), device=device)
+        return
+    threads = threads or available_threads()
+    edges = _chunk_edges(row_count, threads, work)
+    if threads == 1 or len(edges) < 3:
         wp.launch(kernel, dim=row_count, inputs=[0, *inputs], outputs=list(outputs), device=device)
         return
     # Compiling is not safe from several threads at once.
     kernel.module.load(device, block_dim=1)
-    bounds = [row_count * chunk // chunk_count for chunk in range(chunk_count + 1)]
+    chunks = iter(list(pairwise(edges)))
 
-    def launch_chunk(first: int, last: int) -> None:
-        wp.launch(kernel, dim=last - first, inputs=[first, *inputs], outputs=list(outputs), device=device)
+    def launch_chunks() -> None:
+        # Whoever is free takes the next chunk.
+        for first, last in chunks:
+            wp.launch(kernel, dim=last - first, inputs=[first, *inputs], outputs=list(outputs), device=device)
 
-    for finished in [_pool().submit(launch_chunk, a, b) for a, b in pairwise(bounds)]:
-        finished.result()
+    helpers = [_pool().submit(launch_chunks) for _ in range(min(threads, len(edges) - 1) - 1)]
+    try:
+        launch_chunks()
+    finally:
+        # A helper that has not begun has nothing left to do; in a forked process none ever begins.
+        for helper in helpers:
+            if not helper.cancel():
+                helper.result()
+
+
+def _chunk_edges(row_count: int, threads: int, work: np.ndarray | None) -> list[int]:
+    """Where chunks of like effort begin and end."""
+    if work is None:
+        chunk_count = max(1, min(_CHUNKS_PER_THREAD * threads, row_count // _MIN_ROWS_PER_CHUNK))
+        return [row_count * chunk // chunk_count for chunk in range(chunk_count + 1)]
+    done = np.concatenate([[0.0], np.cumsum(np.asarray(work, dtype=np.float64) + 1e-3)])
+    chunk_count = max(1, min(_CHUNKS_PER_THREAD * threads, row_count))
+    inner = np.searchsorted(done, np.linspace(0.0, done[-1], chunk_count + 1)[1:-1])
+    return np.unique(np.concatenate([[0], inner, [row_count]])).tolist()
 
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max_workers=os.cpu_count())
+    return ThreadPoolExecutor(max_workers=max(1, (os.cpu_count() or 1) - 1))

@@ -12,78 +12,68 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def gather_ranks_kernel(
-    first: wp.int32,
+def count_tiles_kernel(
+    first_chunk: wp.int32,
     # In:
+    width: wp.int32,
     height: wp.int32,
+    chunk_start: wp.array[wp.int32],
     gaussian_from_rank: wp.array[wp.int32],
     slot_end: wp.array[wp.int64],
     ellipse: wp.array[wp.vec4],
     falloff: wp.array[wp.vec2],
     # Out:
-    rows_out: wp.array[wp.vec2i],
-    slot_out: wp.array[wp.int32],
-    ellipse_out: wp.array[wp.vec4],
-    falloff_out: wp.array[wp.vec2],
+    tile_from_slot_out: wp.array[wp.int32],
+    count_out: wp.array2d[wp.int32],
 ):
-    """What the walk from front to back needs of each Gaussian, in the order in which it needs it (CPU)."""
-    rank = wp.tid() + first
-    g = gaussian_from_rank[rank]
-    slot = wp.int32(0)
-    if g > 0:
-        slot = wp.int32(slot_end[g - 1])
-    rows_out[rank] = tile_rows(ellipse[g], falloff[g], height)
-    slot_out[rank] = slot
-    ellipse_out[rank] = ellipse[g]
-    falloff_out[rank] = falloff[g]
+    """One thread walks one chunk of the Gaussians, from front to back, and counts them tile by tile (CPU)."""
+    chunk = wp.tid() + first_chunk
+    columns = (width + TILE - 1) / TILE
+    for rank in range(chunk_start[chunk], chunk_start[chunk + 1]):
+        g = gaussian_from_rank[rank]
+        slot = wp.int32(0)
+        if g > 0:
+            slot = wp.int32(slot_end[g - 1])
+        e = ellipse[g]
+        f = falloff[g]
+        rows = tile_rows(e, f, height)
+        for row in range(rows[0], rows[1] + 1):
+            span = tile_columns(e, f, row, width, height)
+            for column in range(span[0], span[1] + 1):
+                tile = row * columns + column
+                tile_from_slot_out[slot] = tile
+                count_out[chunk, tile] = count_out[chunk, tile] + 1
+                slot += 1
 
 
 @wp.kernel
-def band_lists_kernel(
-    first: wp.int32,
+def fill_tiles_kernel(
+    first_chunk: wp.int32,
     # In:
-    band_rows: wp.int32,
-    width: wp.int32,
-    height: wp.int32,
-    visible_count: wp.int32,
-    fill: wp.int32,
+    chunk_start: wp.array[wp.int32],
     gaussian_from_rank: wp.array[wp.int32],
-    rows: wp.array[wp.vec2i],
-    slot: wp.array[wp.int32],
-    ellipse: wp.array[wp.vec4],
-    falloff: wp.array[wp.vec2],
+    slot_end: wp.array[wp.int64],
+    tile_from_slot: wp.array[wp.int32],
     # Out:
-    cursor_out: wp.array[wp.int32],
+    cursor_out: wp.array2d[wp.int32],
     gaussian_from_intersection_out: wp.array[wp.int32],
     slot_from_intersection_out: wp.array[wp.int32],
 ):
-    """One thread walks all Gaussians from front to back and counts, or appends, those of its tile rows (CPU)."""
-    band = wp.tid() + first
-    columns = (width + TILE - 1) / TILE
-    top = band * band_rows
-    bottom = wp.min(top + band_rows, (height + TILE - 1) / TILE) - 1
-    for rank in range(visible_count):
-        reach = rows[rank]
-        if reach[0] <= bottom and reach[1] >= top:
-            e = ellipse[rank]
-            f = falloff[rank]
-            g = gaussian_from_rank[rank]
-            pair = slot[rank]
-            start = reach[0]
-            if fill == 0:
-                # Counting needs no slots, so rows above the band are of no interest.
-                start = wp.max(start, top)
-            for row in range(start, wp.min(reach[1], bottom) + 1):
-                span = tile_columns(e, f, row, width, height)
-                if row >= top:
-                    for column in range(span[0], span[1] + 1):
-                        tile = row * columns + column
-                        i = cursor_out[tile]
-                        cursor_out[tile] = i + 1
-                        if fill != 0:
-                            gaussian_from_intersection_out[i] = g
-                            slot_from_intersection_out[i] = pair + column - span[0]
-                pair += span[1] - span[0] + 1
+    """The same walk appends each Gaussian to its tiles; ``cursor_out`` begins where the chunk's part of a tile does."""
+    chunk = wp.tid() + first_chunk
+    for rank in range(chunk_start[chunk], chunk_start[chunk + 1]):
+        g = gaussian_from_rank[rank]
+        slot = wp.int32(0)
+        if g > 0:
+            slot = wp.int32(slot_end[g - 1])
+        end = wp.int32(slot_end[g])
+        while slot < end:
+            tile = tile_from_slot[slot]
+            i = cursor_out[chunk, tile]
+            cursor_out[chunk, tile] = i + 1
+            gaussian_from_intersection_out[i] = g
+            slot_from_intersection_out[i] = slot
+            slot += 1
 
 
 @wp.kernel

@@ -12,11 +12,11 @@ import warp as wp
 from egs_warp.camera import Camera
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
+from egs_warp.launching import available_threads
 from egs_warp.render.backward import backward
 from egs_warp.render.compositing import RenderedImage, composite
 from egs_warp.render.projection import ProjectedGaussians, project, view_from_camera
 from egs_warp.render.rasteriser import background_of, refusing_what_does_not_fit
-from egs_warp.render.threads import available_threads
 from egs_warp.render.tiles import TileLists, build_tile_lists
 
 

@@ -12,10 +12,10 @@ from egs_warp.kernels.render_backward import (
     pixel_gradients_kernel,
     project_backward_kernel,
 )
+from egs_warp.launching import launch_rows
 from egs_warp.render.arrays import empty, zeros
 from egs_warp.render.compositing import RenderedImage
 from egs_warp.render.projection import ProjectedGaussians
-from egs_warp.render.threads import launch_ranges
 from egs_warp.render.tiles import TileLists
 
 
@@ -89,7 +89,7 @@ def backward(
         # Likewise: a GPU's compiler would refuse this one.
         from egs_warp.kernels.render_cpu import composite_backward_tile_kernel
 
-        launch_ranges(
+        launch_rows(
             composite_backward_tile_kernel,
             lists.tile_count,
             inputs=inputs,
@@ -109,7 +109,7 @@ def backward(
         pose_rotation=empty(poses, wp.mat33, device),
         pose_translation=empty(poses, wp.vec3, device),
     )
-    launch_ranges(
+    launch_rows(
         project_backward_kernel,
         count,
         inputs=[

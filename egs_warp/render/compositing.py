@@ -10,9 +10,9 @@ import warp as wp
 
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.kernels.render_compositing import composite_geometry_kernel, splat_normals_kernel
+from egs_warp.launching import launch_rows
 from egs_warp.render.arrays import empty
 from egs_warp.render.projection import ProjectedGaussians
-from egs_warp.render.threads import launch_ranges
 from egs_warp.render.tiles import TileLists
 
 
@@ -83,7 +83,7 @@ def composite(
         # Likewise: a GPU's compiler would refuse this one.
         from egs_warp.kernels.render_cpu import composite_tile_kernel
 
-        launch_ranges(
+        launch_rows(
             composite_tile_kernel,
             lists.tile_count,
             inputs=inputs,
@@ -108,7 +108,7 @@ def add_geometry(
     device = cloud.device
     width, height = int(view.width), int(view.height)
     splat_normals = empty(cloud.count, wp.vec3, device)
-    launch_ranges(
+    launch_rows(
         splat_normals_kernel,
         cloud.count,
         inputs=[view, cloud.means, cloud.rotations, cloud.log_scales],
@@ -118,7 +118,7 @@ def add_geometry(
     )
     median_depth = empty(width * height, wp.float32, device)
     normal = empty(width * height, wp.vec3, device)
-    launch_ranges(
+    launch_rows(
         composite_geometry_kernel,
         lists.tile_count * 256,
         inputs=[

@@ -13,8 +13,8 @@ from egs_warp.camera import Camera
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.kernels.render_projection import View, project_kernel
+from egs_warp.launching import launch_rows
 from egs_warp.render.arrays import empty
-from egs_warp.render.threads import launch_ranges
 
 _ATTRIBUTES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 
@@ -75,7 +75,7 @@ def project(cloud: GaussianCloud, view: Any, *, antialiased: bool, threads: int)
     tile_count = empty(count, wp.int64, device)
     # The first non-finite Gaussian by attribute, then the number of slots: one read-back for all.
     findings = wp.full(len(_ATTRIBUTES) + 1, count, dtype=wp.int64, device=device)
-    launch_ranges(
+    launch_rows(
         project_kernel,
         count,
         inputs=[view, int(antialiased), *(getattr(cloud, name) for name in _ATTRIBUTES)],

@@ -13,9 +13,9 @@ import warp as wp
 from egs_warp.camera import Camera
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
+from egs_warp.launching import available_threads
 from egs_warp.render.compositing import Background, RenderedImage, add_geometry, composite
 from egs_warp.render.projection import project, view_from_camera
-from egs_warp.render.threads import available_threads
 from egs_warp.render.tiles import build_tile_lists
 
 

@@ -9,13 +9,20 @@ import numpy as np
 import warp as wp
 
 from egs_warp.kernels.render_ellipse import TILE
-from egs_warp.kernels.render_tiles import band_lists_kernel, emit_tiles_kernel, gather_ranks_kernel, tile_starts_kernel
+from egs_warp.kernels.render_tiles import (
+    count_tiles_kernel,
+    emit_tiles_kernel,
+    fill_tiles_kernel,
+    tile_starts_kernel,
+)
+from egs_warp.launching import launch_rows
 from egs_warp.render.arrays import empty, zeros
 from egs_warp.render.projection import ProjectedGaussians
-from egs_warp.render.threads import launch_ranges
 
 TILE_SIDE = int(TILE)
 _LARGE_SORT = 10_000_000
+_CHUNKS_PER_THREAD = 8
+"""Near Gaussians reach more tiles than far ones, so the chunks differ in cost."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +51,11 @@ def build_tile_lists(projected: ProjectedGaussians, view: Any, *, threads: int) 
     device: Any = projected.ellipse.device
     if device.is_cuda:
         return _lists_by_sorting(projected, view, columns * rows)
-    return _lists_by_counting(projected, view, columns, rows, threads)
+    return _lists_by_counting(projected, view, columns * rows, threads)
 
 
-def _lists_by_counting(projected: ProjectedGaussians, view: Any, columns: int, rows: int, threads: int) -> TileLists:
-    """Counting sort: bands of tile rows are filled side by side, each from front to back: no pair is compared."""
+def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, threads: int) -> TileLists:
+    """Counting sort in chunks of the depth order, side by side: no pair is compared."""
     device = projected.ellipse.device
     gaussian_from_visible = np.flatnonzero(np.diff(projected.slot_end.numpy(), prepend=0)).astype(np.int32)
     visible_count = len(gaussian_from_visible)
@@ -58,34 +65,25 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, columns: int, r
     order.numpy()[:visible_count] = gaussian_from_visible
     wp.utils.radix_sort_pairs(keys, order, visible_count)
 
-    in_order = [empty(max(visible_count, 1), dtype, device) for dtype in (wp.vec2i, wp.int32, wp.vec4, wp.vec2)]
-    launch_ranges(
-        gather_ranks_kernel,
-        visible_count,
-        inputs=[view.height, order, projected.slot_end, projected.ellipse, projected.falloff],
-        outputs=in_order,
-        device=device,
-        threads=threads,
+    chunks = min(_CHUNKS_PER_THREAD * threads, max(1, visible_count // 256)) if threads > 1 else 1
+    chunk_start = wp.array(np.linspace(0, visible_count, chunks + 1).astype(np.int32), dtype=wp.int32, device=device)
+    tile_from_slot, gaussians, slots = (empty(max(projected.slot_count, 1), wp.int32, device) for _ in range(3))
+    counts = zeros((chunks, tiles), wp.int32, device)
+    walk = {"device": device, "threads": threads, "work": np.ones(chunks)}
+    shared = [chunk_start, order, projected.slot_end]
+    launch_rows(
+        count_tiles_kernel,
+        chunks,
+        inputs=[view.width, view.height, *shared, projected.ellipse, projected.falloff],
+        outputs=[tile_from_slot, counts],
+        **walk,
     )
-    band_rows = max(1, -(-rows // (4 * threads))) if threads > 1 else rows
-    gaussians = empty(max(projected.slot_count, 1), wp.int32, device)
-    slots = empty(max(projected.slot_count, 1), wp.int32, device)
-
-    def walk(cursor: wp.array, fill: int) -> None:
-        launch_ranges(
-            band_lists_kernel,
-            -(-rows // band_rows),
-            inputs=[band_rows, view.width, view.height, visible_count, fill, order, *in_order],
-            outputs=[cursor, gaussians, slots],
-            device=device,
-            threads=threads,
-        )
-
-    counts = zeros(columns * rows, wp.int32, device)
-    walk(counts, 0)
-    work = counts.numpy().copy()
+    work = counts.numpy().sum(axis=0)
     tile_start = np.concatenate([[0], np.cumsum(work)]).astype(np.int32)
-    walk(wp.array(tile_start[:-1].copy(), dtype=wp.int32, device=device), 1)
+    # Each chunk's part of a tile follows those of the chunks before it, which are nearer.
+    cursor = counts.numpy()
+    cursor[:] = np.cumsum(cursor, axis=0) - cursor + tile_start[:-1]
+    launch_rows(fill_tiles_kernel, chunks, inputs=[*shared, tile_from_slot], outputs=[counts, gaussians, slots], **walk)
     return TileLists(wp.array(tile_start, dtype=wp.int32, device=device), gaussians, slots, work)
 
 
