@@ -120,6 +120,15 @@ class PoseFamily:
         u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", self.body.node_mass, arms, self._arms))
         return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
 
+    def sole_heading(self, positions: np.ndarray) -> float:
+        """Radians about the ground's normal by which the feet alone are turned from the standing pose."""
+        share = self._sole_mass / self._sole_mass.sum()
+        axes = self.ground.axes[:2].T
+        before = (self._arms - share @ self._arms) @ axes
+        now = (positions - share @ positions) @ axes
+        sine = share @ (before[:, 0] * now[:, 1] - before[:, 1] * now[:, 0])
+        return float(np.arctan2(sine, share @ (before * now).sum(axis=1)))
+
     def affine(self, stretch: float, lean: np.ndarray, heading: float = 0.0) -> np.ndarray:
         """(3, 3) world matrix: ``stretch`` along up, half the volume kept by bulging, sheared by ``lean`` (2,), then turned."""
         bulge = stretch**-0.25
