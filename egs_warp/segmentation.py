@@ -6,13 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from egs_warp.camera import Camera
+from egs_warp.connectivity import close_to, connected_parts, enclosed
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.plane import Plane
@@ -24,8 +21,12 @@ _SEEN = 0.02
 """A Gaussian of which less than this share shows in the masked views has no say in whether it belongs to the object."""
 _CELLS = 64
 """Across the object, for connectivity."""
-_ARM = 1.5
-"""Standard deviations: how far a Gaussian reaches to touch another."""
+_SMALL = 0.01
+"""Of the object's opacity mass: a connected part below this is a floater."""
+_OUTLINE = 0.08
+"""Of the object's size: what it has below this height hides the floor."""
+_HALO = 0.1
+"""Of the object's size: floaters this near to it are its halo."""
 _FOOT = 0.015
 """Of the object's size: within this height above the plane, floor and object cannot be told apart by connection."""
 
@@ -79,44 +80,137 @@ def segment(cloud: GaussianCloud, plane: Plane, spec: ObjectSpec) -> Segmentatio
     Raises ``UserError`` where masks are empty, miss the object or have the wrong size, where box or point hold nothing,
     and where the object does not touch the plane.
     """
-    means, opacity = cloud.means.numpy().astype(np.float64), cloud.opacities()
-    heights = plane.heights(means)
+    scene = _Scene.of(cloud, plane)
     if spec.masks:
         wanted, unknown = _voted(cloud, spec.masks)
-    elif spec.box is not None:
-        wanted, unknown = spec.box.holds(means), np.zeros(cloud.count, bool)
     else:
-        wanted, unknown = np.ones(cloud.count, bool), np.zeros(cloud.count, bool)
-    solid = opacity >= _MIN_OPACITY
-    size = _size_of(means, wanted & solid & (heights > 0.0), spec)
+        wanted = spec.box.holds(scene.means) if spec.box is not None else np.ones(cloud.count, bool)
+        unknown = np.zeros(cloud.count, bool)
+    size = _first_size(scene, wanted, spec)
     foot = _FOOT * size
-    core = (wanted | unknown) & solid & (heights > foot)
-    if not core.any():
-        raise UserError("object: nothing of it lies above the plane; check the masks, box or point, or give --plane")
-    chosen = _component(cloud, plane, foot, core, wanted, spec, size)
-    size = _diagonal(means[chosen])
-    # Loose matter inside a hollow body would stay behind as a ghost.
-    chosen |= _enclosed(means, means[chosen], 2.0 * size / _CELLS) & (heights > foot)
-    near = _near(means, means[chosen], 2.0 * size / _CELLS)
-    floor = floor_top(means, opacity, plane, chosen, size)
+    # The first round tells how large the object is and how rough its floor; the second goes by that.
+    for _ in range(2):
+        chosen, small = _body(scene, wanted, unknown, spec, foot, size)
+        size = _diagonal(scene.means[chosen])
+        floor = floor_top(scene.means, scene.opacity, plane, chosen, size)
+        foot = max(_FOOT * size, 1.2 * floor)
+    outline = scene.under(chosen, max(3.0 * foot, _OUTLINE * size), size)
+    near = close_to(scene.means, scene.means[chosen], 2.0 * size / _CELLS)
+    above = scene.heights > foot
     # Where masks decide, they decide on the foot as well; else it is what stands under the object, off the floor.
-    if spec.masks:
-        foot_mask = wanted & near & (heights > 0.0) & (heights <= foot)
-    else:
-        foot_mask = (heights <= foot) & (heights > floor) & _under(means, heights, chosen, plane, 3.0 * foot, size)
-    faint = near & ~solid & (heights > foot) & (wanted | unknown) & _near(means, means[chosen], size / _CELLS)
-    object_mask = chosen | foot_mask | faint
-    lowest = float(np.quantile(heights[object_mask], 0.002))
+    claimed = wanted & near & bool(spec.masks)
+    standing = (scene.heights > floor) & scene.under(chosen, 3.0 * foot, size)
+    at_foot = ~above & (scene.heights > 0.0) & (claimed if spec.masks else standing)
+    faint = ~scene.solid & above & (wanted | unknown) & near
+    object_mask = chosen | at_foot | faint
+    lowest = float(np.quantile(scene.heights[object_mask], 0.002))
     if lowest > 0.1 * size:
         raise UserError(
             f"object: it touches no plane: its lowest part is {lowest / size:.2f} of its size above this one; "
             "give --plane, or mark all of the object"
         )
     # What lies below the object's foot is hidden, so nobody can tell whose it is; inpainting makes new floor there.
-    under = _under(means, heights, chosen, plane, 3.0 * foot, size)
-    buried = ~object_mask & (heights <= foot) & (heights > -0.25 * size) & (under | (wanted & near & bool(spec.masks)))
-    floaters = wanted & ~object_mask & ~buried & (heights > foot) if spec.masks else np.zeros(cloud.count, bool)
+    buried = ~object_mask & ~above & (scene.heights > -0.25 * size) & (outline | claimed)
+    halo = (small | ~scene.solid) & above & close_to(scene.means, scene.means[chosen], _HALO * size)
+    floaters = (halo | (claimed & above)) & ~object_mask & ~buried
     return Segmentation(object_mask, buried, floaters, size)
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What is asked of the capture again and again; all (n, ...)."""
+
+    cloud: GaussianCloud
+    plane: Plane
+    means: np.ndarray
+    flat: np.ndarray
+    """(n, 2) along the plane."""
+    heights: np.ndarray
+    opacity: np.ndarray
+    solid: np.ndarray
+    """(n,) bool: opaque enough to connect."""
+    level: np.ndarray
+    """(n,) bool: flat, and lying along the plane as a floor's Gaussians do."""
+
+    @classmethod
+    def of(cls, cloud: GaussianCloud, plane: Plane) -> _Scene:
+        means, opacity = cloud.means.numpy().astype(np.float64), cloud.opacities()
+        scales = cloud.log_scales.numpy()
+        turns = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
+        thin = np.take_along_axis(turns, scales.argmin(axis=1)[:, None, None], axis=2)[:, :, 0]
+        ordered = np.sort(scales, axis=1)
+        level = (np.abs(thin @ plane.normal) > 0.85) & (ordered[:, 1] - ordered[:, 0] > np.log(2.0))
+        flat = means @ np.stack(plane.tangents(), axis=1)
+        return cls(cloud, plane, means, flat, plane.heights(means), opacity, opacity >= _MIN_OPACITY, level)
+
+    def under(self, chosen: np.ndarray, height: float, size: float) -> np.ndarray:
+        """(n,) bool: within the outline, seen along the normal, of what ``chosen`` has below ``height``."""
+        return enclosed(self.flat, self.flat[chosen & (self.heights < height)], size / _CELLS)
+
+
+def _body(
+    scene: _Scene, wanted: np.ndarray, unknown: np.ndarray, spec: ObjectSpec, foot: float, size: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) bool: the connected part that is meant, all of it higher than ``foot``; and (n,) bool: all small parts."""
+    core = (wanted | unknown) & scene.solid & (scene.heights > foot)
+    # A rumpled floor must not join the object: what lies flat near the plane connects nothing.
+    lying = core & scene.level & (scene.heights < 3.0 * foot) & (not spec.masks)
+    indices = np.flatnonzero(core & ~lying)
+    if len(indices) == 0:
+        raise UserError("object: nothing of it lies above the plane; check the masks, box or point, or give --plane")
+    parts = connected_parts(scene.cloud, indices, cell=size / _CELLS, plane=scene.plane, above=foot)
+    mass = np.bincount(parts, weights=scene.opacity[indices])
+    if spec.point is not None:
+        away = np.linalg.norm(scene.means[indices] - spec.point, axis=1)
+        # A point may lie in the middle of an object, which is hollow.
+        if away.min() > 0.25 * size:
+            raise UserError(
+                f"object: nothing solid above the plane within {0.25 * size:.3g} of the point "
+                f"{','.join(f'{v:g}' for v in spec.point)}; give a point on the object, in the capture's units"
+            )
+        # The heaviest of what is about as near: the nearest may be a stray.
+        near = np.unique(parts[away < away.min() + 4.0 * size / _CELLS])
+        best = int(near[np.argmax(mass[near])])
+    else:
+        best = int(np.argmax(np.bincount(parts, weights=scene.opacity[indices] * wanted[indices])))
+    chosen, small = np.zeros((2, len(core)), bool)
+    chosen[indices[parts == best]] = True
+    small[indices[mass[parts] < _SMALL * mass[best]]] = True
+    # Loose matter inside a hollow body would stay behind as a ghost. The floor closes the body from below: its mirror
+    # image in the floor does as well.
+    shell = scene.means[chosen]
+    mirrored = shell - 2.0 * (scene.heights[chosen, None] - foot) * scene.plane.normal
+    chosen |= enclosed(scene.means, np.concatenate([shell, mirrored]), 2.0 * size / _CELLS) & (scene.heights > foot)
+    chosen |= lying & scene.under(chosen, 0.1 * size, size)
+    return chosen, small
+
+
+def _first_size(scene: _Scene, wanted: np.ndarray, spec: ObjectSpec) -> float:
+    """First guess of the object's size, scene units: half of the capture's where only a point is known."""
+    if spec.box is not None:
+        return float(np.linalg.norm(spec.box.high - spec.box.low))
+    standing = wanted & scene.solid & (scene.heights > 0.0)
+    if not standing.any():
+        raise UserError("object: nothing of it lies above the plane; check the masks, box or point, or give --plane")
+    return _diagonal(scene.means[standing]) * (0.5 if spec.point is not None else 1.0)
+
+
+def _diagonal(points: np.ndarray) -> float:
+    low, high = np.quantile(points, [0.005, 0.995], axis=0)
+    return float(np.linalg.norm(high - low))
+
+
+def floor_top(means: np.ndarray, opacity: np.ndarray, plane: Plane, chosen: np.ndarray, size: float) -> float:
+    """Height up to which the floor's own Gaussians scatter, judged beside the object ``chosen`` (n,) bool; at least 0."""
+    flat, heights = means @ np.stack(plane.tangents(), axis=1), plane.heights(means)
+    middle = np.median(flat[chosen], axis=0)
+    beside = (np.abs(heights) < 0.05 * size) & ~chosen & (opacity > _MIN_OPACITY)
+    beside &= np.linalg.norm(flat - middle, axis=1) < size
+    beside &= ~close_to(flat, flat[chosen & (heights < 0.2 * size)], 0.03 * size)
+    if beside.sum() < 20:
+        return 0.0
+    level = float(np.median(heights[beside]))
+    return max(level + 3.0 * 1.4826 * float(np.median(np.abs(heights[beside] - level))), 0.0)
 
 
 def _voted(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> tuple[np.ndarray, np.ndarray]:
@@ -133,111 +227,6 @@ def _voted(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> tuple[np.ndarra
     if not wanted.any():
         raise UserError("object: nothing of the capture shows inside the masks; check masks and cameras")
     return wanted, ~seen
-
-
-def _size_of(means: np.ndarray, wanted: np.ndarray, spec: ObjectSpec) -> float:
-    """First guess of the object's size: the whole capture's where only a point is known."""
-    if spec.box is not None:
-        return float(np.linalg.norm(spec.box.high - spec.box.low))
-    if not wanted.any():
-        raise UserError("object: nothing of it lies above the plane; check the masks, box or point, or give --plane")
-    return _diagonal(means[wanted]) * (0.5 if spec.point is not None else 1.0)
-
-
-def _diagonal(points: np.ndarray) -> float:
-    low, high = np.quantile(points, [0.005, 0.995], axis=0)
-    return float(np.linalg.norm(high - low))
-
-
-def _component(
-    cloud: GaussianCloud, plane: Plane, foot: float, core: np.ndarray, wanted: np.ndarray, spec: ObjectSpec, size: float
-) -> np.ndarray:
-    """(n,) bool: the connected part of ``core`` that holds the point, or else most of what is wanted.
-
-    Gaussians are connected that reach, with centre or arms, into one cell of a grid; cells below ``foot`` do not count.
-    """
-    indices = np.flatnonzero(core)
-    points = cloud.means.numpy()[indices].astype(np.float64)
-    mass = cloud.opacities()[indices]
-    spacing = float(np.median(cKDTree(points).query(points, k=2)[0][:, 1])) if len(points) > 1 else size / _CELLS
-    cell = max(size / _CELLS, 2.0 * spacing)
-    arms = _ARM * np.exp(cloud.log_scales.numpy()[indices].astype(np.float64))
-    axes = (
-        Rotation.from_quat(cloud.rotations.numpy()[indices][:, [1, 2, 3, 0]]).as_matrix()
-        * np.minimum(arms, 4.0 * cell)[:, None, :]
-    )
-    reached = np.concatenate(
-        [points[:, None], points[:, None] + axes.transpose(0, 2, 1), points[:, None] - axes.transpose(0, 2, 1)], axis=1
-    )
-    owner = np.repeat(np.arange(len(points)), 7).reshape(-1, 7)
-    above = plane.heights(reached) > foot
-    voxel = np.floor((reached[above] - points.min(axis=0)) / cell).astype(np.int64)
-    _, cells = np.unique(voxel, axis=0, return_inverse=True)
-    count = len(points) + int(cells.max()) + 1
-    links = coo_array((np.ones(len(cells)), (owner[above], len(points) + cells.ravel())), shape=(count, count))
-    labels = connected_components(links, directed=False)[1][: len(points)]
-    if spec.point is not None:
-        away = np.linalg.norm(points - spec.point, axis=1)
-        distance = float(away.min())
-        # A point may lie in the middle of an object, which is hollow.
-        if distance > 0.25 * size:
-            raise UserError(
-                f"object: nothing solid above the plane within {0.25 * size:.3g} of the point "
-                f"{','.join(f'{v:g}' for v in spec.point)}; give a point on the object, in the capture's units"
-            )
-        # The heaviest of what is about as near: the nearest may be a stray.
-        near = np.isin(labels, labels[away < distance + 4.0 * cell])
-        best = int(np.argmax(np.bincount(labels, weights=mass * near)))
-    else:
-        best = int(np.argmax(np.bincount(labels, weights=mass * wanted[indices])))
-    chosen = np.zeros(cloud.count, bool)
-    chosen[indices[labels == best]] = True
-    return chosen
-
-
-def _enclosed(points: np.ndarray, shell: np.ndarray, cell: float) -> np.ndarray:
-    """(n,) bool: whether ``points`` (n, k) lie in or within the closed shell of ``shell`` (m, k), on a grid of ``cell``."""
-    corner = shell.min(axis=0) - 3.0 * cell
-    shape = np.ceil((shell.max(axis=0) + 3.0 * cell - corner) / cell).astype(int) + 1
-    grid = np.zeros(shape, bool)
-    grid[tuple(np.floor((shell - corner) / cell).astype(int).T)] = True
-    closed = ndimage.binary_closing(grid, np.ones((3,) * grid.ndim), iterations=2)
-    filled = ndimage.binary_fill_holes(closed)
-    place = np.floor((points - corner) / cell).astype(int)
-    held = np.all((place >= 0) & (place < shape), axis=1)
-    result = np.zeros(len(points), bool)
-    result[held] = np.asarray(filled)[tuple(place[held].T)]
-    return result
-
-
-def _near(means: np.ndarray, others: np.ndarray, reach: float) -> np.ndarray:
-    """(n,) bool: within ``reach`` of one of ``others`` (m, 3)."""
-    return cKDTree(others).query(means, distance_upper_bound=reach)[0] <= reach
-
-
-def floor_top(means: np.ndarray, opacity: np.ndarray, plane: Plane, chosen: np.ndarray, size: float) -> float:
-    """Height up to which the floor's own Gaussians scatter, judged beside the object ``chosen`` (n,) bool; at least 0."""
-    tangents = np.stack(plane.tangents(), axis=1)
-    flat, heights = means @ tangents, plane.heights(means)
-    middle = np.median(flat[chosen], axis=0)
-    low = np.abs(heights) < 0.05 * size
-    beside = low & ~chosen & (opacity > _MIN_OPACITY) & (np.linalg.norm(flat - middle, axis=1) < size)
-    beside &= ~_near(flat, flat[chosen & (heights < 0.2 * size)], 0.03 * size)
-    if beside.sum() < 20:
-        return 0.0
-    level = float(np.median(heights[beside]))
-    return max(level + 3.0 * 1.4826 * float(np.median(np.abs(heights[beside] - level))), 0.0)
-
-
-def _under(
-    means: np.ndarray, heights: np.ndarray, chosen: np.ndarray, plane: Plane, level: float, size: float
-) -> np.ndarray:
-    """(n,) bool: within the outline, seen along the normal, of what ``chosen`` has below ``level``; holes are filled."""
-    low = chosen & (heights < level)
-    if not low.any():
-        return np.zeros(len(means), bool)
-    flat = means @ np.stack(plane.tangents(), axis=1)
-    return _enclosed(flat, flat[low], size / _CELLS)
 
 
 def masks_from_selection(cloud: GaussianCloud, selection: np.ndarray, cameras: Sequence[Camera]) -> list[MaskedView]:
