@@ -14,10 +14,8 @@ import argparse
 import json
 import os
 import platform
-import statistics
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,32 +26,18 @@ import warp as wp
 
 sys.path.insert(0, str(Path(__file__).parent))
 import render_peers as peers
+from render_roofline import median_ms, stage_rows
 
 from egs_warp.camera import Camera
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.launching import available_threads
 from egs_warp.render import render
-from egs_warp.render.backward import backward
 from egs_warp.render.compositing import Background, composite
 from egs_warp.render.projection import project, view_from_camera
 from egs_warp.render.tiles import build_tile_lists
 
 CELLS = ((1, 648, 420), (1, 1944, 1260), (5, 648, 420), (5, 1944, 1260), (11, 648, 420))
 AIMS = ("cuda_beats_gswarp", "cuda_within_1_3_of_gsplat", "same_picture", "cpu_vs_twin", "cpu_two_threads")
-
-
-def median_ms(calls: dict[str, Callable[[], Any]], *, repeats: int, synchronise: Callable[[], Any]) -> dict[str, float]:
-    """Median milliseconds of each call; the calls take turns, so that a drift of the machine hits all alike."""
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for turn in range(repeats + 3):
-        for name, call in calls.items():
-            synchronise()
-            start = time.perf_counter()
-            call()
-            synchronise()
-            if turn >= 3:
-                times[name].append((time.perf_counter() - start) * 1e3)
-    return {name: statistics.median(values) for name, values in times.items()}
 
 
 def difference(ours: torch.Tensor, other: torch.Tensor) -> dict[str, float]:
@@ -113,7 +97,7 @@ def cuda_rows(points: dict[str, np.ndarray], *, cells: tuple, seed: int, repeats
         for name in renderers:
             both(name)
         row["gradient_difference"] = _gradient_differences(scenes)
-        row["stages"] = stage_rows(own, camera, repeats=repeats)
+        row["stages"] = stage_rows(cloud_of(own), camera, repeats=repeats, threads=1)
         rows.append(row)
         print(json.dumps(row))
         torch.cuda.empty_cache()
@@ -135,58 +119,6 @@ def _gradient_differences(scenes: dict[str, peers.Scene]) -> dict[str, float]:
         "sh": (mine["colours"][:, 0], theirs["colours"] * peers.SH_BAND_0 * (mine["colours"][:, 0] != 0)),
     }
     return {name: float((one - two).norm() / two.norm()) for name, (one, two) in pairs.items()}
-
-
-def stage_rows(scene: peers.Scene, camera: Camera, *, repeats: int) -> dict[str, dict[str, float]]:
-    """Milliseconds, bytes that must move and share of the measured copy bandwidth, stage by stage of our renderer."""
-    cloud, view, device = cloud_of(scene), view_from_camera(camera), "cuda:0"
-    background = Background(wp.vec3())
-    pixels = camera.width * camera.height
-    shape = (camera.height, camera.width)
-    gradient = [wp.ones(shape, dtype=t, device=device) for t in (wp.vec3, wp.float32, wp.float32)]
-    project_now = lambda: project(cloud, view, antialiased=False, threads=1)  # noqa: E731
-    projected = project_now()
-    lists = build_tile_lists(projected, view, threads=1)
-    image = composite(projected, lists, view, background=background, threads=1)
-    source = torch.empty(2**30, dtype=torch.uint8, device="cuda")
-    target = torch.empty_like(source)
-    times = median_ms(
-        {
-            "project": project_now,
-            "lists": lambda: build_tile_lists(projected, view, threads=1),
-            "composite": lambda: composite(projected, lists, view, background=background, threads=1),
-            "backward": lambda: backward(
-                *(cloud, view, projected, lists, image),
-                colour_gradient=gradient[0],
-                alpha_gradient=gradient[1],
-                depth_gradient=gradient[2],
-                antialiased=False,
-                want_pose=False,
-                threads=1,
-            ),
-            "copy_1_GiB": lambda: target.copy_(source),
-        },
-        repeats=repeats,
-        synchronise=torch.cuda.synchronize,
-    )
-    bandwidth = 2 * 2**30 / (times["copy_1_GiB"] * 1e-3)
-    count, pairs = cloud.count, projected.slot_count
-    visible = int((np.diff(projected.slot_end.numpy(), prepend=0) > 0).sum())
-    passes = -(-(31 + lists.tile_count.bit_length()) // 8)
-    moved = {
-        # Attributes in; tile count out and scanned; the ellipse of the visible ones out.
-        "project": count * (56 + 8 + 16) + visible * 40,
-        # Keys, slots and Gaussians out; each radix pass reads and writes 12 bytes a pair; starts read keys again.
-        "lists": count * 8 + visible * 40 + pairs * (16 + 24 * passes + 20),
-        "composite": pairs * (4 + 40) + pixels * 20,
-        # Pairs again, their moments written, zeroed and read; attributes in, gradients out.
-        "backward": pairs * (8 + 40 + 3 * 48) + pixels * 60 + count * (56 + 8 + 64),
-        "copy_1_GiB": 2 * 2**30,
-    }
-    return {
-        name: {"ms": ms, "megabytes": moved[name] / 1e6, "share_of_bandwidth": moved[name] / (ms * 1e-3) / bandwidth}
-        for name, ms in times.items()
-    } | {"counts": {"visible": float(visible), "pairs": float(pairs)}}
 
 
 def memory_row(*, seed: int) -> dict[str, Any]:
@@ -239,15 +171,22 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> dict[s
         repeats=repeats,
         synchronise=lambda: None,
     )
-    project_and_list = median_ms(
+    background = Background(wp.vec3())
+    stages = {
+        "project": lambda count: project(cloud, view, antialiased=False, threads=count),
+        "lists": lambda count: build_tile_lists(projected, view, threads=count),
+        "composite": lambda count: composite(projected, lists, view, background=background, threads=count),
+    }
+    by_stage = median_ms(
         {
-            "lists": lambda: build_tile_lists(
-                project(cloud, view, antialiased=False, threads=threads), view, threads=threads
-            )
+            f"{name} {count}": lambda stage=stage, count=count: stage(count)
+            for name, stage in stages.items()
+            for count in sorted({1, 2, threads})
         },
         repeats=repeats,
         synchronise=lambda: None,
-    )["lists"]
+    )
+    project_and_list = by_stage[f"project {threads}"] + by_stage[f"lists {threads}"]
     twin_times: dict[int, float] = {}
     twin = torch.empty(0)
     # The better of both counts: on a busy machine PyTorch's threads wait for one another at every operation.
@@ -266,6 +205,7 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> dict[s
         "height": 480,
         "threads": threads,
         **times,
+        "stages_by_threads": by_stage,
         "twin": project_and_list + min(twin_times.values()),
         "difference": difference(picture, twin),
     }
@@ -304,7 +244,7 @@ def judge(rows: list[dict[str, Any]]) -> tuple[dict[str, bool | None], dict[str,
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
-    """Bars of milliseconds by cell and renderer."""
+    """Bars of milliseconds by cell and renderer; below them, on a GPU, each stage's share of the device's limit."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -317,7 +257,11 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
             bars += [(f"{size}\n{label}", row[label]) for label in ("forward", "forward_backward")]
         elif row["kind"] == "cpu":
             bars.append((f"{size}\nCPU", {k: row[k] for k in ("one_thread", "two_threads", "twin")}))
-    figure, axes = plt.subplots(figsize=(max(6.0, 1.6 * len(bars)), 5.0))
+    roofs = [row for row in rows if "stages" in row]
+    figure, panels = plt.subplots(
+        1 + bool(roofs), squeeze=False, figsize=(max(6.0, 1.6 * len(bars)), 9.0 if roofs else 5.0)
+    )
+    axes = panels[0, 0]
     names = sorted({name for _, values in bars for name in values})
     for index, name in enumerate(names):
         x = [i + (index - len(names) / 2) * 0.8 / len(names) for i, (_, v) in enumerate(bars) if name in v]
@@ -326,8 +270,48 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
     axes.set_yscale("log")
     axes.set_ylabel("ms")
     axes.legend()
+    if roofs:
+        plot_roofline(roofs, panels[1, 0])
     figure.tight_layout()
     figure.savefig(path, dpi=120)
+
+
+def plot_roofline(rows: list[dict[str, Any]], axes: Any) -> None:
+    """Percent of the limit that each stage reaches, by cell; the letter says which: bandwidth or arithmetic."""
+    names = ("project", "lists", "composite", "backward")
+    for index, name in enumerate(names):
+        stages = [row["stages"][name] for row in rows]
+        bars = axes.bar(
+            [i + (index - 2) * 0.2 for i in range(len(rows))],
+            [100 * stage["share_of_limit"] for stage in stages],
+            0.2,
+            label=name,
+            align="edge",
+        )
+        axes.bar_label(bars, [f"{stage['limit'][0]}\n{stage['ms']:.2f} ms" for stage in stages], fontsize=6)
+    labels = [f"{row['gaussians'] / 1e3:.0f}k\n{row['width']}x{row['height']}" for row in rows]
+    axes.set_xticks(range(len(rows)), labels, fontsize=7)
+    axes.set_ylabel("% of the limit (b: bandwidth, a: arithmetic)")
+    axes.margins(y=0.15)
+    axes.legend()
+
+
+def against_gsplat(rows: list[dict[str, Any]]) -> dict[str, Any] | None:
+    """The real aim, beside the ones judged: faster than gsplat in every cell."""
+    ratios = {
+        f"{row['gaussians']} {row['width']}x{row['height']} {label}": row[label]["ours"] / row[label]["gsplat"]
+        for row in rows
+        for label in ("forward", "forward_backward")
+        if row["kind"] == "cuda" and "gsplat" in row[label]
+    }
+    if not ratios:
+        return None
+    return {
+        "time_over_gsplats": ratios,
+        "geometric_mean": float(np.exp(np.mean(np.log(list(ratios.values()))))),
+        "cells_faster": sum(ratio < 1.0 for ratio in ratios.values()),
+        "cells": len(ratios),
+    }
 
 
 def main() -> None:
@@ -365,6 +349,7 @@ def main() -> None:
         },
         "aims": aims,
         "why_null": why_null,
+        "against_gsplat": against_gsplat(rows),
     }
     for row in rows:
         if row["kind"] == "cuda":
@@ -374,7 +359,7 @@ def main() -> None:
         elif row["kind"] == "cpu":
             figures = "  ".join(f"{k} {row[k]:.1f}" for k in ("one_thread", "two_threads", "twin"))
             print(f"{row['gaussians']:>9} {row['width']}x{row['height']} cpu               {figures} ms")
-    print(json.dumps({"aims": aims, "why_null": why_null}, indent=1))
+    print(json.dumps({name: result[name] for name in ("aims", "why_null", "against_gsplat")}, indent=1))
     if options.json:
         options.json.write_text(json.dumps(result, indent=1))
     if options.plot:

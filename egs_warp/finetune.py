@@ -44,6 +44,8 @@ class TrainingView:
     """(H, W) float32; where given, ``image`` holds colours not yet laid over a background."""
     weight: np.ndarray | None = None
     """(H, W) float32 at least 0, how much each pixel counts in the L1 loss; without it all count alike."""
+    name: str = ""
+    """Of the photo, for messages."""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,8 @@ _FAINT = 0.005
 _MAX_COPIES = 50
 _EVERY = 100
 """Steps between relocations."""
+_GROWTH = 1.05
+"""Least factor by which the number of Gaussians grows at each."""
 
 
 class Population:
@@ -51,7 +53,7 @@ class Population:
 
     @torch.no_grad()
     def evolve(self, step: int, steps: int, cap: int) -> None:
-        """Jitter the means; now and then move faint Gaussians onto opaque ones and grow by 5 % towards ``cap``."""
+        """Jitter the means; now and then move faint Gaussians onto opaque ones and grow, to reach ``cap`` at half time."""
         self._jitter()
         # The last fifth of the steps settles what is there.
         if step % _EVERY != _EVERY - 1 or step > 0.8 * steps:
@@ -66,7 +68,9 @@ class Population:
                 tensor[places] = tensor[chosen]
             self._forget(torch.cat([places, chosen]))
         count = len(opacity)
-        more = min(cap, int(1.05 * count) + 1) - count
+        turns_left = max(1, round((0.5 * steps - step) / _EVERY))
+        growth = max(_GROWTH, (cap / count) ** (1 / turns_left))
+        more = min(cap, int(growth * count) + 1) - count
         if more > 0:
             chosen = self._draw(torch.sigmoid(self.tensors["opacity_logits"]), more)
             self._share(chosen)

@@ -11,15 +11,30 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import torch
 
 from egs_warp.camera import Camera
 from egs_warp.errors import UserError
-from egs_warp.finetune import Densification, FinetuneOptions, Rates, TrainingView, finetune, psnr
+from egs_warp.finetune import Densification, FinetuneOptions, Rates, TrainingView, finetune, psnr, ssim
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.io.cameras import read_cameras
 from egs_warp.render import render
 
 SH_BAND_0 = 0.28209479177387814
+_HOLD_OUT_EVERY = 8
+"""As published methods do: every eighth photo is judged on and not trained on."""
+
+
+@dataclass(frozen=True)
+class PhotoScore:
+    """How well the capture shows one photo."""
+
+    name: str
+    held_out: bool
+    psnr: float
+    """dB."""
+    ssim: float
+    """Mean structural similarity, 11 x 11 Gaussian window."""
 
 
 @dataclass(frozen=True)
@@ -29,10 +44,20 @@ class TrainResult:
     cloud: GaussianCloud
     losses: np.ndarray
     """(iterations,) float64."""
-    psnr_train: float
-    """Mean dB over the photos trained on."""
-    psnr_held_out: float | None
-    """Mean dB over every eighth photo, which training did not see; None with fewer than eight photos."""
+    views: tuple[TrainingView, ...]
+    """Every photo as it was trained or judged on: reduced and laid over the background."""
+    scores: tuple[PhotoScore, ...]
+    """One for each of ``views``."""
+    background: tuple[float, float, float]
+    """The colour behind the capture."""
+
+    def mean_score(self, *, held_out: bool) -> tuple[float, float] | None:
+        """Mean PSNR and SSIM of the photos held out, or of those trained on; None where there are none."""
+        chosen = [(score.psnr, score.ssim) for score in self.scores if score.held_out is held_out]
+        if not chosen:
+            return None
+        psnr_mean, ssim_mean = np.mean(chosen, axis=0)
+        return float(psnr_mean), float(ssim_mean)
 
 
 def train(
@@ -41,7 +66,7 @@ def train(
     iterations: int = 3000,
     max_gaussians: int = 50_000,
     sh_degree: int = 2,
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    background: tuple[float, float, float] | None = None,
     max_side: int | None = None,
     seed: int = 0,
     device: str | None = None,
@@ -51,16 +76,20 @@ def train(
     """Make a capture from the photos that ``posed`` (COLMAP, ``transforms.json`` or ``cameras.json``) points to.
 
     Photos larger than ``max_side`` pixels are reduced. Every eighth photo is held out and judged on. Photos with alpha
-    are laid over ``background``. Raises ``UserError`` for missing photos and impossible options.
+    are laid over ``background``; without one, it is white for those and the mean colour along the photos' borders for
+    others, so that no Gaussians are spent on a plain backdrop. Raises ``UserError`` for missing photos and impossible
+    options.
     """
     if iterations < 1 or max_gaussians < 100 or not 0 <= sh_degree <= 3:
         raise UserError(
             f"train: {iterations} iterations, {max_gaussians} Gaussians and SH degree {sh_degree};"
             " give at least 1, at least 100, and 0 to 3"
         )
-    views = read_views(posed, background=background, max_side=max_side)
-    held_out = views[::8] if len(views) >= 8 else []
-    chosen = [view for number, view in enumerate(views) if number % 8 or not held_out]
+    photos = read_views(posed, max_side=max_side)
+    background = background or backdrop_colour(photos)
+    views = tuple(laid_over(view, background) for view in photos)
+    held_out = [len(views) >= _HOLD_OUT_EVERY and number % _HOLD_OUT_EVERY == 0 for number in range(len(views))]
+    chosen = [view for view, out in zip(views, held_out, strict=True) if not out]
     start = rough_cloud(chosen, count=max(100, max_gaussians // 3), sh_degree=sh_degree, seed=seed, device=device)
     options = FinetuneOptions(
         iterations=iterations,
@@ -73,20 +102,28 @@ def train(
         threads=threads,
     )
     result = finetune(start, chosen, options=options, progress=progress)
-
-    def judge(which: Sequence[TrainingView]) -> float:
-        pictures = (render(result.cloud, view.camera, background=background, threads=threads) for view in which)
-        return float(
-            np.mean([psnr(np.clip(p.colour.numpy(), 0, 1), v.image) for p, v in zip(pictures, which, strict=True)])
-        )
-
-    return TrainResult(result.cloud, result.losses, judge(chosen), judge(held_out) if held_out else None)
+    scores = tuple(
+        _score(result.cloud, view, background, held_out=out, threads=threads)
+        for view, out in zip(views, held_out, strict=True)
+    )
+    return TrainResult(result.cloud, result.losses, views, scores, background)
 
 
-def read_views(
-    posed: Path | str, *, background: tuple[float, float, float] = (1.0, 1.0, 1.0), max_side: int | None = None
-) -> list[TrainingView]:
-    """Photos and cameras; a photo with alpha is laid over ``background``.
+def _score(
+    cloud: GaussianCloud,
+    view: TrainingView,
+    background: tuple[float, float, float],
+    *,
+    held_out: bool,
+    threads: int | None,
+) -> PhotoScore:
+    picture = np.clip(render(cloud, view.camera, background=background, threads=threads).colour.numpy(), 0, 1)
+    likeness = float(ssim(torch.as_tensor(picture), torch.as_tensor(view.image)))
+    return PhotoScore(view.name, held_out, psnr(picture, view.image), likeness)
+
+
+def read_views(posed: Path | str, *, max_side: int | None = None) -> list[TrainingView]:
+    """Photos and cameras; photos larger than ``max_side`` pixels are reduced.
 
     Raises ``UserError`` for a photo that is missing, unreadable or of another shape than its camera.
     """
@@ -100,17 +137,43 @@ def read_views(
         full = {"uint8": 255.0, "uint16": 65535.0}.get(pixels.dtype.name, 1.0)
         values = np.atleast_3d(np.asarray(pixels, dtype=np.float32)) / full
         colour = values[:, :, :3][:, :, ::-1] if values.shape[2] >= 3 else np.repeat(values[:, :, :1], 3, axis=2)
+        alpha = values[:, :, 3] if values.shape[2] == 4 else None
         camera = _scaled(entry.camera, colour.shape[1], colour.shape[0], entry.image)
-        if values.shape[2] == 4:
-            alpha = values[:, :, 3:]
-            colour = colour * alpha + (1 - alpha) * np.asarray(background, dtype=np.float32)
         side = max(camera.width, camera.height)
         if max_side is not None and side > max_side:
             width, height = (max(1, round(s * max_side / side)) for s in (camera.width, camera.height))
-            colour = cv2.resize(colour, (width, height), interpolation=cv2.INTER_AREA)
+            if alpha is not None:
+                # Transparent pixels hold any colour: it must not bleed into their neighbours.
+                colour = cv2.resize(colour * alpha[:, :, None], (width, height), interpolation=cv2.INTER_AREA)
+                alpha = cv2.resize(alpha, (width, height), interpolation=cv2.INTER_AREA)
+                colour = colour / np.maximum(alpha, 1e-6)[:, :, None]
+            else:
+                colour = cv2.resize(colour, (width, height), interpolation=cv2.INTER_AREA)
             camera = _scaled(camera, width, height, entry.image, exact=False)
-        views.append(TrainingView(camera, np.ascontiguousarray(colour, dtype=np.float32)))
+        image = np.ascontiguousarray(colour, dtype=np.float32)
+        views.append(TrainingView(camera, image, alpha, name=entry.name))
     return views
+
+
+def laid_over(view: TrainingView, background: tuple[float, float, float]) -> TrainingView:
+    """``view`` without alpha, its picture over one colour."""
+    if view.alpha is None:
+        return view
+    alpha = view.alpha[:, :, None]
+    behind = np.asarray(background, dtype=np.float32)
+    return replace(view, image=view.image * alpha + (1 - alpha) * behind, alpha=None)
+
+
+def backdrop_colour(views: Sequence[TrainingView]) -> tuple[float, float, float]:
+    """White for photos with alpha; else the mean colour along the borders of all photos."""
+    if any(view.alpha is not None for view in views):
+        return (1.0, 1.0, 1.0)
+    rims = []
+    for view in views:
+        image = view.image
+        rims.append(np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]).mean(axis=0))
+    red, green, blue = np.mean(rims, axis=0).tolist()
+    return (red, green, blue)
 
 
 def _scaled(camera: Camera, width: int, height: int, image: Path, *, exact: bool = True) -> Camera:

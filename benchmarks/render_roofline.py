@@ -1,0 +1,233 @@
+"""What limits each stage of the renderer: bytes that must move, operations that must be done, and the machine's speed at both."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from egs_warp.camera import Camera
+from egs_warp.gaussians import GaussianCloud
+from egs_warp.kernels.render_ellipse import ALPHA_CUT, ALPHA_LIMIT, TILE, TILE_PIXELS, TRANSMITTANCE_STOP
+from egs_warp.render.backward import backward
+from egs_warp.render.compositing import Background, composite
+from egs_warp.render.projection import ProjectedGaussians, project, view_from_camera
+from egs_warp.render.tiles import TileLists, build_tile_lists
+
+wp.set_module_options({"enable_backward": False})
+
+_PROBE_STEPS = wp.constant(2048)
+
+
+@wp.kernel
+def hits_kernel(
+    # In:
+    width: wp.int32,
+    height: wp.int32,
+    tile_start: wp.array[wp.int32],
+    gaussian_from_intersection: wp.array[wp.int32],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    # Out:
+    hits_out: wp.array[wp.int32],
+):
+    """Splats that each pixel blends: what no renderer of the same picture can leave out."""
+    thread = wp.tid()
+    tile = thread / TILE_PIXELS
+    i = thread % TILE_PIXELS
+    columns = (width + TILE - 1) / TILE
+    column = (tile % columns) * TILE + i % TILE
+    row = (tile / columns) * TILE + i / TILE
+    if column >= width or row >= height:
+        return
+    passing = wp.float32(1.0)
+    hits = wp.int32(0)
+    intersection = tile_start[tile]
+    end = tile_start[tile + 1]
+    while intersection < end:
+        g = gaussian_from_intersection[intersection]
+        intersection += 1
+        e = ellipse[g]
+        f = falloff[g]
+        dy = wp.float32(row) + 0.5 - e[1]
+        u = wp.float32(column) + 0.5 - e[0] + e[3] * dy
+        alpha = wp.min(wp.exp(f[1] - f[0] * dy * dy - e[2] * u * u), ALPHA_LIMIT)
+        if alpha >= ALPHA_CUT:
+            passing = passing * (1.0 - alpha)
+            hits += 1
+            if passing <= TRANSMITTANCE_STOP:
+                intersection = end
+    hits_out[row * width + column] = hits
+
+
+@wp.kernel
+def arithmetic_kernel(
+    # In:
+    factor: wp.float32,
+    # Out:
+    sum_out: wp.array[wp.float32],
+):
+    """Eight independent chains of multiply and add: the most operations that this device can be brought to do."""
+    i = wp.tid()
+    a = wp.float32(i)
+    b = a + 1.0
+    c = a + 2.0
+    d = a + 3.0
+    e = a + 4.0
+    f = a + 5.0
+    g = a + 6.0
+    h = a + 7.0
+    for _step in range(_PROBE_STEPS):
+        a = a * factor + 1.0
+        b = b * factor + 1.0
+        c = c * factor + 1.0
+        d = d * factor + 1.0
+        e = e * factor + 1.0
+        f = f * factor + 1.0
+        g = g * factor + 1.0
+        h = h * factor + 1.0
+    sum_out[i] = a + b + c + d + e + f + g + h
+
+
+def median_ms(calls: dict[str, Callable[[], Any]], *, repeats: int, synchronise: Callable[[], Any]) -> dict[str, float]:
+    """Median milliseconds of each call; the calls take turns, so that a drift of the machine hits all alike."""
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for turn in range(repeats + 3):
+        for name, call in calls.items():
+            synchronise()
+            start = time.perf_counter()
+            call()
+            synchronise()
+            if turn >= 3:
+                times[name].append((time.perf_counter() - start) * 1e3)
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def stage_rows(cloud: GaussianCloud, camera: Camera, *, repeats: int, threads: int) -> dict[str, dict[str, Any]]:
+    """Each stage's milliseconds, megabytes, millions of operations, and share of what the device's limits would allow.
+
+    The share is the time that the scarcer of bandwidth and arithmetic needs at full speed, over the time taken, which
+    includes the calls from Python. Both speeds are measured here: a copy of 1 GiB, and chains of multiply and add.
+    """
+    device: Any = cloud.device
+    view, background = view_from_camera(camera), Background(wp.vec3())
+    shape = (camera.height, camera.width)
+    gradient = [wp.ones(shape, dtype=t, device=device) for t in (wp.vec3, wp.float32, wp.float32)]
+    projected = project(cloud, view, antialiased=False, threads=threads)
+    lists = build_tile_lists(projected, view, threads=threads)
+    image = composite(projected, lists, view, background=background, threads=threads)
+    times = median_ms(
+        {
+            "project": lambda: project(cloud, view, antialiased=False, threads=threads),
+            "lists": lambda: build_tile_lists(projected, view, threads=threads),
+            "composite": lambda: composite(projected, lists, view, background=background, threads=threads),
+            "backward": lambda: backward(
+                *(cloud, view, projected, lists, image),
+                colour_gradient=gradient[0],
+                alpha_gradient=gradient[1],
+                depth_gradient=gradient[2],
+                antialiased=False,
+                want_pose=False,
+                threads=threads,
+            ),
+        },
+        repeats=repeats,
+        synchronise=lambda: wp.synchronize_device(device),
+    )
+    bandwidth, arithmetic = device_limits(device)
+    counts = _counts(projected, lists, view)
+    moved = _bytes(cloud.count, counts, int(view.width * view.height), cuda=device.is_cuda, tiles=lists.tile_count)
+    done = _operations(cloud.count, counts)
+    rows: dict[str, dict[str, Any]] = {}
+    for name, ms in times.items():
+        needed = {"bandwidth": moved[name] / bandwidth, "arithmetic": done[name] / arithmetic}
+        limit = max(needed, key=needed.__getitem__)
+        rows[name] = {
+            "ms": ms,
+            "megabytes": moved[name] / 1e6,
+            "million_operations": done[name] / 1e6,
+            "limit": limit,
+            "share_of_limit": needed[limit] / (ms * 1e-3),
+        }
+    return rows | {
+        "counts": counts,
+        "device": {"gigabytes_per_second": bandwidth / 1e9, "gigaflops": arithmetic / 1e9},
+    }
+
+
+def device_limits(device: Any) -> tuple[float, float]:
+    """Bytes a second of a long copy, read and write together, and single-precision operations a second."""
+    size = 2**30 if device.is_cuda else 2**27
+    source = wp.zeros(size // 4, dtype=wp.int32, device=device)
+    target = wp.empty_like(source)
+    lanes = 2**20 if device.is_cuda else 64
+    sums = wp.zeros(lanes, dtype=wp.float32, device=device)
+    times = median_ms(
+        {
+            "copy": lambda: wp.copy(target, source),
+            "arithmetic": lambda: wp.launch(arithmetic_kernel, lanes, inputs=[0.999], outputs=[sums], device=device),
+        },
+        repeats=7,
+        synchronise=lambda: wp.synchronize_device(device),
+    )
+    # Eight chains, two operations a step.
+    operations = lanes * 2048 * 8 * 2
+    return 2 * size / (times["copy"] * 1e-3), operations / (times["arithmetic"] * 1e-3)
+
+
+def _counts(projected: ProjectedGaussians, lists: TileLists, view: Any) -> dict[str, float]:
+    device: Any = projected.ellipse.device
+    hits = wp.zeros(int(view.width * view.height), dtype=wp.int32, device=device)
+    wp.launch(
+        hits_kernel,
+        dim=lists.tile_count * 256,
+        inputs=[
+            *(view.width, view.height, lists.tile_start, lists.gaussian_from_intersection),
+            *(projected.ellipse, projected.falloff),
+        ],
+        outputs=[hits],
+        device=device,
+    )
+    visible = np.diff(projected.slot_end.numpy(), prepend=0) > 0
+    return {
+        "visible": float(visible.sum()),
+        "pairs": float(projected.slot_count),
+        "pixel_hits": float(hits.numpy().sum(dtype=np.int64)),
+    }
+
+
+def _bytes(count: int, counts: dict[str, float], pixels: int, *, cuda: bool, tiles: int) -> dict[str, float]:
+    visible, pairs = counts["visible"], counts["pairs"]
+    if cuda:
+        # Keys, slots and Gaussians out; each radix pass reads and writes 12 bytes a pair; starts read keys again.
+        sorting = pairs * (16 + 24 * -(-(31 + tiles.bit_length()) // 8) + 20)
+    else:
+        # The tile of each slot out and in, then Gaussian and slot out.
+        sorting = pairs * 16 + visible * 64
+    return {
+        # Attributes in; tile count out and scanned; the ellipse of the visible ones out.
+        "project": count * (56 + 8 + 16) + visible * 40,
+        "lists": count * 8 + visible * 40 + sorting,
+        "composite": pairs * (4 + 40) + pixels * 20,
+        # Pairs again, their moments written, zeroed and read; attributes in, gradients out.
+        "backward": pairs * (8 + 40 + 3 * 48) + pixels * 60 + count * (56 + 8 + 64),
+    }
+
+
+def _operations(count: int, counts: dict[str, float]) -> dict[str, float]:
+    """Counted in the kernels' source: a multiply, an add and a special function are one each."""
+    visible, pairs, hits = counts["visible"], counts["pairs"], counts["pixel_hits"]
+    return {
+        # Rotation, product with the camera's and scales for all; ellipse and colour for the visible ones.
+        "project": count * 150 + visible * 120,
+        # The span of each tile row, about one row to a pair and a half; sorting is not arithmetic.
+        "lists": pairs * 30,
+        # Alpha: 12; blend: 10.
+        "composite": hits * 22,
+        # Alpha: 12; value, slope and transmittance: 20; ten sums: 24. Then the chain rule of each visible Gaussian.
+        "backward": hits * 56 + visible * 600 + pairs * 12,
+    }

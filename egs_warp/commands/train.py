@@ -1,0 +1,217 @@
+"""``egs-warp train``: a capture from photos with known camera poses."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from egs_warp.cli_input import check_device
+from egs_warp.errors import UserError
+
+_SHEET_PHOTOS = 6
+_DEFAULTS = {"cpu": (2000, 20_000, 360), "cuda": (7000, 200_000, 1600)}
+"""Iterations, Gaussians, longer side in pixels: some ten minutes on two cores, about one on a GPU."""
+
+
+def add_parser(commands) -> None:
+    """Add the command to the subparsers ``commands``."""
+    train = commands.add_parser("train", help="make a capture from posed photos")
+    train.add_argument("posed", help="COLMAP model, transforms.json or cameras.json, or a folder that holds one")
+    train.add_argument("--out", required=True, type=Path, help="capture to write: .ply, .compressed.ply, .spz or .sog")
+    train.add_argument("--iterations", type=int, help="optimiser steps, one photo each (cpu 2000, cuda 7000)")
+    train.add_argument("--gaussians", type=int, help="at most this many (cpu 20000, cuda 200000)")
+    train.add_argument("--max-side", type=int, help="photos are reduced to this many pixels (cpu 360, cuda 1600)")
+    train.add_argument("--sh-degree", type=int, default=2, help="how colours depend on the view, 0 to 3 (2)")
+    train.add_argument(
+        "--background", help="r,g,b from 0 to 1 behind the capture (white for photos with alpha, else their border's)"
+    )
+    train.add_argument("--seed", type=int, default=0, help="of the first cloud and the order of photos (0)")
+    train.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
+    train.set_defaults(run=_train)
+
+
+def _train(chosen: argparse.Namespace) -> int:
+    background = _colour(chosen.background) if chosen.background else None
+    for flag, value, least in (
+        ("--iterations", chosen.iterations, 1),
+        ("--gaussians", chosen.gaussians, 100),
+        ("--max-side", chosen.max_side, 16),
+    ):
+        if value is not None and value < least:
+            raise UserError(f"{flag} {value}: give a whole number of at least {least}")
+    if not 0 <= chosen.sh_degree <= 3:
+        raise UserError(f"--sh-degree {chosen.sh_degree}: give 0, 1, 2 or 3")
+    write = _writer(chosen.out)
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_ERROR
+    check_device(chosen.device)
+    try:
+        from egs_warp.training import train
+    except ImportError as error:
+        raise UserError("train: PyTorch is not installed; pip install 'egs-warp[torch]'") from error
+    from egs_warp.io import read_cameras, writable_folder
+
+    # Poses that cannot be read must not leave a new folder behind.
+    read_cameras(chosen.posed)
+    folder = writable_folder(chosen.out.parent)
+    iterations, gaussians, side = _DEFAULTS["cuda" if chosen.device.startswith("cuda") else "cpu"]
+    iterations = chosen.iterations or iterations
+    progress = _Progress(iterations)
+    progress.say(f"reading {chosen.posed}")
+    began = time.perf_counter()
+    result = train(
+        chosen.posed,
+        iterations=iterations,
+        max_gaussians=chosen.gaussians or gaussians,
+        sh_degree=chosen.sh_degree,
+        background=background,
+        max_side=chosen.max_side or side,
+        seed=chosen.seed,
+        device=chosen.device,
+        progress=progress.step,
+    )
+    progress.say(f"writing {chosen.out}")
+    stem = chosen.out.name.split(".")[0]
+    write(chosen.out, result.cloud)
+    report = _report(chosen, result, progress, time.perf_counter() - began)
+    _write_text(folder / f"{stem}.report.json", json.dumps(report, indent=1))
+    _write_sheet(folder / f"{stem}.sheet.png", result)
+    for which, scores in report["mean"].items():
+        if scores:
+            print(f"{which.replace('_', ' ')}: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f}")
+    print(f"wrote {chosen.out} ({result.cloud.count} Gaussians), {stem}.sheet.png, {stem}.report.json")
+    return 0
+
+
+class _Progress:
+    """Stage, speed and time left on stderr: one line that is rewritten on a terminal, a line every tenth elsewhere."""
+
+    def __init__(self, iterations: int) -> None:
+        self._iterations = iterations
+        self._terminal = sys.stderr.isatty()
+        self._first: float | None = None
+        self._shown = 0.0
+        self.frames_per_second = 0.0
+
+    def say(self, stage: str) -> None:
+        """A new stage."""
+        print(f"egs-warp: {stage}", file=sys.stderr)
+
+    def step(self, step: int, loss: float) -> None:
+        """Called after every step. The first is not timed: kernels may be compiled in it."""
+        now = time.perf_counter()
+        done = step + 1
+        if self._first is None:
+            self._first = now
+            return
+        self.frames_per_second = step / max(now - self._first, 1e-9)
+        last = done == self._iterations
+        due = now - self._shown > 0.5 if self._terminal else done % max(1, self._iterations // 10) == 0
+        if not (due or last):
+            return
+        self._shown = now
+        left = round((self._iterations - done) / self.frames_per_second)
+        text = (
+            f"egs-warp: training {done}/{self._iterations}, loss {loss:.4f},"
+            f" {self.frames_per_second:.1f} frames/s, {left // 60}:{left % 60:02d} left"
+        )
+        end = "\n" if last or not self._terminal else ""
+        print(f"\r{text}\x1b[K" if self._terminal else text, end=end, file=sys.stderr, flush=True)
+
+
+def _colour(text: str) -> tuple[float, float, float]:
+    try:
+        red, green, blue = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise UserError(f"--background {text}: give three numbers r,g,b from 0 to 1") from error
+    if not all(0.0 <= value <= 1.0 for value in (red, green, blue)):
+        raise UserError(f"--background {text}: give three numbers r,g,b from 0 to 1")
+    return red, green, blue
+
+
+def _writer(out: Path):
+    """The function that writes a capture to ``out``; refused now rather than after training."""
+    from egs_warp import io
+
+    writers = {".compressed.ply": io.write_compressed_ply, ".ply": io.write_ply, ".spz": io.write_spz}
+    writers |= {".sog": io.write_sog, ".splat": io.write_splat}
+    for suffix, write in writers.items():
+        if out.name.lower().endswith(suffix) and out.name.lower() != suffix:
+            if out.is_dir():
+                raise UserError(f"--out {out}: is a folder; give the name of a file")
+            return write
+    raise UserError(f"--out {out}: give a name that ends in {', '.join(writers)}")
+
+
+def _report(chosen: argparse.Namespace, result, progress: _Progress, seconds: float) -> dict:
+    import platform
+    from importlib.metadata import version
+
+    import egs_warp
+
+    photo = result.views[0].camera
+    means = {
+        name: dict(zip(("psnr", "ssim"), score, strict=True)) if score else None
+        for name, score in (
+            ("held_out", result.mean_score(held_out=True)),
+            ("trained_on", result.mean_score(held_out=False)),
+        )
+    }
+    return {
+        "photos": len(result.views),
+        "photo_size": [photo.width, photo.height],
+        "gaussians": result.cloud.count,
+        "iterations": len(result.losses),
+        "final_loss": float(np.mean(result.losses[-100:])),
+        "background": list(result.background),
+        "mean": means,
+        "scores": [asdict(score) for score in result.scores],
+        "seconds": seconds,
+        "frames_per_second": progress.frames_per_second,
+        "device": chosen.device,
+        "seed": chosen.seed,
+        "sh_degree": chosen.sh_degree,
+        "versions": {
+            "egs-warp": egs_warp.__version__,
+            "python": platform.python_version(),
+            **{name: version(name) for name in ("warp-lang", "numpy", "torch")},
+        },
+    }
+
+
+def _write_sheet(path: Path, result) -> None:
+    """Photo beside render, of photos held out where there are any."""
+    from egs_warp.render import contact_sheet, render, write_png
+
+    pairs = list(zip(result.views, result.scores, strict=True))
+    judged = [pair for pair in pairs if pair[1].held_out] or pairs
+    picked = [judged[i] for i in np.unique(np.linspace(0, len(judged) - 1, _SHEET_PHOTOS).round().astype(int))]
+    size = max(view.image.shape[0] for view, _ in picked), max(view.image.shape[1] for view, _ in picked)
+    frames, labels = [], []
+    for view, score in picked:
+        for kind, picture in (
+            (f"photo {score.name}", np.rint(view.image * 255).astype(np.uint8)),
+            (
+                f"{score.psnr:.1f} dB, SSIM {score.ssim:.3f}",
+                render(result.cloud, view.camera, background=result.background).colour_srgb8(),
+            ),
+        ):
+            frame = np.full((*size, 3), 255, dtype=np.uint8)
+            frame[: picture.shape[0], : picture.shape[1]] = picture
+            frames.append(frame)
+            labels.append(kind)
+    write_png(path, contact_sheet(frames, 4 if len(picked) > 2 else 2, labels))
+
+
+def _write_text(path: Path, text: str) -> None:
+    from egs_warp.io import atomic_write
+
+    with atomic_write(path) as temporary:
+        temporary.write_text(text)
