@@ -30,6 +30,8 @@ class JumpTarget:
 
     distance: float
     height: float
+    rise: float = 0.0
+    """How much higher the landing is than the start."""
 
 
 @dataclass(frozen=True)
@@ -60,8 +62,12 @@ def plan_jump(
     support_ahead: float,
     gravity: float,
     step: float,
+    lean: float | None = None,
 ) -> JumpPlan:
-    """Stroke, times and take-off velocity for a jump of ``target`` by a body of ``height`` H (DESIGN 9)."""
+    """Stroke, times and take-off velocity for a jump of ``target`` by a body of ``height`` H (DESIGN 9).
+
+    ``lean`` (metres) replaces the choice made here.
+    """
     time_unit = np.sqrt(height / gravity)
     extension = min(0.04 * height, 0.25 * target.height)
     rise = target.height - extension
@@ -69,8 +75,9 @@ def plan_jump(
     acceleration = 1.6 * gravity
     stroke = max(speed_up**2 / (2.0 * acceleration), extension + 0.02 * height)
     thrust_time = 2.0 * stroke / speed_up
-    flight_time = 2.0 * np.sqrt(2.0 * rise / gravity)
-    lean = min(0.3 * support_ahead, 0.05 * height, 0.2 * target.distance)
+    flight_time = np.sqrt(2.0 * rise / gravity) + np.sqrt(2.0 * max(rise - target.rise, 0.0) / gravity)
+    if lean is None:
+        lean = min(0.3 * support_ahead, 0.05 * height, 0.2 * target.distance)
     # A body that comes in with speed v stops over its base if that is ahead by v sqrt(h/g) (the capture point); the
     # front of the footprint helps.
     capture_time = np.sqrt(com_height / (1.3 * gravity))
@@ -104,6 +111,7 @@ class Jump:
         touching: np.ndarray,
         step: float,
         weights: Weights | None = None,
+        lean: float | None = None,
     ) -> None:
         self.body, self.ground, self.target = body, ground, target
         self.weights = weights or Weights()
@@ -117,6 +125,7 @@ class Jump:
             support_ahead=float(self.pose.support_high[0]),
             gravity=self.gravity,
             step=step,
+            lean=lean,
         )
         self.phase = JumpPhase.SETTLE
         self._entered = 0.0

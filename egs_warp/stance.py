@@ -48,6 +48,13 @@ class Ground:
     """(3, 3)."""
     origin: np.ndarray
     """(3,) metres, on the plane."""
+    normal: np.ndarray | None = None
+    """(3,) of the plane where it is not up: on a slope."""
+
+    @property
+    def surface_normal(self) -> np.ndarray:
+        """(3,) unit, of the plane under the feet."""
+        return self.axes[2] if self.normal is None else self.normal
 
     @classmethod
     def on(cls, plane: Plane, forward: np.ndarray, below: np.ndarray) -> Ground:
@@ -57,9 +64,17 @@ class Ground:
         axes = np.stack([flat, np.cross(plane.normal, flat), plane.normal])
         return cls(axes, below - plane.heights(below) * plane.normal)
 
+    def turn(self, angle: float) -> np.ndarray:
+        """(3, 3) rotation by ``angle`` radians about up, world axes."""
+        return Rotation.from_rotvec(angle * self.axes[2]).as_matrix()
+
     def local(self, points: np.ndarray) -> np.ndarray:
         """World points (..., 3) to ground coordinates."""
         return (points - self.origin) @ self.axes.T
+
+    def world(self, points: np.ndarray) -> np.ndarray:
+        """Ground coordinates (..., 3) to world points."""
+        return self.origin + points @ self.axes
 
 
 class PoseFamily:
@@ -71,9 +86,7 @@ class PoseFamily:
         local = ground.local(standing)
         self._arms = (local - body.centre_of_mass(local)) @ ground.axes
         self.standing_height = float(body.centre_of_mass(local)[2])
-        sole = local[:, 2] < local[:, 2].min() + 0.06 * body.height
-        self._sole = sole
-        self._sole_mass = body.node_mass * sole
+        self._sole_share = sole_shares(body, ground, standing)
         self._standing = standing
         self.base_offset = self._base(local) - body.centre_of_mass(local)[:2]
         footprint = ground.local(touching)[:, :2] - body.centre_of_mass(local)[:2]
@@ -98,7 +111,7 @@ class PoseFamily:
         return (seen.com[:2] - pressure) / lever
 
     def _base(self, local: np.ndarray) -> np.ndarray:
-        return (self._sole_mass @ local / self._sole_mass.sum())[:2]
+        return (self._sole_share @ local)[:2]
 
     def measure(self, state: BodyState, report: StepReport | None) -> Measurement:
         """What the controller sees."""
@@ -122,12 +135,7 @@ class PoseFamily:
 
     def sole_heading(self, positions: np.ndarray) -> float:
         """Radians about the ground's normal by which the feet alone are turned from the standing pose."""
-        share = self._sole_mass / self._sole_mass.sum()
-        axes = self.ground.axes[:2].T
-        before = (self._arms - share @ self._arms) @ axes
-        now = (positions - share @ positions) @ axes
-        sine = share @ (before[:, 0] * now[:, 1] - before[:, 1] * now[:, 0])
-        return float(np.arctan2(sine, share @ (before * now).sum(axis=1)))
+        return heading_between(self._arms, positions, self._sole_share, self.ground)
 
     def affine(self, stretch: float, lean: np.ndarray, heading: float = 0.0) -> np.ndarray:
         """(3, 3) world matrix: ``stretch`` along up, half the volume kept by bulging, sheared by ``lean`` (2,), then turned."""
@@ -179,3 +187,17 @@ class PoseFamily:
         u, _, vt = np.linalg.svd(spread)
         wanted = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
         return Rotation.from_matrix(wanted @ self.rotation(state.positions).T).as_rotvec()
+
+
+def sole_shares(body: SoftBody, ground: Ground, standing: np.ndarray) -> np.ndarray:
+    """(N,) weights, sum 1, whose mean is the centre of the feet: the mass of the nodes that are near the ground at rest."""
+    heights = standing @ ground.surface_normal
+    mass = body.node_mass * (heights < heights.min() + 0.06 * body.height)
+    return mass / mass.sum()
+
+
+def heading_between(before: np.ndarray, after: np.ndarray, share: np.ndarray, ground: Ground) -> float:
+    """Radians about the ground's up by which points ``before`` (N, 3), weighted by ``share`` (N,), best turn to ``after``."""
+    flat_before, flat_after = ((x - share @ x) @ ground.axes[:2].T for x in (before, after))
+    sine = share @ (flat_before[:, 0] * flat_after[:, 1] - flat_before[:, 1] * flat_after[:, 0])
+    return float(np.arctan2(sine, share @ (flat_before * flat_after).sum(axis=1)))

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from egs_warp.body import BodyState, SoftBody
+from egs_warp.body import BodyState
+from egs_warp.leap import Leap
 from egs_warp.locomotion import StepReport
-from egs_warp.motions import Jump, JumpPhase, JumpTarget
+from egs_warp.motions import JumpPhase, JumpTarget
 from egs_warp.objectives import Objective, SpinObjective
-from egs_warp.stance import Ground, Measurement, PoseFamily, Weights
+from egs_warp.sequence import Place
+from egs_warp.stance import Measurement, Weights
 
 AIRBORNE_SHARE = 0.88
 """Of the planned time of flight the body is off the ground: it stretches before it leaves it and before it lands."""
@@ -20,53 +22,25 @@ WIDEST = 1.15
 """How much wider or narrower than standing the body makes itself in the air."""
 
 
-class Twist(Jump):
-    """A jump that lands facing ``turn`` radians, counter-clockwise from above, from where it faced at the start.
+class Twist(Leap):
+    """A jump that lands facing ``turn`` radians, counter-clockwise from above, from where it faced at the start."""
 
-    From take-off on everything is told in the frame of the landing, in which the landed body stands as it stood at the start.
-    """
-
-    def __init__(
-        self,
-        body: SoftBody,
-        ground: Ground,
-        standing: np.ndarray,
-        target: JumpTarget,
-        turn: float,
-        *,
-        touching: np.ndarray,
-        step: float,
-        weights: Weights | None = None,
-    ) -> None:
-        super().__init__(body, ground, standing, target, touching=touching, step=step, weights=weights)
-        self.turn = turn
-        self._standing_inertia = float(ground.axes[2] @ body.inertia(standing) @ ground.axes[2])
+    def __init__(self, place: Place, target: JumpTarget, turn: float, *, weights: Weights | None = None) -> None:
+        super().__init__(place, target, turn=turn, weights=weights)
         self._turned = 0.0
-        landing = Ground(_about_up(turn) @ ground.axes, ground.origin + target.distance * ground.axes[0])
-        moved = landing.origin + (ground.local(standing) @ landing.axes)
-        self._landing_pose = PoseFamily(body, landing, moved, landing.origin + ground.local(touching) @ landing.axes)
-
-    @property
-    def _landed(self) -> bool:
-        return self.pose is self._landing_pose
+        up = place.ground.axes[2]
+        self._standing_inertia = float(up @ place.body.inertia(place.standing) @ up)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
-        facing = self.pose.measure(state, report).heading + (self.turn if self._landed else 0.0)
+        facing = self.pose.measure(state, report).heading + (self.turn if self.left_ground else 0.0)
         self._turned += float(np.remainder(facing - self._turned + np.pi, 2.0 * np.pi) - np.pi)
         return super().objectives(state, report, dt)
-
-    def _advance_phase(self, seen: Measurement, time: float, dt: float) -> None:
-        super()._advance_phase(seen, time, dt)
-        if self.phase is JumpPhase.FLIGHT and not self._landed:
-            self.pose = self._landing_pose
-            self.ground = self.pose.ground
-            self._goal_base = self._start_base
 
     def _stand(
         self, state: BodyState, com_velocity: np.ndarray, position: np.ndarray, base: np.ndarray, dt: float
     ) -> list[Objective | SpinObjective]:
-        if self._landed:
+        if self.left_ground:
             # As the feet stand, so shall the body: what it was turned too little is not made up by standing twisted.
             pose = self.pose.over_base(position, base, self.pose.sole_heading(state.positions))
             return self._write(
@@ -106,9 +80,3 @@ class Twist(Jump):
     def _with_yaw(self, rate: np.ndarray, yaw: float) -> np.ndarray:
         up = self.ground.axes[2]
         return rate + (yaw - rate @ up) * up
-
-
-def _about_up(angle: float) -> np.ndarray:
-    """(3, 3) maps the rows forward, left, up of a ground frame to those of the frame turned by ``angle``."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -1,0 +1,46 @@
+"""From what a user asks for to motions that a body can do: the one list of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from egs_warp.hop import Squares
+from egs_warp.leap import Leap
+from egs_warp.motions import JumpTarget
+from egs_warp.script import MotionRequest
+from egs_warp.sequence import BodyMotion, Part, Place
+from egs_warp.twist import Twist
+
+FRAMES: Mapping[str, int] = {"jump": 120, "hop": 100, "twist": 110, "walk": 120, "trajectory": 60}
+"""Frames at 60 Hz within which a motion of each kind comes to rest; one that takes longer is cut off."""
+
+
+def _jump(asked: Mapping[str, float], place: Place) -> BodyMotion:
+    height = place.body.height
+    return Leap(place, JumpTarget(asked["distance"] * height, asked["height"] * height))
+
+
+def _twist(asked: Mapping[str, float], place: Place) -> BodyMotion:
+    height = place.body.height
+    target = JumpTarget(asked["distance"] * height, asked["height"] * height)
+    return Twist(place, target, float(np.radians(asked["heading_degrees"])))
+
+
+_BEGIN: Mapping[str, Callable[[Mapping[str, float], Place], BodyMotion]] = {"jump": _jump, "twist": _twist}
+
+
+def parts_of(requests: Sequence[MotionRequest], height: float) -> list[Part]:
+    """The motions of a script, for a body of ``height`` metres, in their order."""
+    parts: list[Part] = []
+    for request in requests:
+        asked = request.asked
+        if request.name == "hop":
+            row = Squares(asked["distance"] * height, asked["height"] * height, request.repeat, asked)
+            parts += row.parts()
+        else:
+            begin = _BEGIN[request.name]
+            for _ in range(request.repeat):
+                parts.append(Part(request.name, asked, lambda place, asked=asked, begin=begin: begin(asked, place)))
+    return parts

@@ -1,0 +1,118 @@
+"""Motions one after the other: each begins where, and as, the body stands when the one before has come to rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Protocol
+
+import numpy as np
+
+from egs_warp.body import BodyState, SoftBody
+from egs_warp.locomotion import StepReport
+from egs_warp.objectives import Objective, SpinObjective
+from egs_warp.stance import Ground, heading_between, sole_shares
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a body stands, upright and at rest, and which way is forward."""
+
+    body: SoftBody
+    ground: Ground
+    """Its origin is under the centre of mass; up is against gravity."""
+    standing: np.ndarray
+    """(N, 3) nodes, metres."""
+    touching: np.ndarray
+    """(k, 3) points of the body on the ground, metres."""
+    step: float
+    """Seconds of a solver step."""
+
+    def now(self, positions: np.ndarray) -> Place:
+        """The same stance turned about up and moved to where the feet of ``positions`` (N, 3) are."""
+        share = sole_shares(self.body, self.ground, self.standing)
+        angle = heading_between(self.standing, positions, share, self.ground)
+        feet, moved = share @ self.standing, share @ positions
+        turn = self.ground.turn(angle)
+        return replace(
+            self,
+            ground=Ground(self.ground.axes @ turn.T, moved + (self.ground.origin - feet) @ turn.T, self.ground.normal),
+            standing=moved + (self.standing - feet) @ turn.T,
+            touching=moved + (self.touching - feet) @ turn.T,
+        )
+
+    def facing(self, direction: np.ndarray) -> Place:
+        """The same stance with another way forward (3,); the body is not turned."""
+        x, y = self.ground.axes[:2] @ direction
+        turn = self.ground.turn(float(np.arctan2(y, x)))
+        return replace(self, ground=replace(self.ground, axes=self.ground.axes @ turn.T))
+
+
+class BodyMotion(Protocol):
+    """A state machine that ends in a phase whose value is "rest"."""
+
+    phase: Enum
+
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[Objective | SpinObjective]:
+        """Objectives of the step of ``dt`` seconds that starts at ``state``; ``report`` is of the step before."""
+        ...
+
+    def planned(self) -> dict[str, float]:
+        """What it aims at."""
+        ...
+
+    def notes(self) -> list[str]:
+        """What kept it from its target, for the user."""
+        ...
+
+
+@dataclass
+class Done:
+    """A motion of a sequence and when it began."""
+
+    name: str
+    asked: dict[str, float]
+    motion: BodyMotion
+    start_time: float
+
+
+@dataclass(frozen=True)
+class Part:
+    """A motion to come."""
+
+    name: str
+    asked: dict[str, float]
+    begin: Callable[[Place], BodyMotion]
+
+
+class MotionSequence:
+    """Runs ``parts`` one after the other from ``place``; itself a motion."""
+
+    def __init__(self, place: Place, parts: Sequence[Part]) -> None:
+        self._place = place
+        self._parts = list(parts)
+        self.done: list[Done] = []
+        self._rested_since: float | None = None
+
+    @property
+    def finished(self) -> bool:
+        """Whether the last motion has come to rest."""
+        return not self._parts and self._resting
+
+    @property
+    def _resting(self) -> bool:
+        return bool(self.done) and self.done[-1].motion.phase.value == "rest"
+
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[Objective | SpinObjective]:
+        """Objectives of the step of ``dt`` that starts at ``state``, from the motion whose turn it is."""
+        if self._parts and (not self.done or self._resting):
+            place = self._place.now(state.positions) if self.done else self._place
+            part = self._parts.pop(0)
+            self.done.append(Done(part.name, part.asked, part.begin(place), state.time))
+        return self.done[-1].motion.objectives(state, report, dt)
+
+    def spans(self, time: np.ndarray) -> list[tuple[int, int]]:
+        """First and last index into ``time`` (F+1,) of each motion that was begun."""
+        starts = [int(np.searchsorted(time, entry.start_time - 1e-9)) for entry in self.done]
+        return list(zip(starts, [*starts[1:], len(time) - 1], strict=True))
