@@ -22,13 +22,15 @@ from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.io.atomic import writable_folder
 from egs_warp.locomotion import LocomotionStepper
-from egs_warp.motions import Jump, JumpTarget
 from egs_warp.muscles import MuscleSet, automatic_muscles
 from egs_warp.plane import Plane
 from egs_warp.render.ground import Floor
 from egs_warp.render.rasteriser import render
 from egs_warp.render.video import VideoWriter, contact_sheet, write_png
+from egs_warp.repertoire import longest, parts_of
 from egs_warp.report import build_report, motion_entry, qp_summary, timing_summary, write_report
+from egs_warp.script import LARGEST_TARGET, LARGEST_TURN, parse_script
+from egs_warp.sequence import MotionSequence, Place
 from egs_warp.simulation import FRAME_RATE, Simulation, settle, simulate, steps_per_frame
 from egs_warp.splitting import split_for_motion
 from egs_warp.stance import Ground
@@ -38,17 +40,17 @@ SHEET_FRAMES = 12
 SPLIT_KEY_FRAMES = 24
 SMALLEST_SAG = 0.004
 """A body is not made stiffer than this column's sag, whatever it bends."""
-LARGEST_TARGET = 10.0
-"""Body heights; a larger target is refused as a slip of the pen."""
 
 
 @dataclass(frozen=True)
 class AnimateOptions:
-    """What a user may ask; lengths of targets are in body heights."""
+    """What a user may ask; lengths of targets are in body heights. Targets hold for motions that do not say their own."""
 
-    distance: float = 0.5
-    height: float = 0.2
-    frames: int = 120
+    distance: float | None = None
+    height: float | None = None
+    heading_degrees: float | None = None
+    frames: int | None = None
+    """None: until the last motion has come to rest."""
     size: int = 512
     """Pixels, both sides."""
     seed: int = 0
@@ -59,12 +61,17 @@ class AnimateOptions:
 
     def __post_init__(self) -> None:
         for name, value in (("distance", self.distance), ("height", self.height)):
-            if not np.isfinite(value) or value < 0.0 or value > LARGEST_TARGET:
+            if value is not None and not (0.0 <= value <= LARGEST_TARGET):
                 raise UserError(f"--{name} {value}: give a number of body heights from 0 to {LARGEST_TARGET:g}")
         if self.height == 0.0:
             raise UserError("--height 0: a jump needs a height above 0 body heights")
+        turn = self.heading_degrees
+        if turn is not None and not abs(turn) <= LARGEST_TURN:
+            raise UserError(
+                f"--heading-degrees {turn}: give a number of degrees from -{LARGEST_TURN:g} to {LARGEST_TURN:g}"
+            )
         for name, value, least in (("frames", self.frames, 1), ("size", self.size, 16)):
-            if value < least:
+            if value is not None and value < least:
                 raise UserError(f"--{name} {value}: give a whole number of at least {least}")
         if self.metres_per_unit is not None and not (np.isfinite(self.metres_per_unit) and self.metres_per_unit > 0.0):
             raise UserError(f"--metres-per-unit {self.metres_per_unit}: give a positive number")
@@ -162,45 +169,45 @@ def animate(
 ) -> dict:
     """Bring ``cloud`` (scene units) to life and write video, contact sheet, report and trajectory into ``out``.
 
-    ``background`` is drawn behind the object instead of the plain floor. Returns the report (docs/report.md).
-    Raises ``UserError`` for bad input, before any file of an earlier run is touched.
+    ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.script``). ``background`` is drawn
+    behind the object instead of the plain floor. Returns the report (docs/report.md). Raises ``UserError`` for bad input,
+    before any file of an earlier run is touched.
     """
-    if motion != "jump":
-        raise UserError(f"--motion {motion}: known motions are: jump")
     options = options or AnimateOptions()
+    flags = {"distance": options.distance, "height": options.height, "heading_degrees": options.heading_degrees}
+    requests = parse_script(motion, defaults=flags)
     folder = writable_folder(out)
     with tqdm(total=1, desc="prepare", unit="capture", disable=quiet) as bar:
         creature = make_creature(
             cloud, up=up, plane=plane, metres_per_unit=options.metres_per_unit, friction=options.friction
         )
         bar.update()
-        stepper, start = creature.stepper, creature.start
-    ground = Ground.on(creature.plane, _forward(creature), creature.body.centre_of_mass(start.positions))
-    height = creature.body.height
-    jump = Jump(
-        creature.body,
-        ground,
-        start.positions,
-        JumpTarget(options.distance * height, options.height * height),
-        touching=stepper.detector.points_within(start.positions, 0.01 * height),
-        step=1.0 / (FRAME_RATE * steps_per_frame(creature.body)),
-    )
-    with tqdm(total=options.frames, desc="simulate", unit="frame", disable=quiet) as bar:
+    place = first_place(creature)
+    sequence = MotionSequence(place, parts_of(requests, creature.body.height))
+    frames = options.frames or longest(requests)
+    with tqdm(total=frames, desc="simulate", unit="frame", disable=quiet) as bar:
         simulation = simulate(
-            stepper, creature.geometry, start, jump, frames=options.frames, progress=lambda _: (bar.update(), None)[1]
+            creature.stepper,
+            creature.geometry,
+            creature.start,
+            sequence,
+            frames=frames,
+            finished=lambda: options.frames is None and sequence.finished,
+            progress=lambda _: (bar.update(), None)[1],
         )
-    drawing, split_count = _draw(creature, simulation, ground, folder, motion, options, background, quiet)
-    reached = measure(simulation.trajectory)
+    name = requests[0].name if len({request.name for request in requests}) == 1 else "motions"
+    drawing, split_count = _draw(creature, simulation, place.ground, folder, name, options, background, quiet)
     unconverged = sum(not report.converged for report in simulation.reports)
     report = build_report(
         motion=[
             motion_entry(
-                motion,
-                {"distance": options.distance, "height": options.height},
-                jump.planned(),
-                reached,
-                jump.notes(),
+                entry.name,
+                entry.asked,
+                entry.motion.planned(),
+                measure(simulation.trajectory, first=first, last=last),
+                entry.motion.notes(),
             )
+            for entry, (first, last) in zip(sequence.done, sequence.spans(simulation.trajectory.time), strict=True)
         ],
         audit=audit(simulation.trajectory, newton_unconverged=unconverged),
         qp=qp_summary(simulation.reports, simulation.frames),
@@ -228,6 +235,18 @@ def animate(
     creature.cage.mesh.write_vtu(folder / "cage.vtu")
     write_report(folder / "report.json", report)
     return report
+
+
+def first_place(creature: Creature) -> Place:
+    """Where the creature stands at the start, facing along its footprint."""
+    body, start = creature.body, creature.start
+    return Place(
+        body,
+        Ground.on(creature.plane, _forward(creature), body.centre_of_mass(start.positions)),
+        start.positions,
+        creature.stepper.detector.points_within(start.positions, 0.01 * body.height),
+        1.0 / (FRAME_RATE * steps_per_frame(body)),
+    )
 
 
 def _forward(creature: Creature) -> np.ndarray:
@@ -278,12 +297,13 @@ def _draw(
     camera = view_of(simulation, ground, options.size)
     device = creature.cloud.device
     height = creature.body.height
-    com = trajectory.node_mass @ trajectory.positions[:, :, :].mean(axis=0) / trajectory.node_mass.sum()
+    path = np.einsum("n,fni->fi", trajectory.node_mass, trajectory.positions) / trajectory.node_mass.sum()
+    com = path.mean(axis=0)
     floor = Floor(
         camera,
         creature.plane,
         centre=com - creature.plane.heights(com) * creature.plane.normal,
-        reach=2.2 * height * (1.0 + options.distance),
+        reach=2.2 * (height + float(np.linalg.norm(np.ptp(path, axis=0)))),
         cell=0.25 * height,
     )
     behind = render(background.scaled(creature.metres_per_unit), camera) if background is not None else None
@@ -330,16 +350,20 @@ def _draw(
 
 def summary(report: dict) -> str:
     """A few lines for the terminal."""
-    entry = report["motion"][0]
-    reached, asked = entry["reached"], entry["asked"]
-    return (
-        f"{entry['name']}: distance {reached['distance']:.3f} of {asked['distance']:g}, "
-        f"height {reached['height']:.3f} of {asked['height']:g} body heights, "
-        f"tilt {reached['tilt_degrees']:.1f} degrees, airborne {reached['airborne_frames']:.0f} frames\n"
-        + "audit: "
-        + ", ".join(f"{name} {value:.2g}" for name, value in report["audit"].items())
-        + "".join(f"\nnote: {note}" for note in (*entry["notes"], *report["notes"]))
-    )
+    lines = []
+    for entry in report["motion"]:
+        reached, asked = entry["reached"], entry["asked"]
+        pairs = [
+            f"{name} {reached[name]:.3f} of {asked[name]:g}" if name in asked else f"{name} {reached[name]:.3f}"
+            for name in ("distance", "height", "heading_degrees")
+        ]
+        lines.append(
+            f"{entry['name']}: {', '.join(pairs)}, tilt {reached['tilt_degrees']:.1f} degrees, "
+            f"airborne {reached['airborne_frames']:.0f} frames (lengths in body heights)"
+        )
+        lines += [f"note: {note}" for note in entry["notes"]]
+    lines.append("audit: " + ", ".join(f"{name} {value:.2g}" for name, value in report["audit"].items()))
+    return "\n".join([*lines, *(f"note: {note}" for note in report["notes"])])
 
 
 def as_options(**values: Any) -> AnimateOptions:

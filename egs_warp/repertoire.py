@@ -44,3 +44,8 @@ def parts_of(requests: Sequence[MotionRequest], height: float) -> list[Part]:
             for _ in range(request.repeat):
                 parts.append(Part(request.name, asked, lambda place, asked=asked, begin=begin: begin(asked, place)))
     return parts
+
+
+def longest(requests: Sequence[MotionRequest]) -> int:
+    """Frames after which a script is cut off."""
+    return sum(FRAMES[request.name] * request.repeat for request in requests)

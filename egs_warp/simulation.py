@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -18,12 +18,14 @@ from egs_warp.trajectory import Trajectory, record
 
 FRAME_RATE = 60
 """Frames of a video, 1/s."""
+REST_FRAMES = 20
+"""Frames shown after the last motion has come to rest."""
 
 
 class Motion(Protocol):
     """Anything that writes objectives from the measured state."""
 
-    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[Objective | SpinObjective]:
         """Objectives of the step of ``dt`` seconds that starts at ``state``; ``report`` is of the step before."""
         ...
 
@@ -80,15 +82,20 @@ def simulate(
     motion: Motion,
     *,
     frames: int,
+    finished: Callable[[], bool] = lambda: False,
     progress: Callable[[int], None] = lambda frame: None,
 ) -> Simulation:
-    """Run ``frames`` frames of ``motion`` from ``start``; ``progress`` is told each finished frame."""
+    """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``.
+
+    ``progress`` is told each frame done.
+    """
     body = stepper.body
     per_frame = steps_per_frame(body)
     dt = 1.0 / (FRAME_RATE * per_frame)
     state, memory = start, stepper.initial_memory()
     reports: list[StepReport] = []
     shown = [0]
+    resting = 0
     for frame in range(frames):
         for _ in range(per_frame):
             objectives = motion.objectives(state, reports[-1] if reports else None, dt)
@@ -96,6 +103,9 @@ def simulate(
             reports.extend(done)
         shown.append(len(reports))
         progress(frame)
+        resting = resting + 1 if finished() else 0
+        if resting == REST_FRAMES:
+            break
     gaps, _ = stepper.detector.gaps(start.positions)
     trajectory = record(
         body,

@@ -95,7 +95,7 @@ class Reached:
     height: float
     """Apex of the centre of mass minus its standing height."""
     heading_degrees: float
-    """Turn about the plane's normal."""
+    """Turn about the plane's normal; whole turns count."""
     tilt_degrees: float
     """Angle between the up of the body's best-fit rotation and the normal, at the end."""
     airborne_frames: float
@@ -183,10 +183,8 @@ def measure(trajectory: Trajectory, *, first: int = 0, last: int = -1) -> Reache
     up = -t.gravity / np.linalg.norm(t.gravity)
     com = np.einsum("n,fni->fi", t.node_mass, t.positions[first : last + 1]) / t.node_mass.sum()
     moved = com[-1] - com[0]
-    turn = _best_fit(t, t.positions[last]) @ _best_fit(t, t.positions[first]).T
     upright = _best_fit(t, t.positions[last]) @ up
-    twist = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    heading = np.arctan2(twist @ up, np.trace(turn) - up @ turn @ up)
+    heading = _headings(t, first, last, up)[-1]
     longest = run_start = 0.0
     above = False
     for time, gap in zip(t.time[first : last + 1], t.min_gap[first : last + 1], strict=True):
@@ -208,3 +206,14 @@ def _best_fit(t: Trajectory, positions: np.ndarray) -> np.ndarray:
     arms = positions - t.node_mass @ positions / t.node_mass.sum()
     u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", t.node_mass, arms, rest))
     return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+
+
+def _headings(t: Trajectory, first: int, last: int, up: np.ndarray) -> np.ndarray:
+    """(n,) radians about ``up`` since ``first``, followed from step to step so that whole turns count."""
+    start = _best_fit(t, t.positions[first])
+    angles = []
+    for positions in t.positions[first : last + 1]:
+        turn = _best_fit(t, positions) @ start.T
+        axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+        angles.append(np.arctan2(axis @ up, np.trace(turn) - up @ turn @ up))
+    return np.unwrap(angles)

@@ -15,15 +15,20 @@ def add_parser(commands) -> None:
     """Add the command to the subparsers ``commands``."""
     animate = commands.add_parser("animate", help="bring a capture to life")
     animate.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog or an unbundled SOG folder")
-    animate.add_argument("--motion", default="jump", help="jump (default)")
+    animate.add_argument(
+        "--motion",
+        default="jump",
+        help='jump (default), hop, twist, walk, several as "hop x3, twist 180", or a script.json',
+    )
     animate.add_argument("--out", required=True, type=Path, help="folder for video, sheet, report and trajectory")
     animate.add_argument("--up", help="axis that points up: x, y, z or with a minus, as --up=-y; else it is guessed")
     animate.add_argument(
         "--plane", help="nx,ny,nz,d of the ground n.x + d = 0 in the capture's units; else it is found"
     )
-    animate.add_argument("--distance", type=float, help="of the jump, body heights (0.5)")
+    animate.add_argument("--distance", type=float, help="of a jump or hop, body heights (0.5; 0.7)")
     animate.add_argument("--height", type=float, help="rise of the centre of mass, body heights (0.2)")
-    animate.add_argument("--frames", type=int, help="length of the video at 60 Hz (120)")
+    animate.add_argument("--heading-degrees", type=float, help="of a twist, counter-clockwise from above (180)")
+    animate.add_argument("--frames", type=int, help="length of the video at 60 Hz (until the body rests)")
     animate.add_argument("--size", type=int, help="pixels, both sides (512)")
     animate.add_argument("--seed", type=int, help="recorded in the report; a jump has nothing random (0)")
     animate.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
@@ -43,6 +48,7 @@ def _animate(chosen: argparse.Namespace) -> int:
     options = as_options(
         distance=chosen.distance,
         height=chosen.height,
+        heading_degrees=chosen.heading_degrees,
         frames=chosen.frames,
         size=chosen.size,
         seed=chosen.seed,

@@ -1,0 +1,37 @@
+"""The pawn hops across the chess board of its scene, a square at a time: video, contact sheet, report and trajectory."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from egs_warp.animation import AnimateOptions, animate, summary
+from egs_warp.scenes import scene
+from egs_warp.scenes.rooms import SQUARE
+
+
+def main(arguments: list[str] | None = None) -> dict:
+    """Run the example; returns the report."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("out/hop"))
+    parser.add_argument("--hops", type=int, default=5)
+    parser.add_argument("--frames", type=int, help="default: until it rests")
+    parser.add_argument("--size", type=int, default=512)
+    parser.add_argument("--device", default="cpu")
+    chosen = parser.parse_args(arguments)
+    chess = scene("pawn", device=chosen.device)
+    report = animate(
+        chess.object,
+        chosen.out,
+        motion=f"hop x{chosen.hops}",
+        plane=chess.plane,
+        background=chess.background,
+        options=AnimateOptions(distance=SQUARE, frames=chosen.frames, size=chosen.size),
+        source="pawn",
+    )
+    print(summary(report))
+    return report
+
+
+if __name__ == "__main__":
+    main()

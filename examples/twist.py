@@ -1,0 +1,29 @@
+"""The built-in chess pawn jumps and turns about: video, contact sheet, report and trajectory."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from egs_warp.animation import AnimateOptions, animate, summary
+from egs_warp.scenes import pawn
+
+
+def main(arguments: list[str] | None = None) -> dict:
+    """Run the example; returns the report."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("out/twist"))
+    parser.add_argument("--degrees", type=float, default=180.0)
+    parser.add_argument("--frames", type=int, help="default: until it rests")
+    parser.add_argument("--size", type=int, default=512)
+    parser.add_argument("--device", default="cpu")
+    chosen = parser.parse_args(arguments)
+    thing = pawn(device=chosen.device)
+    options = AnimateOptions(heading_degrees=chosen.degrees, frames=chosen.frames, size=chosen.size)
+    report = animate(thing.cloud, chosen.out, motion="twist", plane=thing.plane, options=options, source="pawn")
+    print(summary(report))
+    return report
+
+
+if __name__ == "__main__":
+    main()
