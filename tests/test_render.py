@@ -10,6 +10,8 @@ from egs_warp.camera import Camera
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.render import render, render_views
+from egs_warp.render.projection import project, view_from_camera
+from egs_warp.render.tiles import _lists_by_counting, _lists_by_sorting
 from tests.render_twin import render_twin, rotation_matrices, sh_basis
 
 EYE = np.array([0.3, -0.4, -3.0])
@@ -277,3 +279,20 @@ def test_impossible_cameras_and_backgrounds_are_refused() -> None:
         render(cloud, Camera(**{**camera_of().__dict__, "fx": float("nan")}))
     with pytest.raises(UserError, match=r"an image of 45 x 67 x 3, not shape \(3, 3\)"):
         render(cloud, camera_of(), background=np.ones((3, 3)))
+
+
+def test_sorted_lists_equal_counted_ones() -> None:
+    """A GPU sorts pairs and a CPU counts them: tile by tile the same Gaussians in the same order, equal depths by index."""
+    values = random_scene(3000, coefficients=1, seed=12)
+    values["means"][::3, 2] = 0.25
+    cloud, view = cloud_of(values), view_from_camera(camera_of(200, 150))
+    projected = project(cloud, view, antialiased=False, threads=1)
+    tiles = 13 * 10
+    counted = [_lists_by_counting(projected, view, tiles, threads) for threads in (1, 2, 3)]
+    lists = [_lists_by_sorting(projected, view, tiles), *counted]
+    pairs = projected.slot_count
+    assert lists[0].tile_start.numpy()[-1] == pairs > 10_000
+    for other in lists[1:]:
+        assert np.array_equal(lists[0].tile_start.numpy(), other.tile_start.numpy())
+        for name in ("gaussian_from_intersection", "slot_from_intersection"):
+            assert np.array_equal(getattr(lists[0], name).numpy()[:pairs], getattr(other, name).numpy()[:pairs])

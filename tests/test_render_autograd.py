@@ -176,3 +176,23 @@ def test_pixels_share_memory_and_bad_tensors_are_named() -> None:
         render_torch(tensors[0], tensors[1][:, :3], *tensors[2:], camera)
     with pytest.raises(UserError, match="rotation and translation together"):
         render_torch(*tensors, camera, rotation=torch.eye(3))
+
+
+def test_screen_positions_get_their_gradient_where_asked_for(device: str) -> None:
+    """Moving every splat by one pixel is moving the principal point: the sums are the camera's."""
+    values, camera = clear_scene()
+    tensors = [torch.tensor(values[name], dtype=torch.float32, device=device, requires_grad=True) for name in NAMES]
+    screen = torch.zeros((len(values["means"]), 2), device=device, requires_grad=True)
+    image = render_torch(*tensors, camera, screen=screen, background=(0.2, 0.5, 0.9))
+    weight = torch.tensor(weights(camera)["colour"], dtype=torch.float32, device=device)
+    (weight * image.colour).sum().backward()
+    assert screen.grad is not None
+    step = 1e-4
+    for axis, name in enumerate(("cx", "cy")):
+        sides = []
+        for sign in (1, -1):
+            moved = replace(camera, **{name: getattr(camera, name) + sign * step})
+            picture = render_twin(values, moved, background=(0.2, 0.5, 0.9))
+            sides.append(float((weights(camera)["colour"] * picture["colour"]).sum()))
+        expected = (sides[0] - sides[1]) / (2 * step)
+        assert float(screen.grad[:, axis].sum()) == pytest.approx(expected, rel=2e-3, abs=2e-3)

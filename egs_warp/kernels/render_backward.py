@@ -11,27 +11,23 @@ from egs_warp.kernels.render_projection import View, rotation_matrix, screen_axe
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
-@wp.kernel
-def pixel_gradients_kernel(
-    # In:
+@wp.func
+def pixel_gradient(
+    row: wp.int32,
+    column: wp.int32,
     colour: wp.array2d[wp.vec3],
     alpha: wp.array2d[wp.float32],
     depth: wp.array2d[wp.float32],
     colour_gradient: wp.array2d[wp.vec3],
     alpha_gradient: wp.array2d[wp.float32],
     depth_gradient: wp.array2d[wp.float32],
-    # Out:
-    sum_gradient_out: wp.array[wp.vec4],
-    remaining_out: wp.array[wp.float32],
-):
-    """Per pixel, the gradient by its weighted sums, and the whole that splats from front to back use up.
+) -> tuple[wp.vec4, wp.float32]:
+    """The gradient by a pixel's weighted sums, and the whole that splats from front to back use up.
 
     With s_i = (colour_i, depth_i) . gradient, the loss is linear in the weights w_i and the final transmittance T:
     dL/dalpha_i = T_i s_i - (sum of w_j s_j over j > i + T dL/dT) / (1 - alpha_i). The bracket for i = 0 is what is
-    returned; walking from front to back then needs no second pass and no stored state.
+    returned; walking from front to back then needs no second pass and no stored state. Empty arrays are zero gradients.
     """
-    row, column = wp.tid()
-    i = row * colour.shape[1] + column
     opaque = alpha[row, column]
     by_colour = wp.vec3()
     if colour_gradient.shape[0] > 0:
@@ -43,10 +39,40 @@ def pixel_gradients_kernel(
     if depth_gradient.shape[0] > 0 and opaque > 0.0:
         by_depth_sum = depth_gradient[row, column] / opaque
     depth_sum = depth[row, column] * opaque
-    sum_gradient_out[i] = wp.vec4(by_colour[0], by_colour[1], by_colour[2], by_depth_sum)
     by_alpha = by_alpha - by_depth_sum * depth[row, column]
     # colour holds T times the background already; depth times alpha is the weighted sum of depths.
-    remaining_out[i] = wp.dot(by_colour, colour[row, column]) + by_depth_sum * depth_sum - (1.0 - opaque) * by_alpha
+    remaining = wp.dot(by_colour, colour[row, column]) + by_depth_sum * depth_sum - (1.0 - opaque) * by_alpha
+    return wp.vec4(by_colour[0], by_colour[1], by_colour[2], by_depth_sum), remaining
+
+
+@wp.kernel
+def pixel_gradients_kernel(
+    first: wp.int32,
+    # In:
+    colour: wp.array2d[wp.vec3],
+    alpha: wp.array2d[wp.float32],
+    depth: wp.array2d[wp.float32],
+    colour_gradient: wp.array2d[wp.vec3],
+    alpha_gradient: wp.array2d[wp.float32],
+    depth_gradient: wp.array2d[wp.float32],
+    # Out:
+    sum_gradient_out: wp.array[wp.vec4],
+    remaining_out: wp.array[wp.float32],
+):
+    """``pixel_gradient`` of every pixel (CPU; a GPU's compositor works it out itself)."""
+    i = wp.tid() + first
+    by_sums, remaining = pixel_gradient(
+        i / colour.shape[1],
+        i % colour.shape[1],
+        colour,
+        alpha,
+        depth,
+        colour_gradient,
+        alpha_gradient,
+        depth_gradient,
+    )
+    sum_gradient_out[i] = by_sums
+    remaining_out[i] = remaining
 
 
 @wp.func
@@ -165,12 +191,14 @@ def project_backward_kernel(
         slot = wp.int32(slot_end[g - 1])
     end = wp.int32(slot_end[g])
     want_pose = by_pose_rotation_out.shape[0] > 0
+    want_screen = by_screen_out.shape[0] > 0
     if slot == end:
         by_mean_out[g] = wp.vec3()
         by_rotation_out[g] = wp.vec4()
         by_log_scale_out[g] = wp.vec3()
         by_opacity_logit_out[g] = wp.float32(0.0)
-        by_screen_out[g] = wp.vec2()
+        if want_screen:
+            by_screen_out[g] = wp.vec2()
         for k in range(sh.shape[1]):
             by_sh_out[g, k] = wp.vec3()
         if want_pose:
@@ -210,7 +238,8 @@ def project_backward_kernel(
     by_v = -m1[1]
     by_shear = -2.0 * a * m1[0]
     by_screen = wp.vec2(2.0 * a * m0[1], 2.0 * a * shear * m0[1] + 2.0 * v * m0[2])
-    by_screen_out[g] = by_screen
+    if want_screen:
+        by_screen_out[g] = by_screen
     by_opacity_logit_out[g] = by_log_opacity / (1.0 + wp.exp(logit))
 
     # a = var_yy / (2 det), shear = -var_xy / var_yy, v = 1 / (2 var_yy).

@@ -140,7 +140,12 @@ _BACKWARD = (
         by_far[i] = g[3];
     }
     int open_pixels = tile_width * tile_height;
-    for (int i = start; i < end && open_pixels > 0; ++i) {
+    for (int i = start; i < end; ++i) {
+        float* out = (float*)moments.data + 12 * (size_t)slots.data[i];
+        if (open_pixels == 0) {
+            for (int q = 0; q < 12; ++q) out[q] = 0.0f;
+            continue;
+        }
         const int id = gaussians.data[i];
         alignas(64) float sums[10][8] = {};
 """
@@ -182,7 +187,6 @@ _BACKWARD = (
                 open_in_half[2 * row + half] -= closed;
             }
         }
-        float* out = (float*)moments.data + 12 * (size_t)slots.data[i];
         for (int q = 0; q < 10; ++q) {
             float total = 0.0f;
             for (int k = 0; k < 8; ++k) total += sums[q][k];

@@ -7,6 +7,7 @@ nor per-warp control flow; Warp compiles it at run time like every other kernel.
 
 import warp as wp
 
+from egs_warp.kernels.render_backward import pixel_gradient
 from egs_warp.kernels.render_ellipse import TILE, TILE_PIXELS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -160,13 +161,8 @@ _BACKWARD = (
     const float2* falloffs = (const float2*)falloff.data;
     const float4* colours = (const float4*)colour_depth.data;
     float* out = (float*)moments.data;
-    float passing = 1.0f, rest = 0.0f;
-    float4 gradient = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
-    if (inside) {
-        const int pixel = (top + (int)py) * width + left + (int)px;
-        gradient = ((const float4*)sum_gradient.data)[pixel];
-        rest = remaining.data[pixel];
-    }
+    float passing = 1.0f, rest = remaining;
+    const float4 gradient = make_float4(sum_gradient[0], sum_gradient[1], sum_gradient[2], sum_gradient[3]);
     s_gradient[thread] = gradient;
     bool open = inside;
     // The loads of the next batch are under way while this one is blended.
@@ -183,7 +179,8 @@ _BACKWARD = (
         }
     };
     fetch(start + thread);
-    for (int base = start; base < end; base += 256) {
+    int base = start;
+    for (; base < end; base += 256) {
         if (__syncthreads_count(open) == 0) break;
         unsigned parts = 0;
         if (base + thread < end) {
@@ -310,6 +307,11 @@ _BACKWARD = (
             __syncthreads();
         }
     }
+    // Splats behind the last open pixel.
+    for (int i = base + thread; i < end; i += 256) {
+        float4* unseen = (float4*)moments.data + 3 * (size_t)slots.data[i];
+        unseen[0] = unseen[1] = unseen[2] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
+    }
 """
 )
 
@@ -349,11 +351,14 @@ def composite_backward_block(
     ellipse: wp.array[wp.vec4],
     falloff: wp.array[wp.vec2],
     colour_depth: wp.array[wp.vec4],
-    sum_gradient: wp.array[wp.vec4],
-    remaining: wp.array[wp.float32],
+    sum_gradient: wp.vec4,
+    remaining: wp.float32,
     moments: wp.array2d[wp.vec4],
 ):
-    """Gradient sums of one tile's splats by its block; the same walk and rounding as ``composite_block``."""
+    """Gradient sums of one tile's splats by its block; the same walk and rounding as ``composite_block``.
+
+    ``sum_gradient`` and ``remaining`` are those of the thread's own pixel.
+    """
     ...
 
 
@@ -407,19 +412,43 @@ def composite_backward_block_kernel(
     ellipse: wp.array[wp.vec4],
     falloff: wp.array[wp.vec2],
     colour_depth: wp.array[wp.vec4],
-    sum_gradient: wp.array[wp.vec4],
-    remaining: wp.array[wp.float32],
+    colour: wp.array2d[wp.vec3],
+    alpha: wp.array2d[wp.float32],
+    depth: wp.array2d[wp.float32],
+    colour_gradient: wp.array2d[wp.vec3],
+    alpha_gradient: wp.array2d[wp.float32],
+    depth_gradient: wp.array2d[wp.float32],
     # Out:
     moments_out: wp.array2d[wp.vec4],
 ):
     """A block of 256 threads does for one tile what ``composite_backward_tile_kernel`` does with one."""
     tile = wp.tid() / TILE_PIXELS
     columns = (width + TILE - 1) / TILE
+    left = (tile % columns) * TILE
+    top = (tile / columns) * TILE
+    # A warp has 8 x 4 pixels; two such parts stand side by side.
+    i = wp.tid() % TILE_PIXELS
+    part = i / 32
+    column = left + (part % 2) * 8 + i % 8
+    row = top + (part / 2) * 4 + (i % 32) / 8
+    by_sums = wp.vec4()
+    remaining = wp.float32(0.0)
+    if column < width and row < height:
+        by_sums, remaining = pixel_gradient(
+            row,
+            column,
+            colour,
+            alpha,
+            depth,
+            colour_gradient,
+            alpha_gradient,
+            depth_gradient,
+        )
     composite_backward_block(
         width,
         height,
-        (tile % columns) * TILE,
-        (tile / columns) * TILE,
+        left,
+        top,
         tile_start[tile],
         tile_start[tile + 1],
         gaussian_from_intersection,
@@ -427,7 +456,7 @@ def composite_backward_block_kernel(
         ellipse,
         falloff,
         colour_depth,
-        sum_gradient,
+        by_sums,
         remaining,
         moments_out,
     )

@@ -7,6 +7,10 @@ from egs_warp.kernels.render_ellipse import LOG_255, LOW_PASS, tile_columns, til
 wp.set_module_options({"enable_backward": False})
 
 
+NOT_FINITE = wp.constant(wp.int64(2**36))
+"""Stands for the number of tiles of a Gaussian with a value that is not finite; more than any image has."""
+
+
 @wp.struct
 class View:
     """One pinhole camera in single precision."""
@@ -118,7 +122,6 @@ def project_kernel(
     falloff_out: wp.array[wp.vec2],
     colour_depth_out: wp.array[wp.vec4],
     tile_count_out: wp.array[wp.int64],
-    first_bad_out: wp.array[wp.int64],
 ):
     """Screen ellipse, falloff and colour of every Gaussian; a Gaussian that cannot show reaches no tile.
 
@@ -132,18 +135,9 @@ def project_kernel(
     log_scale = log_scales[g]
     logit = opacity_logits[g]
     tile_count_out[g] = wp.int64(0)
-    if not wp.isfinite(mean):
-        wp.atomic_min(first_bad_out, 0, wp.int64(g))
-        return
-    if not wp.isfinite(q):
-        wp.atomic_min(first_bad_out, 1, wp.int64(g))
-        return
     # -inf is a legal logarithm of a flat Gaussian's scale, but the file readers never make one.
-    if not wp.isfinite(log_scale):
-        wp.atomic_min(first_bad_out, 2, wp.int64(g))
-        return
-    if not wp.isfinite(logit):
-        wp.atomic_min(first_bad_out, 3, wp.int64(g))
+    if not (wp.isfinite(mean) and wp.isfinite(q) and wp.isfinite(log_scale) and wp.isfinite(logit)):
+        tile_count_out[g] = NOT_FINITE
         return
     p = view.rotation * mean + view.translation
     if p[2] < view.near or p[2] > view.far:
@@ -185,7 +179,7 @@ def project_kernel(
         return
     colour = sh_sum(sh, g, sh.shape[1], wp.normalize(mean - view.centre))
     if not wp.isfinite(colour):
-        wp.atomic_min(first_bad_out, 4, wp.int64(g))
+        tile_count_out[g] = NOT_FINITE
         return
     tile_count_out[g] = wp.int64(tiles)
     ellipse_out[g] = ellipse

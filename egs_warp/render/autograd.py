@@ -30,8 +30,6 @@ class TorchImage:
     """(H, W) float32."""
     depth: torch.Tensor
     """(H, W) float32, expected z-depth divided by alpha."""
-    screen: torch.Tensor
-    """(n, 2) float32 zeros whose ``grad`` receives the gradient by the screen positions, in pixels; (0, 2) without grad."""
     slot_end: torch.Tensor
     """(n,) int64: number of tiles reached by the Gaussians up to and including this one."""
 
@@ -50,6 +48,7 @@ def render_torch(
     *,
     rotation: torch.Tensor | None = None,
     translation: torch.Tensor | None = None,
+    screen: torch.Tensor | None = None,
     background: Any = (1.0, 1.0, 1.0),
     antialiased: bool = False,
     threads: int | None = None,
@@ -57,8 +56,10 @@ def render_torch(
     """Picture of Gaussians given as float32 tensors (n, 3), (n, 4), (n, 3), (n,), (n, K, 3), all on one device.
 
     Gradients flow to all five, and to the camera's pose where ``rotation`` (3, 3) and ``translation`` (3,) are given
-    (they then replace the camera's; the gradient by ``rotation`` is by its nine entries, taken as free). On CUDA the
-    work is queued on torch's current stream. Raises ``UserError`` as ``egs_warp.render.render`` does.
+    (they then replace the camera's; the gradient by ``rotation`` is by its nine entries, taken as free). ``screen``
+    (n, 2), any values, receives the gradient by the screen positions in pixels, which densification by splitting
+    watches. On CUDA the work is queued on torch's current stream. Raises ``UserError`` as ``egs_warp.render.render``
+    does.
     """
     tensors = {
         "means": (means, (len(means), 3)),
@@ -75,13 +76,11 @@ def render_torch(
             )
     if (rotation is None) != (translation is None):
         raise UserError("render: give the pose's rotation and translation together, or neither")
-    wanted = any(tensor.requires_grad for tensor, _ in tensors.values()) and torch.is_grad_enabled()
-    screen = torch.zeros((len(means) if wanted else 0, 2), device=means.device, requires_grad=wanted)
     options = _Options(camera, background, antialiased, threads or available_threads())
     colour, alpha, depth, slot_end = _Render.apply(
         *(means, rotations, log_scales, opacity_logits, sh, rotation, translation, screen, options)
     )
-    return TorchImage(colour, alpha, depth, screen, slot_end)
+    return TorchImage(colour, alpha, depth, slot_end)
 
 
 @dataclass(frozen=True)
@@ -162,12 +161,14 @@ class _Render(torch.autograd.Function):
                     depth_gradient=by_depth,
                     antialiased=ctx.options.antialiased,
                     want_pose=ctx.want_pose,
+                    want_screen=ctx.needs_input_grad[7],
                     threads=ctx.options.threads,
                 )
             names = ("means", "rotations", "log_scales", "opacity_logits", "sh", "pose_rotation", "pose_translation")
-            tensors: list[torch.Tensor | None] = [wp.to_torch(getattr(gradients, name)) for name in (*names, "screen")]
+            arrays = [getattr(gradients, name) for name in (*names, "screen")]
+            tensors = [None if array is None else wp.to_torch(array) for array in arrays]
             # The pose's gradient is the sum of every Gaussian's part.
             for index in (5, 6):
                 part = tensors[index]
-                tensors[index] = part.sum(dim=0) if ctx.want_pose and part is not None else None
+                tensors[index] = None if part is None else part.sum(dim=0)
             return (*tensors, None)

@@ -10,7 +10,7 @@ import warp as wp
 
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.kernels.render_compositing import composite_geometry_kernel, splat_normals_kernel
-from egs_warp.launching import launch_rows
+from egs_warp.launching import launch_again, launch_rows
 from egs_warp.render.arrays import empty
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.tiles import TileLists
@@ -71,14 +71,7 @@ def composite(
         # Imported here because this module holds CUDA code that a CPU cannot compile.
         from egs_warp.kernels.render_cuda import composite_block_kernel
 
-        wp.launch(
-            composite_block_kernel,
-            dim=lists.tile_count * 256,
-            inputs=inputs,
-            outputs=outputs,
-            device=device,
-            block_dim=256,
-        )
+        launch_again(composite_block_kernel, lists.tile_count * 256, inputs=inputs, outputs=outputs, device=device)
     else:
         # Likewise: a GPU's compiler would refuse this one.
         from egs_warp.kernels.render_cpu import composite_tile_kernel

@@ -12,7 +12,7 @@ import warp as wp
 from egs_warp.camera import Camera
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
-from egs_warp.kernels.render_projection import View, project_kernel
+from egs_warp.kernels.render_projection import NOT_FINITE, View, project_kernel
 from egs_warp.launching import launch_rows
 from egs_warp.render.arrays import empty
 
@@ -73,25 +73,31 @@ def project(cloud: GaussianCloud, view: Any, *, antialiased: bool, threads: int)
     falloff = empty(count, wp.vec2, device)
     colour_depth = empty(count, wp.vec4, device)
     tile_count = empty(count, wp.int64, device)
-    # The first non-finite Gaussian by attribute, then the number of slots: one read-back for all.
-    findings = wp.full(len(_ATTRIBUTES) + 1, count, dtype=wp.int64, device=device)
     launch_rows(
         project_kernel,
         count,
         inputs=[view, int(antialiased), *(getattr(cloud, name) for name in _ATTRIBUTES)],
-        outputs=[ellipse, falloff, colour_depth, tile_count, findings],
+        outputs=[ellipse, falloff, colour_depth, tile_count],
         device=device,
         threads=threads,
     )
     wp.utils.array_scan(tile_count, tile_count, inclusive=True)
-    wp.copy(findings, tile_count, dest_offset=len(_ATTRIBUTES), src_offset=count - 1, count=1)
-    *first_bad, slot_count = (int(value) for value in findings.numpy())
-    for attribute, first in zip(_ATTRIBUTES, first_bad, strict=True):
-        if first < count:
-            raise UserError(f"render: {attribute} of Gaussian {first} is not finite; repair or remove it")
-    if slot_count >= 2**30:
-        raise UserError(
-            f"render: {count} Gaussians cover {slot_count} tiles of {view.width} x {view.height} pixels, more than 2^30;"
-            " render a smaller image or fewer Gaussians"
-        )
+    last: Any = tile_count[count - 1 :]
+    slot_count = int(last.numpy()[0])
+    if not 0 <= slot_count < 2**30:
+        raise _too_many(cloud, view, tile_count.numpy())
     return ProjectedGaussians(ellipse, falloff, colour_depth, tile_count, slot_count)
+
+
+def _too_many(cloud: GaussianCloud, view: Any, slot_end: np.ndarray) -> UserError:
+    """Why there are so many tiles: a Gaussian that is not finite, or Gaussians that are too large."""
+    bad = np.flatnonzero(np.diff(slot_end, prepend=0) >= int(NOT_FINITE))
+    if len(bad) == 0:
+        return UserError(
+            f"render: {cloud.count} Gaussians cover {slot_end[-1]} tiles of {view.width} x {view.height} pixels, more"
+            " than 2^30; render a smaller image or fewer Gaussians"
+        )
+    finite = {name: bool(np.isfinite(getattr(cloud, name).numpy()[bad[0]]).all()) for name in _ATTRIBUTES}
+    # Finite coefficients may still sum to a colour that is not.
+    attribute = next((name for name, is_finite in finite.items() if not is_finite), "sh")
+    return UserError(f"render: {attribute} of Gaussian {bad[0]} is not finite; repair or remove it")

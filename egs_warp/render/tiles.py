@@ -15,7 +15,7 @@ from egs_warp.kernels.render_tiles import (
     fill_tiles_kernel,
     tile_starts_kernel,
 )
-from egs_warp.launching import launch_rows
+from egs_warp.launching import launch_again, launch_rows
 from egs_warp.render.arrays import empty, zeros
 from egs_warp.render.projection import ProjectedGaussians
 
@@ -100,9 +100,9 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int) -> T
     gaussian_from_slot = empty(pairs, wp.int32, device)
     nearest, farthest = (int(np.float32(z).view(np.int32)) for z in (view.near, view.far))
     depth_bits = max((farthest - nearest).bit_length(), 1)
-    wp.launch(
+    launch_again(
         emit_tiles_kernel,
-        dim=count,
+        count,
         inputs=[
             view.width,
             view.height,
@@ -120,9 +120,9 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int) -> T
         # The sort takes scratch memory inside Warp, which does not report a failure: see first whether there is any.
         empty((pairs, 3), wp.int32, device)
     wp.utils.radix_sort_pairs(keys, slots, pairs, end_bit=depth_bits + max(tiles - 1, 1).bit_length())
-    wp.launch(
+    launch_again(
         tile_starts_kernel,
-        dim=pairs + 1,
+        pairs + 1,
         inputs=[pairs, depth_bits, keys, gaussian_from_slot, slots],
         outputs=[tile_start, gaussians],
         device=device,
