@@ -176,6 +176,7 @@ def animate(
     options = options or AnimateOptions()
     flags = {"distance": options.distance, "height": options.height, "heading_degrees": options.heading_degrees}
     requests = parse_script(motion, defaults=flags)
+    cut_off = longest(requests)
     folder = writable_folder(out)
     with tqdm(total=1, desc="prepare", unit="capture", disable=quiet) as bar:
         creature = make_creature(
@@ -184,7 +185,7 @@ def animate(
         bar.update()
     place = first_place(creature)
     sequence = MotionSequence(place, parts_of(requests, creature.body.height))
-    frames = options.frames or longest(requests)
+    frames = options.frames or cut_off
     with tqdm(total=frames, desc="simulate", unit="frame", disable=quiet) as bar:
         simulation = simulate(
             creature.stepper,

@@ -6,15 +6,19 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from egs_warp.follow import Follow
 from egs_warp.hop import Squares
+from egs_warp.keyframes import read_keyframes
 from egs_warp.leap import Leap
 from egs_warp.motions import JumpTarget
 from egs_warp.script import MotionRequest
 from egs_warp.sequence import BodyMotion, Part, Place
 from egs_warp.twist import Twist
 
-FRAMES: Mapping[str, int] = {"jump": 120, "hop": 100, "twist": 110, "walk": 120, "trajectory": 60}
+FRAMES: Mapping[str, int] = {"jump": 120, "hop": 150, "twist": 120, "walk": 120}
 """Frames at 60 Hz within which a motion of each kind comes to rest; one that takes longer is cut off."""
+TRAJECTORY_TAIL = 30
+"""Frames shown after the last key of a trajectory."""
 
 
 def _jump(asked: Mapping[str, float], place: Place) -> BodyMotion:
@@ -39,6 +43,10 @@ def parts_of(requests: Sequence[MotionRequest], height: float) -> list[Part]:
         if request.name == "hop":
             row = Squares(asked["distance"] * height, asked["height"] * height, request.repeat, asked)
             parts += row.parts()
+        elif request.file is not None:
+            keys = read_keyframes(request.file)
+            asked = {"keys": float(len(keys)), "duration": max(key.time for key in keys)}
+            parts += [Part(request.name, asked, lambda place, keys=keys: Follow(place, keys))] * request.repeat
         else:
             begin = _BEGIN[request.name]
             for _ in range(request.repeat):
@@ -48,4 +56,11 @@ def parts_of(requests: Sequence[MotionRequest], height: float) -> list[Part]:
 
 def longest(requests: Sequence[MotionRequest]) -> int:
     """Frames after which a script is cut off."""
-    return sum(FRAMES[request.name] * request.repeat for request in requests)
+    total = 0
+    for request in requests:
+        if request.file is not None:
+            seconds = max(key.time for key in read_keyframes(request.file))
+            total += request.repeat * (int(np.ceil(60.0 * seconds)) + TRAJECTORY_TAIL)
+        else:
+            total += request.repeat * FRAMES[request.name]
+    return total

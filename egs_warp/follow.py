@@ -1,0 +1,160 @@
+"""Follow a user's own key frames as nearly as the muscles and the ground allow (DESIGN 9)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import Enum
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from egs_warp.body import BodyState
+from egs_warp.keyframes import Channel, Key, Quantity, channels
+from egs_warp.locomotion import StepReport
+from egs_warp.objectives import (
+    BodyPart,
+    Coordinates,
+    Objective,
+    SpinObjective,
+    centre_of_mass_velocity,
+    node_velocities,
+    part_angular_momentum,
+    part_turning,
+    part_velocity,
+)
+from egs_warp.sequence import Place
+from egs_warp.stance import PoseFamily, Weights
+
+MISSED = 0.1
+"""Of the largest value of its channel: a key missed by more is noted."""
+
+
+class FollowPhase(Enum):
+    """Phases of a trajectory."""
+
+    FOLLOW = "follow"
+    REST = "rest"
+
+
+class Follow:
+    """The keys' own objectives, and beside them a standing body: balance, no spin, its shape, each unless a key rules it."""
+
+    def __init__(self, place: Place, keys: Sequence[Key], *, weights: Weights | None = None) -> None:
+        self.body, self.ground, self.weights = place.body, place.ground, weights or Weights()
+        self.keys, self.channels = tuple(keys), channels(keys)
+        heights = place.ground.local(place.standing)[:, 2]
+        self.parts = {
+            "body": BodyPart.whole(self.body),
+            "base": BodyPart.base(self.body, heights),
+            "head": BodyPart.head(self.body, heights),
+        }
+        self.pose = PoseFamily(self.body, place.ground, place.standing, place.touching)
+        self.phase = FollowPhase.FOLLOW
+        self._standing = place.standing
+        self._gravity = float(np.linalg.norm(self.body.gravity))
+        self._rate = 6.0 * float(np.sqrt(self._gravity / self.body.height))
+        self._began: float | None = None
+        self._end = max(key.time for key in self.keys)
+        self._reached: dict[int, np.ndarray] = {}
+        self._ruled = {(channel.part, channel.quantity) for channel in self.channels}
+
+    def planned(self) -> dict[str, float]:
+        """How many keys there are, how long they take (seconds), and the worst miss so far, in the unit of its quantity."""
+        misses = [float(np.linalg.norm(self.miss(index))) for index in self._reached]
+        return {"keys": float(len(self.keys)), "duration": self._end, "worst_miss": max(misses, default=0.0)}
+
+    def miss(self, index: int) -> np.ndarray:
+        """(3,) value at the time of key ``index`` minus the key's, in its unit."""
+        return self._reached[index] - np.array(self.keys[index].value)
+
+    def notes(self) -> list[str]:
+        """Which keys were missed."""
+        notes = []
+        for index, key in enumerate(self.keys):
+            group = [np.linalg.norm(k.value) for k in self.keys if (k.part, k.quantity) == (key.part, key.quantity)]
+            name = f"{key.where}: {key.part} {key.quantity.value} at {key.time:g} s"
+            if index not in self._reached:
+                notes.append(f"{name} was not reached in time")
+            elif np.linalg.norm(self.miss(index)) > MISSED * max(group):
+                told = ", ".join(f"{value:.3g}" for value in self._reached[index])
+                notes.append(f"{name}: reached ({told})")
+        return notes
+
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
+        """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
+        if self._began is None:
+            self._began = state.time
+        elapsed = state.time - self._began
+        for index, key in enumerate(self.keys):
+            if index not in self._reached and elapsed >= key.time - 0.5 * dt:
+                self._reached[index] = self._measured(key.part, key.quantity, state)
+        if elapsed > self._end:
+            self.phase = FollowPhase.REST
+        return [
+            *self._standing_objectives(state, report, dt),
+            *(self._keyed(channel, state, elapsed, dt) for channel in self.channels),
+        ]
+
+    def _standing_objectives(self, state, report, dt: float) -> list[Objective | SpinObjective]:
+        seen = self.pose.measure(state, report)
+        balance = np.array([*(seen.base - self.pose.base_offset), self.pose.standing_height])
+        rules: list[Objective | SpinObjective] = []
+        velocity = self._rate / 3.0 * (balance - seen.com)
+        acceleration = (velocity - seen.velocity) / dt
+        level = self.pose.balanced_acceleration(seen, acceleration[:2], float(acceleration[2]), self._gravity)
+        velocity[:2] = seen.velocity[:2] + dt * level
+        if not {("body", Quantity.POSITION), ("body", Quantity.VELOCITY)} & self._ruled:
+            rules.append(centre_of_mass_velocity(self.body, self.ground.axes.T @ velocity, self.weights.com))
+        if not {("body", Quantity.ORIENTATION), ("body", Quantity.ANGULAR_MOMENTUM)} & self._ruled:
+            pose = self.pose.over_base(seen.com, seen.base, seen.heading)
+            spin = self.body.inertia(state.positions) @ (self.pose.turn_towards(state, pose) * 0.7 * self._rate)
+            rules.append(SpinObjective(spin, self.weights.spin))
+        # The shape at rest goes along with the centre of mass.
+        arms = self._standing - self.body.centre_of_mass(self._standing)
+        now = state.positions - self.body.centre_of_mass(state.positions)
+        drift = self.body.centre_of_mass(state.velocities)
+        rules.append(node_velocities(self.body, drift + self._rate * (arms - now), self.weights.pose))
+        return rules
+
+    def _keyed(self, channel: Channel, state: BodyState, elapsed: float, dt: float) -> Objective | SpinObjective:
+        part, body, whole = self.parts[channel.part], self.body, channel.part == "body"
+        axes = Coordinates(self.ground.axes, False)
+        value, rate = channel.at(elapsed + dt)
+        now = self._measured(channel.part, channel.quantity, state)
+        weight = channel.weight * (self.weights.com if channel.quantity in _LINEAR else self.weights.spin)
+        if channel.quantity is Quantity.POSITION:
+            target = body.height * (rate + self._rate * (value - now - dt * rate))
+            return part_velocity(body, part, target, weight, axes)
+        if channel.quantity is Quantity.VELOCITY:
+            return part_velocity(body, part, body.height * value, weight, axes)
+        if channel.quantity is Quantity.ORIENTATION:
+            wanted = Rotation.from_rotvec(value, degrees=True)
+            ahead = Rotation.from_rotvec(value + dt * rate, degrees=True)
+            error = (wanted * Rotation.from_rotvec(now, degrees=True).inv()).as_rotvec()
+            turning = (ahead * wanted.inv()).as_rotvec() / dt + self._rate * error
+            if whole:
+                return SpinObjective(body.inertia(state.positions) @ (self.ground.axes.T @ turning), weight)
+            return part_turning(body, part, state, turning, weight, axes)
+        momentum = body.mass * body.height**2 * value
+        if whole:
+            return SpinObjective(self.ground.axes.T @ momentum, weight)
+        return part_angular_momentum(body, part, state, momentum, weight, axes)
+
+    def _measured(self, name: str, quantity: Quantity, state: BodyState) -> np.ndarray:
+        """(3,) in the unit of the quantity, axes of the ground."""
+        part, axes, height = self.parts[name], self.ground.axes, self.body.height
+        if quantity is Quantity.POSITION:
+            return axes @ (part.centre(state.positions) - part.centre(self._standing)) / height
+        if quantity is Quantity.VELOCITY:
+            return axes @ part.centre(state.velocities) / height
+        if quantity is Quantity.ORIENTATION:
+            before, after = (x[part.nodes] - part.centre(x) for x in (self._standing, state.positions))
+            u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", part.masses, after, before))
+            turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+            return axes @ Rotation.from_matrix(turn).as_rotvec(degrees=True)
+        arms = state.positions[part.nodes] - part.centre(state.positions)
+        spin = (part.masses[:, None] * np.cross(arms, state.velocities[part.nodes])).sum(axis=0)
+        return axes @ spin / (self.body.mass * height**2)
+
+
+_LINEAR = (Quantity.POSITION, Quantity.VELOCITY)

@@ -1,0 +1,204 @@
+"""Key frames of a user's own trajectory, from JSON or CSV: what a part of the body shall do, and when (DESIGN 9).
+
+JSON: a list of keys, ``[{"time": 0.5, "part": "head", "quantity": "position", "value": [0.1, 0, 0]}]``; CSV: a header
+``time,part,quantity,x,y,z`` and a key a row. Both may give a ``weight``.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from egs_warp.errors import UserError
+
+
+class Quantity(Enum):
+    """What a key gives; components are forward, left and up as the body stands at the start."""
+
+    POSITION = "position"
+    """Displacement from the start, body heights."""
+    VELOCITY = "velocity"
+    """Body heights a second."""
+    ORIENTATION = "orientation"
+    """Turn from the start as a rotation vector, degrees."""
+    ANGULAR_MOMENTUM = "angular_momentum"
+    """About the part's centre, body mass x height squared a second."""
+
+
+PARTS = ("body", "base", "head")
+"""Parts that a key may name: the whole body (of which the position is that of the centre of mass), what stands on the ground, the top."""
+LONGEST_TIME = 60.0
+"""Seconds."""
+LARGEST: Mapping[Quantity, float] = {
+    Quantity.POSITION: 10.0,
+    Quantity.VELOCITY: 20.0,
+    Quantity.ORIENTATION: 720.0,
+    Quantity.ANGULAR_MOMENTUM: 10.0,
+}
+"""Length of a value beyond which it is refused as a slip of the pen."""
+_FIELDS = ("time", "part", "quantity", "value", "weight")
+
+
+@dataclass(frozen=True)
+class Key:
+    """One key frame."""
+
+    time: float
+    """Seconds from the start of the motion."""
+    part: str
+    quantity: Quantity
+    value: tuple[float, float, float]
+    weight: float = 1.0
+    """Relative to the motion's own."""
+    where: str = ""
+    """File and place in it, for messages."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """All keys of one part and quantity, joined by a monotone cubic; at rest at time 0 and after the last key."""
+
+    part: str
+    quantity: Quantity
+    times: np.ndarray
+    """(k+1,) seconds, from 0."""
+    values: np.ndarray
+    """(k+1, 3)."""
+    weight: float
+
+    def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Value (3,) and its rate (3,) per second."""
+        inside = min(time, float(self.times[-1]))
+        curve = PchipInterpolator(self.times, self.values, axis=0)
+        return curve(inside), curve(inside, 1) * (time < self.times[-1])
+
+
+def read_keyframes(path: Path) -> tuple[Key, ...]:
+    """Keys of a ``.json`` or ``.csv`` file; raises ``UserError`` for the first malformed one, with its place."""
+    path = Path(path)
+    if path.suffix.lower() not in (".json", ".csv"):
+        raise UserError(f"{path}: key frames are read from .json or .csv")
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise UserError(f"{path}: not UTF-8 text") from None
+    keys = _from_json(text, path) if path.suffix.lower() == ".json" else _from_csv(text, path)
+    if not keys:
+        raise UserError(f"{path}: no key frames; give at least one")
+    channels(keys)
+    return tuple(keys)
+
+
+def channels(keys: Sequence[Key]) -> tuple[Channel, ...]:
+    """Keys by part and quantity; raises ``UserError`` if two of a channel have the same time, or times go back."""
+    found: dict[tuple[str, Quantity], list[Key]] = {}
+    for key in keys:
+        group = found.setdefault((key.part, key.quantity), [])
+        if group and key.time <= group[-1].time:
+            raise UserError(
+                f"{key.where}: time {key.time:g} is not after {group[-1].time:g}, the key before of "
+                f"{key.part} {key.quantity.value}; give keys in the order of their times"
+            )
+        group.append(key)
+    return tuple(
+        Channel(
+            part,
+            quantity,
+            np.array([0.0, *(key.time for key in group)]),
+            np.array([(0.0, 0.0, 0.0), *(key.value for key in group)]),
+            float(np.mean([key.weight for key in group])),
+        )
+        for (part, quantity), group in found.items()
+    )
+
+
+def _from_json(text: str, path: Path) -> list[Key]:
+    try:
+        entries = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise UserError(f"{path}: not JSON ({error})") from None
+    if not isinstance(entries, list):
+        raise UserError(f"{path}: give a list of keys, each an object with {', '.join(_FIELDS[:4])}")
+    keys = []
+    for number, entry in enumerate(entries, start=1):
+        where = f"{path}, key {number}"
+        if not isinstance(entry, dict):
+            raise UserError(f"{where}: {entry!r} is not an object with {', '.join(_FIELDS[:4])}")
+        keys.append(_key(entry, where))
+    return keys
+
+
+def _from_csv(text: str, path: Path) -> list[Key]:
+    rows = [row for row in csv.reader(text.splitlines())]
+    if not rows:
+        return []
+    header = [name.strip().lower() for name in rows[0]]
+    needed = ["time", "part", "quantity", "x", "y", "z"]
+    if sorted(set(header) - {"weight"}) != sorted(needed) or len(set(header)) != len(header):
+        raise UserError(f"{path}, line 1: the columns are {','.join(header)}; give {','.join(needed)} and maybe weight")
+    keys = []
+    for line, row in enumerate(rows[1:], start=2):
+        where = f"{path}, line {line}"
+        if not any(cell.strip() for cell in row):
+            continue
+        if len(row) != len(header):
+            raise UserError(f"{where}: {len(row)} values for {len(header)} columns")
+        cells = dict(zip(header, (cell.strip() for cell in row), strict=True))
+        entry: dict[str, Any] = {"part": cells["part"], "quantity": cells["quantity"]}
+        entry["time"] = _parsed(cells["time"])
+        entry["value"] = [_parsed(cells[axis]) for axis in "xyz"]
+        if cells.get("weight"):
+            entry["weight"] = _parsed(cells["weight"])
+        keys.append(_key(entry, where))
+    return keys
+
+
+def _parsed(cell: str) -> float | str:
+    try:
+        return float(cell)
+    except ValueError:
+        return cell
+
+
+def _key(entry: Mapping[str, Any], where: str) -> Key:
+    for name in _FIELDS[:4]:
+        if name not in entry:
+            raise UserError(f'{where}: "{name}" is missing; a key has {", ".join(_FIELDS[:4])}')
+    for name in entry:
+        if name not in _FIELDS:
+            raise UserError(f'{where}: "{name}" is unknown; a key has {", ".join(_FIELDS)}')
+    part, quantity, value = entry["part"], entry["quantity"], entry["value"]
+    if part not in PARTS:
+        raise UserError(f"{where}: part {part!r} is unknown; give one of {', '.join(PARTS)}")
+    names = [member.value for member in Quantity]
+    if quantity not in names:
+        raise UserError(f"{where}: quantity {quantity!r} is unknown; give one of {', '.join(names)}")
+    time = _number(entry["time"])
+    if not 0.0 < time <= LONGEST_TIME:
+        raise UserError(f"{where}: time {entry['time']!r}: give seconds above 0, at most {LONGEST_TIME:g}")
+    if not isinstance(value, list) or len(value) != 3 or not all(math.isfinite(_number(item)) for item in value):
+        raise UserError(f"{where}: value {value!r}: give three numbers: forward, left, up")
+    largest = LARGEST[Quantity(quantity)]
+    length = math.hypot(*value)
+    if length > largest:
+        raise UserError(f"{where}: value {value!r} has the length {length:g}; at most {largest:g} is done")
+    weight = _number(entry.get("weight", 1.0))
+    if not 0.0 < weight <= 1000.0:
+        raise UserError(f"{where}: weight {entry['weight']!r}: give a number above 0, at most 1000")
+    return Key(time, part, Quantity(quantity), (float(value[0]), float(value[1]), float(value[2])), weight, where)
+
+
+def _number(value: Any) -> float:
+    """The number, or nan for anything else."""
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
