@@ -281,11 +281,18 @@ def test_impossible_cameras_and_backgrounds_are_refused() -> None:
         render(cloud, camera_of(), background=np.ones((3, 3)))
 
 
-def test_sorted_lists_equal_counted_ones() -> None:
-    """A GPU sorts pairs and a CPU counts them: tile by tile the same Gaussians in the same order, equal depths by index."""
+@pytest.mark.parametrize("spread", [1.0, 1e-5])
+def test_sorted_lists_equal_counted_ones(spread: float) -> None:
+    """A GPU sorts pairs and a CPU counts them: tile by tile the same Gaussians in the same order, equal depths by index.
+
+    With a spread of 1e-5 hundreds of Gaussians of each tile share the leading bits of depth that are sorted by.
+    """
     values = random_scene(3000, coefficients=1, seed=12)
-    values["means"][::3, 2] = 0.25
-    cloud, view = cloud_of(values), view_from_camera(camera_of(200, 150))
+    camera = camera_of(200, 150)
+    local = values["means"] * [1.0, 1.0, spread] + [0.0, 0.0, 3.0]
+    local[::3, 2] = 3.0
+    values["means"] = (local - camera.translation) @ camera.rotation
+    cloud, view = cloud_of(values), view_from_camera(camera)
     projected = project(cloud, view, antialiased=False, threads=1)
     tiles = 13 * 10
     counted = [_lists_by_counting(projected, view, tiles, threads) for threads in (1, 2, 3)]
@@ -296,3 +303,6 @@ def test_sorted_lists_equal_counted_ones() -> None:
         assert np.array_equal(lists[0].tile_start.numpy(), other.tile_start.numpy())
         for name in ("gaussian_from_intersection", "slot_from_intersection"):
             assert np.array_equal(getattr(lists[0], name).numpy()[:pairs], getattr(other, name).numpy()[:pairs])
+    depth = projected.colour_depth.numpy()[lists[0].gaussian_from_intersection.numpy()[:pairs], 3]
+    inner = np.setdiff1d(np.arange(1, pairs), lists[0].tile_start.numpy())
+    assert (depth[inner] >= depth[inner - 1]).all()

@@ -82,17 +82,18 @@ def emit_tiles_kernel(
     width: wp.int32,
     height: wp.int32,
     nearest_bits: wp.int32,
-    depth_bits: wp.int64,
+    dropped_bits: wp.int32,
+    kept_bits: wp.int32,
     slot_end: wp.array[wp.int64],
     ellipse: wp.array[wp.vec4],
     falloff: wp.array[wp.vec2],
     colour_depth: wp.array[wp.vec4],
     # Out:
-    key_out: wp.array[wp.int64],
+    key_out: wp.array[wp.uint32],
     gaussian_from_slot_out: wp.array[wp.int32],
     slot_out: wp.array[wp.int32],
 ):
-    """Sort key (tile, then depth) and Gaussian of every slot."""
+    """Sort key (tile, then the leading bits of the depth) and Gaussian of every slot."""
     g = wp.tid()
     slot = wp.int32(0)
     if g > 0:
@@ -103,37 +104,58 @@ def emit_tiles_kernel(
     e = ellipse[g]
     f = falloff[g]
     # Positive floats order as their bits do; counted from those of the near plane they need fewer.
-    depth_key = wp.int64(wp.cast(colour_depth[g][3], wp.int32) - nearest_bits)
+    depth_key = wp.uint32((wp.cast(colour_depth[g][3], wp.int32) - nearest_bits) >> dropped_bits)
     rows = tile_rows(e, f, height)
     for row in range(rows[0], rows[1] + 1):
         span = tile_columns(e, f, row, width, height)
         for column in range(span[0], span[1] + 1):
-            key_out[slot] = (wp.int64(row * columns + column) << depth_bits) | depth_key
+            key_out[slot] = (wp.uint32(row * columns + column) << wp.uint32(kept_bits)) | depth_key
             gaussian_from_slot_out[slot] = g
             slot_out[slot] = slot
             slot += 1
 
 
 @wp.kernel
-def tile_starts_kernel(
+def finish_lists_kernel(
     # In:
     intersection_count: wp.int32,
-    depth_bits: wp.int64,
-    key: wp.array[wp.int64],
+    kept_bits: wp.int32,
+    key: wp.array[wp.uint32],
+    sorted_slot: wp.array[wp.int32],
     gaussian_from_slot: wp.array[wp.int32],
-    slot_from_intersection: wp.array[wp.int32],
+    colour_depth: wp.array[wp.vec4],
     # Out:
     tile_start_out: wp.array[wp.int32],
     gaussian_from_intersection_out: wp.array[wp.int32],
+    slot_from_intersection_out: wp.array[wp.int32],
 ):
-    """Start of each tile's run in the sorted intersections: thread i fills the tiles after tile i-1 up to tile i."""
+    """Start of each tile's run in the sorted pairs, and the exact order of the few whose leading depth bits are equal.
+
+    Thread i fills the starts of the tiles after that of pair i-1 up to that of pair i.
+    """
     i = wp.tid()
     before = wp.int32(-1)
     if i > 0:
-        before = wp.int32(key[i - 1] >> depth_bits)
+        before = wp.int32(key[i - 1] >> wp.uint32(kept_bits))
     here = tile_start_out.shape[0] - 1
     if i < intersection_count:
-        here = wp.int32(key[i] >> depth_bits)
-        gaussian_from_intersection_out[i] = gaussian_from_slot[slot_from_intersection[i]]
+        own = key[i]
+        here = wp.int32(own >> wp.uint32(kept_bits))
+        slot = sorted_slot[i]
+        g = gaussian_from_slot[slot]
+        # Pairs of equal keys stand in the order of their slots, which is that of equal depths.
+        place = i
+        j = i - 1
+        while j >= 0 and key[j] == own:
+            if colour_depth[gaussian_from_slot[sorted_slot[j]]][3] > colour_depth[g][3]:
+                place -= 1
+            j -= 1
+        j = i + 1
+        while j < intersection_count and key[j] == own:
+            if colour_depth[gaussian_from_slot[sorted_slot[j]]][3] < colour_depth[g][3]:
+                place += 1
+            j += 1
+        gaussian_from_intersection_out[place] = g
+        slot_from_intersection_out[place] = slot
     for tile in range(before + 1, here + 1):
         tile_start_out[tile] = i

@@ -13,7 +13,7 @@ from egs_warp.kernels.render_tiles import (
     count_tiles_kernel,
     emit_tiles_kernel,
     fill_tiles_kernel,
-    tile_starts_kernel,
+    finish_lists_kernel,
 )
 from egs_warp.launching import launch_again, launch_rows
 from egs_warp.render.arrays import empty, zeros
@@ -21,6 +21,7 @@ from egs_warp.render.projection import ProjectedGaussians
 
 TILE_SIDE = int(TILE)
 _LARGE_SORT = 10_000_000
+_KEY_BITS = 32
 _CHUNKS_PER_THREAD = 8
 """Near Gaussians reach more tiles than far ones, so the chunks differ in cost."""
 
@@ -88,43 +89,40 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, thr
 
 
 def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int) -> TileLists:
-    """Radix sort of all (tile, Gaussian) pairs by tile and depth."""
+    """Radix sort of all (tile, Gaussian) pairs by tile and the leading bits of depth; 32 bits sort twice as fast as 64."""
     device = projected.ellipse.device
     count, pairs = projected.slot_end.shape[0], projected.slot_count
     gaussians = empty(max(pairs, 1), wp.int32, device)
-    slots = empty(2 * max(pairs, 1), wp.int32, device)
+    slots = empty(max(pairs, 1), wp.int32, device)
     if pairs == 0:
         return TileLists(zeros(tiles + 1, wp.int32, device), gaussians, slots, None)
     tile_start = empty(tiles + 1, wp.int32, device)
-    keys = empty(2 * pairs, wp.int64, device)
+    keys = empty(2 * pairs, wp.uint32, device)
+    sorted_slots = empty(2 * pairs, wp.int32, device)
     gaussian_from_slot = empty(pairs, wp.int32, device)
     nearest, farthest = (int(np.float32(z).view(np.int32)) for z in (view.near, view.far))
     depth_bits = max((farthest - nearest).bit_length(), 1)
+    tile_bits = max(tiles - 1, 1).bit_length()
+    kept_bits = min(depth_bits, _KEY_BITS - tile_bits)
     launch_again(
         emit_tiles_kernel,
         count,
         inputs=[
-            view.width,
-            view.height,
-            nearest,
-            depth_bits,
-            projected.slot_end,
-            projected.ellipse,
-            projected.falloff,
-            projected.colour_depth,
+            *(view.width, view.height, nearest, depth_bits - kept_bits, kept_bits),
+            *(projected.slot_end, projected.ellipse, projected.falloff, projected.colour_depth),
         ],
-        outputs=[keys, gaussian_from_slot, slots],
+        outputs=[keys, gaussian_from_slot, sorted_slots],
         device=device,
     )
     if pairs > _LARGE_SORT:
         # The sort takes scratch memory inside Warp, which does not report a failure: see first whether there is any.
-        empty((pairs, 3), wp.int32, device)
-    wp.utils.radix_sort_pairs(keys, slots, pairs, end_bit=depth_bits + max(tiles - 1, 1).bit_length())
+        empty((pairs, 2), wp.int32, device)
+    wp.utils.radix_sort_pairs(keys, sorted_slots, pairs, end_bit=kept_bits + tile_bits)
     launch_again(
-        tile_starts_kernel,
+        finish_lists_kernel,
         pairs + 1,
-        inputs=[pairs, depth_bits, keys, gaussian_from_slot, slots],
-        outputs=[tile_start, gaussians],
+        inputs=[pairs, kept_bits, keys, sorted_slots, gaussian_from_slot, projected.colour_depth],
+        outputs=[tile_start, gaussians, slots],
         device=device,
     )
     return TileLists(tile_start, gaussians, slots, None)
