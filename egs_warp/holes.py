@@ -1,0 +1,148 @@
+"""Where the floor is missing: under the object's foot, where no view sees it, or where the user says."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from egs_warp.camera import Camera
+from egs_warp.errors import UserError
+from egs_warp.gaussians import GaussianCloud
+from egs_warp.plane import Plane
+from egs_warp.rectified import PlaneWindow, rectify
+
+_TEXELS = 256
+"""Across the window in which a hole is drawn."""
+_CONTACT = 0.05
+"""Of the object's height: what of it lies lower hides the floor from every side."""
+
+
+@dataclass(frozen=True)
+class Hole:
+    """A region of a plane, drawn on a window of it."""
+
+    window: PlaneWindow
+    mask: np.ndarray
+    """(rows, columns) bool; none of it on the window's edge."""
+
+    def __post_init__(self) -> None:
+        if not self.mask.any():
+            raise UserError("inpaint: the hole is empty; give the object, a mask, or a place on the plane")
+
+    @property
+    def plane(self) -> Plane:
+        """What it is a hole in."""
+        return self.window.plane
+
+    @property
+    def area(self) -> float:
+        """Scene units squared."""
+        return float(self.mask.sum()) * self.window.texel**2
+
+    def bounds(self) -> tuple[np.ndarray, float]:
+        """Middle (3,) of its bounding square on the plane and that square's side, scene units."""
+        rows, columns = np.nonzero(self.mask)
+        middle = np.array([[columns.min() + columns.max() + 1, rows.min() + rows.max() + 1]]) / 2.0
+        side = max(np.ptp(rows), np.ptp(columns)) + 1
+        return self.window.points(middle)[0], float(side) * self.window.texel
+
+    def drawn_on(self, window: PlaneWindow) -> np.ndarray:
+        """(rows, columns) bool: the hole on another window of the same plane."""
+        columns, rows = np.meshgrid(np.arange(window.columns) + 0.5, np.arange(window.rows) + 0.5)
+        places = window.points(np.stack([columns.ravel(), rows.ravel()], axis=1))
+        at = self.window.pixels(places) - 0.5
+        values = ndimage.map_coordinates(self.mask.astype(np.float32), at[:, ::-1].T, order=1, mode="constant")
+        return (values > 0.5).reshape(window.rows, window.columns)
+
+
+def disc(plane: Plane, centre: np.ndarray, radius: float) -> Hole:
+    """A round hole about ``centre`` (3,), dropped onto the plane. Raises ``UserError`` unless the radius is positive."""
+    if not (np.isfinite(radius) and radius > 0.0 and np.isfinite(centre).all()):
+        raise UserError(f"inpaint: the hole's radius {radius:g} must be a positive number and its centre finite")
+    window = _window(plane, np.asarray(centre, float), 2.0 * radius)
+    columns, rows = np.meshgrid(np.arange(_TEXELS) + 0.5, np.arange(_TEXELS) + 0.5)
+    return Hole(window, np.hypot(columns - 0.5 * _TEXELS, rows - 0.5 * _TEXELS) * window.texel < radius)
+
+
+def footprint(thing: GaussianCloud, plane: Plane) -> Hole:
+    """What an object that stands on ``plane`` hides from every side: its lowest part, seen from above, and what that
+    encloses. Raises ``UserError`` where the object does not reach down to the plane."""
+    means, opacity = thing.means.numpy(), thing.opacities()
+    heights = plane.heights(means)
+    solid = (opacity > 0.3) & (heights > -np.abs(heights).max() * 0.5)
+    if not solid.any():
+        raise UserError("inpaint: the object has no opaque Gaussian; give another object, a mask, or a place")
+    top = float(np.quantile(heights[solid], 0.99))
+    low = solid & (heights < _CONTACT * top)
+    if top <= 0.0 or not low.any():
+        raise UserError(
+            f"inpaint: the object does not touch the plane (lowest part at {heights[solid].min():.3g}, highest at"
+            f" {top:.3g} scene units above it); check the plane"
+        )
+    middle = 0.5 * (means[low].min(axis=0) + means[low].max(axis=0))
+    # Splats reach beyond their means.
+    margin = 3.0 * float(np.exp(np.quantile(np.max(thing.log_scales.numpy()[low], axis=1), 0.9)))
+    first, second = plane.tangents()
+    span = max(np.ptp(means[low] @ first), np.ptp(means[low] @ second)) + 2.0 * margin
+    window = _window(plane, middle, float(span))
+    covered = rectify(thing.subset(low), window, thickness=np.inf).alpha > 0.5
+    return Hole(window, ndimage.binary_fill_holes(covered))
+
+
+def unseen(plane: Plane, views: Sequence[tuple[Camera, np.ndarray]]) -> Hole:
+    """The floor that stands behind the object in every view that has it in sight, from masks (H, W) of the object.
+
+    Raises ``UserError`` for masks that do not fit their cameras, are empty, or between them hide no common floor.
+    """
+    for number, (camera, mask) in enumerate(views):
+        if mask.shape != (camera.height, camera.width):
+            raise UserError(
+                f"inpaint: mask {number} has {mask.shape[1]} x {mask.shape[0]} pixels, its camera"
+                f" {camera.width} x {camera.height}; give masks of the cameras' size"
+            )
+        if not mask.any():
+            raise UserError(f"inpaint: mask {number} is empty; paint the object white")
+    shadows = [_on_plane(plane, camera, mask) for camera, mask in views]
+    if any(len(shadow) == 0 for shadow in shadows):
+        raise UserError("inpaint: the floor is not in sight inside a mask; the hole is off the plane, check the plane")
+    # The common floor lies inside every shadow's bounds; the smallest shadow has the finest window.
+    smallest = min(shadows, key=lambda shadow: float(np.ptp(shadow, axis=0).max()))
+    middle = 0.5 * (smallest.min(axis=0) + smallest.max(axis=0))
+    first, second = plane.tangents()
+    window = _window(plane, middle, float(max(np.ptp(smallest @ first), np.ptp(smallest @ second))))
+    columns, rows = np.meshgrid(np.arange(_TEXELS) + 0.5, np.arange(_TEXELS) + 0.5)
+    places = window.points(np.stack([columns.ravel(), rows.ravel()], axis=1))
+    hidden, looked = np.ones(len(places), bool), np.zeros(len(places), bool)
+    for camera, mask in views:
+        seen = places @ camera.rotation.T + camera.translation
+        ahead = seen[:, 2] > camera.near
+        depth = np.where(ahead, seen[:, 2], 1.0)
+        column = np.floor(camera.fx * seen[:, 0] / depth + camera.cx).astype(int)
+        row = np.floor(camera.fy * seen[:, 1] / depth + camera.cy).astype(int)
+        inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        hidden[inside] &= mask[row[inside], column[inside]]
+        looked |= inside
+    found = (hidden & looked).reshape(_TEXELS, _TEXELS)
+    if not found.any():
+        raise UserError("inpaint: the masks hide no floor in common; check that they show one object and the plane")
+    return Hole(window, found)
+
+
+def _on_plane(plane: Plane, camera: Camera, mask: np.ndarray) -> np.ndarray:
+    """(n, 3) points of the plane behind the pixels of ``mask``; none for those that miss it."""
+    rows, columns = np.nonzero(mask)
+    rays = np.stack([(columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy, np.ones(len(rows))])
+    rays = rays.T @ camera.rotation
+    slope = rays @ plane.normal
+    height = float(plane.heights(camera.centre))
+    meets = slope * height < 0.0
+    return camera.centre - (height / slope[meets])[:, None] * rays[meets]
+
+
+def _window(plane: Plane, middle: np.ndarray, span: float) -> PlaneWindow:
+    centre = middle - float(plane.heights(middle)) * plane.normal
+    # A few texels stay free all around.
+    return PlaneWindow(plane, centre, span / (_TEXELS - 16), _TEXELS, _TEXELS)
