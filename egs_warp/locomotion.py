@@ -10,6 +10,7 @@ import numpy as np
 
 from egs_warp.body import BodyState, SoftBody
 from egs_warp.complementarity import (
+    SEPARATE,
     ContactLayout,
     proposed_pivots,
     states_from_prediction,
@@ -25,7 +26,7 @@ from egs_warp.contact import (
 from egs_warp.contact_step import ContactStepResult, contact_step
 from egs_warp.dynamics import Factorisation, ImplicitStep, conserve_angular_momentum
 from egs_warp.muscles import MuscleColumns, MuscleSet
-from egs_warp.objectives import Objective, SpinObjective
+from egs_warp.objectives import Objective, SpinObjective, lifted_contacts
 from egs_warp.prediction import Prediction, predict
 from egs_warp.qp import QpSolution, QuadraticProgram
 
@@ -215,6 +216,7 @@ class LocomotionStepper:
             self.geometry.friction,
             settings.directions,
         )
+        states[lifted_contacts(contacts, objectives)] = SEPARATE
         best, count, infeasible = _pivot(program, layout, states, offset, linear, contacts, self, settings.qp_limit)
         clock.lap("qp")
         if best is None:

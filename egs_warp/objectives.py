@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ import scipy.sparse as sparse
 from scipy.spatial import ConvexHull
 
 from egs_warp.body import BodyState, SoftBody
+from egs_warp.contact import ContactSet
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,9 @@ class Objective:
     target: np.ndarray
     """(k,) m/s."""
     weight: float
+    lifted: tuple[int, ...] = ()
+    """Nodes whose contacts ought to let go: the first guess of their state is that they separate. Stage 1 keeps last step's
+    activations, so it cannot foresee a foot that the muscles are about to lift."""
 
 
 def centre_of_mass_velocity(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
@@ -41,21 +46,17 @@ class SpinObjective:
     weight: float
 
 
+def lifted_contacts(contacts: ContactSet, objectives: Sequence[Objective | SpinObjective]) -> np.ndarray:
+    """(n,) bool: contacts on nodes that an objective lifts."""
+    lifted = [node for wish in objectives if isinstance(wish, Objective) for node in wish.lifted]
+    nearest = contacts.nodes[np.arange(contacts.count), np.argmax(contacts.weights, axis=1)]
+    return np.isin(nearest, lifted)
+
+
 def node_velocities(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
     """Velocities (N, 3) of all nodes, each weighted by its share of the mass: a pose to move towards."""
     shares = np.sqrt(np.repeat(body.node_mass / body.mass, 3))
     return Objective("pose", sparse.diags(shares).tocsr(), shares * target.ravel(), weight)
-
-
-@dataclass(frozen=True)
-class Release:
-    """Contacts that ought to leave the ground: the first guess of their state is that they separate.
-
-    Stage 1 keeps last step's activations, so it cannot foresee a foot that the muscles are about to lift.
-    """
-
-    nodes: np.ndarray
-    """(k,) nodes whose contacts let go."""
 
 
 @dataclass(frozen=True)
