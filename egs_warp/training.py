@@ -21,6 +21,9 @@ from egs_warp.io.cameras import read_cameras
 from egs_warp.render import render
 
 SH_BAND_0 = 0.28209479177387814
+_NEAREST = 0.2
+"""Nothing is trained nearer to a camera than this share of its distance to the middle: a veil before one camera fits that
+photo and spoils all others."""
 _HOLD_OUT_EVERY = 8
 """As published methods do: every eighth photo is judged on and not trained on."""
 
@@ -76,9 +79,10 @@ def train(
     """Make a capture from the photos that ``posed`` (COLMAP, ``transforms.json`` or ``cameras.json``) points to.
 
     Photos larger than ``max_side`` pixels are reduced. Every eighth photo is held out and judged on. Photos with alpha
-    are laid over ``background``; without one, it is white for those and the mean colour along the photos' borders for
-    others, so that no Gaussians are spent on a plain backdrop. Raises ``UserError`` for missing photos and impossible
-    options.
+    or masks (``read_views``) are trained before a random colour each step, so that nothing can pass for the backdrop.
+    They are judged before ``background``; without one, it is white for those and the mean colour along the photos'
+    borders for others, so that no Gaussians are spent on a plain backdrop. Raises ``UserError`` for missing photos and
+    impossible options.
     """
     if iterations < 1 or max_gaussians < 100 or not 0 <= sh_degree <= 3:
         raise UserError(
@@ -89,13 +93,25 @@ def train(
     background = background or backdrop_colour(photos)
     views = tuple(laid_over(view, background) for view in photos)
     held_out = [len(views) >= _HOLD_OUT_EVERY and number % _HOLD_OUT_EVERY == 0 for number in range(len(views))]
-    chosen = [view for view, out in zip(views, held_out, strict=True) if not out]
-    start = rough_cloud(chosen, count=max(100, max_gaussians // 3), sh_degree=sh_degree, seed=seed, device=device)
+    start = rough_cloud(
+        [view for view, out in zip(views, held_out, strict=True) if not out],
+        count=max(100, max_gaussians // 3),
+        sh_degree=sh_degree,
+        seed=seed,
+        device=device,
+    )
+    focus = middle_of([view.camera for view in views])
+    cut_out = all(view.alpha is not None for view in photos)
+    chosen = [
+        replace(view, camera=_without_veils(view.camera, focus))
+        for view, out in zip(photos if cut_out else views, held_out, strict=True)
+        if not out
+    ]
     options = FinetuneOptions(
         iterations=iterations,
         # Short runs cannot wait for the rates of 30,000 steps.
         rates=Rates(means=1.6e-4 * min(4.0, max(1.0, 30_000 / iterations) ** 0.5)),
-        background=background,
+        background=None if cut_out else background,
         densification=Densification.RELOCATION,
         max_gaussians=max_gaussians,
         seed=seed,
@@ -125,7 +141,9 @@ def _score(
 def read_views(posed: Path | str, *, max_side: int | None = None) -> list[TrainingView]:
     """Photos and cameras; photos larger than ``max_side`` pixels are reduced.
 
-    Raises ``UserError`` for a photo that is missing, unreadable or of another shape than its camera.
+    Alpha is the photo's own or, as COLMAP has it, that of ``masks/PHOTO.png`` (or ``masks/`` with the photo's own name)
+    beside the photos' folder: white is kept. Raises ``UserError`` for a photo or mask that is unreadable or of another
+    shape than its camera, and for a missing photo.
     """
     views = []
     for entry in read_cameras(posed):
@@ -137,7 +155,7 @@ def read_views(posed: Path | str, *, max_side: int | None = None) -> list[Traini
         full = {"uint8": 255.0, "uint16": 65535.0}.get(pixels.dtype.name, 1.0)
         values = np.atleast_3d(np.asarray(pixels, dtype=np.float32)) / full
         colour = values[:, :, :3][:, :, ::-1] if values.shape[2] >= 3 else np.repeat(values[:, :, :1], 3, axis=2)
-        alpha = values[:, :, 3] if values.shape[2] == 4 else None
+        alpha = values[:, :, 3] if values.shape[2] == 4 else _mask_of(entry.image, entry.name, colour.shape[:2])
         camera = _scaled(entry.camera, colour.shape[1], colour.shape[0], entry.image)
         side = max(camera.width, camera.height)
         if max_side is not None and side > max_side:
@@ -153,6 +171,30 @@ def read_views(posed: Path | str, *, max_side: int | None = None) -> list[Traini
         image = np.ascontiguousarray(colour, dtype=np.float32)
         views.append(TrainingView(camera, image, alpha, name=entry.name))
     return views
+
+
+def _mask_of(image: Path, name: str, shape: tuple[int, ...]) -> np.ndarray | None:
+    """(H, W) float32 from the photo's mask file, if there is one."""
+    # COLMAP's names may hold folders, which the masks repeat.
+    depth = min(len(Path(name).parts), len(image.parents) - 1)
+    relative = image.relative_to(image.parents[depth - 1])
+    places = (
+        place
+        for folder, file in ((image.parents[depth] / "masks", relative), (image.parent.parent / "masks", image.name))
+        for place in (folder / f"{file}.png", (folder / file).with_suffix(".png"), folder / file)
+    )
+    path = next((place for place in places if place.is_file()), None)
+    if path is None:
+        return None
+    pixels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if pixels is None:
+        raise UserError(f"{path}: not a readable picture; export the mask again")
+    if pixels.shape != shape:
+        raise UserError(
+            f"{path}: {pixels.shape[1]} x {pixels.shape[0]} pixels, but its photo has {shape[1]} x {shape[0]};"
+            " make the mask from the same photo"
+        )
+    return pixels.astype(np.float32) / 255.0
 
 
 def laid_over(view: TrainingView, background: tuple[float, float, float]) -> TrainingView:
@@ -195,6 +237,19 @@ def _scaled(camera: Camera, width: int, height: int, image: Path, *, exact: bool
     )
 
 
+def middle_of(cameras: Sequence[Camera]) -> np.ndarray:
+    """(3,) the point nearest to all optical axes, in the least-squares sense."""
+    centres = np.array([camera.centre for camera in cameras])
+    axes = np.array([camera.rotation[2] for camera in cameras])
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    return np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, centres), rcond=None)[0]
+
+
+def _without_veils(camera: Camera, focus: np.ndarray) -> Camera:
+    near = _NEAREST * float(np.linalg.norm(camera.centre - focus))
+    return replace(camera, near=min(max(camera.near, near), 0.5 * camera.far))
+
+
 def rough_cloud(
     views: Sequence[TrainingView], *, count: int, sh_degree: int, seed: int = 0, device: str | None = None
 ) -> GaussianCloud:
@@ -203,10 +258,7 @@ def rough_cloud(
     Of many random points those are kept on whose colour the views agree best: a rough visual and photometric hull.
     """
     centres = np.array([view.camera.centre for view in views])
-    axes = np.array([view.camera.rotation[2] for view in views])
-    # The point nearest to all optical axes, in the least-squares sense.
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    focus = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, centres), rcond=None)[0]
+    focus = middle_of([view.camera for view in views])
     distance = float(np.median(np.linalg.norm(centres - focus, axis=1)))
     reach = np.median([0.5 * max(v.camera.width / v.camera.fx, v.camera.height / v.camera.fy) for v in views])
     random = np.random.default_rng(seed)
