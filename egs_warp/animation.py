@@ -27,13 +27,14 @@ from egs_warp.plane import Plane
 from egs_warp.render.ground import Floor
 from egs_warp.render.rasteriser import render
 from egs_warp.render.video import VideoWriter, contact_sheet, write_png
-from egs_warp.repertoire import longest, parts_of
+from egs_warp.repertoire import also_reached, longest, parts_of
 from egs_warp.report import build_report, motion_entry, qp_summary, timing_summary, write_report
 from egs_warp.script import LARGEST_TARGET, LARGEST_TURN, parse_script
 from egs_warp.sequence import MotionSequence, Place
 from egs_warp.simulation import FRAME_RATE, Simulation, settle, simulate, steps_per_frame
 from egs_warp.splitting import split_for_motion
 from egs_warp.stance import Ground
+from egs_warp.terrain import Solid
 from egs_warp.trajectory import audit, measure
 
 SHEET_FRAMES = 12
@@ -89,6 +90,8 @@ class Creature:
     """Body, muscles and contact."""
     start: BodyState
     """At rest on the ground."""
+    solids: tuple[Solid, ...]
+    """All that there is to stand on, the ground first."""
 
     @property
     def body(self) -> SoftBody:
@@ -113,9 +116,12 @@ def make_creature(
     plane: Plane | None = None,
     metres_per_unit: float | None = None,
     friction: float = 0.8,
+    solids: tuple[Solid, ...] = (),
+    gravity_up: np.ndarray | None = None,
 ) -> Creature:
     """Give a capture (scene units) a body that stands on ``plane``, or on its own base, square to ``up`` (3,).
 
+    ``solids`` (scene units) are steps and walls beside the ground; ``gravity_up`` (3,) is against gravity if the ground is a slope.
     A body that its own weight would bend out of shape is made stiffer until it stands.
     """
     if plane is None:
@@ -126,10 +132,11 @@ def make_creature(
     cage = build_cage(cloud, plane)
     scale = metres_per_unit or 1.0 / cage.height(plane)
     cloud, plane, cage = cloud.scaled(scale), plane.scaled(scale), cage.scaled(scale)
-    geometry = contact_geometry(cloud, cage.mesh, (plane,), friction=friction, device=device)
+    solids = tuple(solid.scaled(scale) for solid in solids)
+    geometry = contact_geometry(cloud, cage.mesh, (plane,), solids=solids, friction=friction, device=device)
     sag = DEFAULT_SAG
     while True:
-        body = make_body(cage.mesh, plane, sag=sag, device=device)
+        body = make_body(cage.mesh, plane, up=gravity_up, sag=sag, device=device)
         muscles = automatic_muscles(
             cage.mesh,
             plane.normal,
@@ -141,7 +148,7 @@ def make_creature(
         stepper = LocomotionStepper(body, muscles, geometry, device=device)
         start = settle(stepper)
         if sag < SMALLEST_SAG or _stands(stepper, start):
-            return Creature(cloud, plane, scale, cage, stepper, start)
+            return Creature(cloud, plane, scale, cage, stepper, start, (Solid((plane,)), *solids))
         sag *= 0.5
 
 
@@ -162,6 +169,8 @@ def animate(
     up: np.ndarray | None = None,
     plane: Plane | None = None,
     background: GaussianCloud | None = None,
+    solids: tuple[Solid, ...] = (),
+    gravity_up: np.ndarray | None = None,
     options: AnimateOptions | None = None,
     source: str = "capture",
     notes: tuple[str, ...] = (),
@@ -170,8 +179,8 @@ def animate(
     """Bring ``cloud`` (scene units) to life and write video, contact sheet, report and trajectory into ``out``.
 
     ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.script``). ``background`` is drawn
-    behind the object instead of the plain floor. Returns the report (docs/report.md). Raises ``UserError`` for bad input,
-    before any file of an earlier run is touched.
+    behind the object instead of the plain floor. ``solids`` and ``gravity_up``: see ``make_creature``. Returns the report
+    (docs/report.md). Raises ``UserError`` for bad input, before any file of an earlier run is touched.
     """
     options = options or AnimateOptions()
     flags = {"distance": options.distance, "height": options.height, "heading_degrees": options.heading_degrees}
@@ -180,7 +189,13 @@ def animate(
     folder = writable_folder(out)
     with tqdm(total=1, desc="prepare", unit="capture", disable=quiet) as bar:
         creature = make_creature(
-            cloud, up=up, plane=plane, metres_per_unit=options.metres_per_unit, friction=options.friction
+            cloud,
+            up=up,
+            plane=plane,
+            metres_per_unit=options.metres_per_unit,
+            friction=options.friction,
+            solids=solids,
+            gravity_up=gravity_up,
         )
         bar.update()
     place = first_place(creature)
@@ -207,6 +222,7 @@ def animate(
                 entry.motion.planned(),
                 measure(simulation.trajectory, first=first, last=last),
                 entry.motion.notes(),
+                also_reached(entry.motion, simulation.trajectory.positions[last]),
             )
             for entry, (first, last) in zip(sequence.done, sequence.spans(simulation.trajectory.time), strict=True)
         ],
@@ -243,11 +259,16 @@ def first_place(creature: Creature) -> Place:
     body, start = creature.body, creature.start
     return Place(
         body,
-        Ground.on(creature.plane, _forward(creature), body.centre_of_mass(start.positions)),
+        Ground.on(creature.plane, _forward(creature), body.centre_of_mass(start.positions), up=_up(body)),
         start.positions,
         creature.stepper.detector.points_within(start.positions, 0.01 * body.height),
         1.0 / (FRAME_RATE * steps_per_frame(body)),
+        creature.solids,
     )
+
+
+def _up(body: SoftBody) -> np.ndarray:
+    return -body.gravity / np.linalg.norm(body.gravity)
 
 
 def _forward(creature: Creature) -> np.ndarray:

@@ -98,6 +98,7 @@ def make_body(
     mesh: TetMesh,
     plane: Plane,
     *,
+    up: np.ndarray | None = None,
     sag: float = DEFAULT_SAG,
     poisson_ratio: float = 0.4,
     density: float = 1000.0,
@@ -108,6 +109,8 @@ def make_body(
 
     A body on thin legs would sink further into them than a column does; it is stiffened until its centre of mass sinks by no
     more than ``LARGEST_SINK`` H under its weight.
+
+    ``up`` (3,) is against gravity where the ground is a slope.
 
     ``damping_ratio`` is that of the first mode of the body held at its base (nodes within 5 % of H above the plane); it sets the
     Rayleigh coefficient beta.
@@ -123,7 +126,7 @@ def make_body(
     frequency = _first_frequency(undamped, node_mass, free)
     damped = Material(young, poisson_ratio, density, 2.0 * damping_ratio / frequency)
     assembly = ElasticAssembly(mesh, damped, device=device)
-    return SoftBody(mesh, assembly, node_mass, -GRAVITY * plane.normal, height)
+    return SoftBody(mesh, assembly, node_mass, -GRAVITY * (plane.normal if up is None else up), height)
 
 
 def _held_stiffness(assembly: ElasticAssembly, free: np.ndarray) -> tuple[sparse.csc_matrix, np.ndarray]:

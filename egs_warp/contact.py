@@ -16,6 +16,7 @@ from egs_warp.gaussians import GaussianCloud
 from egs_warp.kernels import contact as kernels
 from egs_warp.plane import Plane
 from egs_warp.precision import Vec3, Vec4, real
+from egs_warp.terrain import Solid
 from egs_warp.tetmesh import TetMesh
 
 
@@ -35,6 +36,13 @@ class ContactGeometry:
     """Gaussians whose mean lies below a plane at rest."""
     left_out_opacity: float
     """Their share of the opacity mass."""
+    solid_from_plane: tuple[int, ...] = ()
+    """Which solid each plane is a face of, in ascending order; empty: each is a half space of its own."""
+
+    @property
+    def solid_of_each_plane(self) -> np.ndarray:
+        """(planes,) int32."""
+        return np.array(self.solid_from_plane or range(len(self.planes)), dtype=np.int32)
 
 
 @dataclass(frozen=True)
@@ -80,12 +88,14 @@ def contact_geometry(
     mesh: TetMesh,
     planes: tuple[Plane, ...],
     *,
+    solids: tuple[Solid, ...] = (),
     friction: float = 0.8,
     gamma: float = 3.0,
     device: str | None = None,
 ) -> ContactGeometry:
     """Points of all T+ and T- (Eq. 3); endpoints below a plane at rest are shortened to it (DESIGN 7).
 
+    ``planes`` bound half spaces, the first of them the ground; ``solids`` stand on it.
     Only vertices of the convex hull of each tetrahedron's points are kept: a deformation is affine inside a tetrahedron, so
     the deepest point of it is always one of those.
     """
@@ -93,7 +103,8 @@ def contact_geometry(
     quaternions = cloud.rotations.numpy().astype(np.float64)
     axes = Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix()
     arms = gamma * np.exp(cloud.log_scales.numpy().astype(np.float64))[:, None, :] * axes
-    heights = np.min([plane.heights(means) for plane in planes], axis=0)
+    obstacles = [Solid((plane,)) for plane in planes] + list(solids)
+    heights = np.min([np.max([face.heights(means) for face in solid.faces], axis=0) for solid in obstacles], axis=0)
     above = heights >= 0.0
     opacities = cloud.opacities()
     points = [means[above]]
@@ -101,9 +112,11 @@ def contact_geometry(
         for axis in range(3):
             arm = sign * arms[above, :, axis]
             reach = np.ones(len(arm))
-            for plane in planes:
-                drop = -(arm @ plane.normal)
-                room = plane.heights(means[above])
+            for solid in obstacles:
+                rooms = np.stack([face.heights(means[above]) for face in solid.faces])
+                facing = np.argmax(rooms, axis=0)
+                normals = np.stack([face.normal for face in solid.faces])[facing]
+                drop, room = -(arm * normals).sum(axis=1), rooms.max(axis=0)
                 reach = np.minimum(reach, np.where(drop > room, room / np.where(drop > room, drop, 1.0), 1.0))
             points.append(means[above] + reach[:, None] * arm)
     embedding = embed_points(mesh, np.concatenate(points), device=device)
@@ -111,12 +124,13 @@ def contact_geometry(
     kept = _hull_points(tet_from_point, weights, len(mesh.tets))
     return ContactGeometry(
         mesh,
-        planes,
+        tuple(face for solid in obstacles for face in solid.faces),
         friction,
         tet_from_point[kept],
         weights[kept],
         int((~above).sum()),
         float(opacities[~above].sum() / opacities.sum()),
+        tuple(index for index, solid in enumerate(obstacles) for _ in solid.faces),
     )
 
 
@@ -147,13 +161,17 @@ class ContactDetector:
         self._tets = wp.array(geometry.mesh.tets, dtype=wp.vec4i, device=device)
         rows = np.array([[*plane.normal, plane.offset] for plane in geometry.planes])
         self._planes = wp.array(rows, dtype=Vec4, device=device)
+        self._solids = wp.array(geometry.solid_of_each_plane, dtype=int, device=device)
         self._positions = wp.zeros(len(geometry.mesh.nodes), dtype=Vec3, device=device)
         count = len(geometry.tet_from_point)
         self._gaps = wp.zeros(count, dtype=real, device=device)
         self._nearest = wp.zeros(count, dtype=int, device=device)
 
     def gaps(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(P,) signed distance of every point at ``positions`` (N, 3) to its nearest plane, and (P,) that plane's index."""
+        """(P,) signed distance of every point at ``positions`` (N, 3) to the nearest solid, and (P,) its face's index.
+
+        Of a solid's faces the one counts that the point is furthest in front of, or least far behind.
+        """
         self._positions.assign(np.ascontiguousarray(positions))
         wp.launch(
             kernels.point_gaps_kernel,
@@ -163,6 +181,7 @@ class ContactDetector:
                 self._tet_from_point,
                 self._weights,
                 self._planes,
+                self._solids,
                 self._positions,
             ],
             outputs=[self._gaps, self._nearest],

@@ -47,6 +47,7 @@ class Squares:
         self.distance, self.height, self.count, self.asked = distance, height, count, asked
         self._first: np.ndarray | None = None
         self._way = np.zeros(3)
+        self._clearance = 0.0
 
     def parts(self) -> list[Part]:
         """The hops, for a sequence."""
@@ -59,8 +60,9 @@ class Squares:
         if self._first is None:
             share = sole_shares(place.body, place.ground, place.standing)
             self._first = share @ place.standing
-            forward = place.ground.axes[0]
-            # Along the ground: on a slope the way forward climbs.
-            normal = place.ground.surface_normal
-            self._way = forward - place.ground.axes[2] * (forward @ normal) / (place.ground.axes[2] @ normal)
-        return Hop(place, self._first + number * self.distance * self._way, self.height)
+            self._way = place.ground.axes[0]
+            # The middle of the feet is a little above what they stand on.
+            self._clearance = -place.rise_at(self._first)
+        square = self._first + number * self.distance * self._way
+        rise = place.rise_at(square) + self._clearance
+        return Hop(place, square + rise * place.ground.axes[2], self.height)

@@ -39,7 +39,7 @@ class Leap(Jump):
         self._landing = Ground(
             ground.axes @ ground.turn(turn).T,
             ground.origin + target.distance * ground.axes[0] + target.rise * ground.axes[2],
-            ground.normal,
+            ground.surface_normal,
         )
         self._landing_pose = PoseFamily(
             place.body,

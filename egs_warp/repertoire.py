@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from egs_warp.follow import Follow
-from egs_warp.hop import Squares
+from egs_warp.hop import Hop, Squares
 from egs_warp.keyframes import read_keyframes
 from egs_warp.leap import Leap
 from egs_warp.motions import JumpTarget
@@ -52,6 +52,15 @@ def parts_of(requests: Sequence[MotionRequest], height: float) -> list[Part]:
             for _ in range(request.repeat):
                 parts.append(Part(request.name, asked, lambda place, asked=asked, begin=begin: begin(asked, place)))
     return parts
+
+
+def also_reached(motion: BodyMotion, positions: np.ndarray) -> dict[str, float]:
+    """What a report says of a motion beside the measures that all have; ``positions`` (N, 3) at its end."""
+    if isinstance(motion, Hop):
+        return {"square_miss": motion.miss(positions) / motion.target.distance}
+    if isinstance(motion, Follow):
+        return {"worst_miss": motion.planned()["worst_miss"]}
+    return {}
 
 
 def longest(requests: Sequence[MotionRequest]) -> int:

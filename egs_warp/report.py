@@ -19,9 +19,12 @@ from egs_warp.trajectory import Audit, Reached
 SCHEMA_VERSION = 1
 
 
-def motion_entry(name: str, asked: dict, planned: dict, reached: Reached, notes: Sequence[str]) -> dict:
+def motion_entry(
+    name: str, asked: dict, planned: dict, reached: Reached, notes: Sequence[str], also_reached: dict | None = None
+) -> dict:
     """One element of ``motion``."""
-    return {"name": name, "asked": asked, "planned": planned, "reached": asdict(reached), "notes": list(notes)}
+    measures = {**asdict(reached), **(also_reached or {})}
+    return {"name": name, "asked": asked, "planned": planned, "reached": measures, "notes": list(notes)}
 
 
 def qp_summary(reports: Sequence[StepReport], frames: np.ndarray) -> dict:

@@ -13,6 +13,7 @@ from egs_warp.body import BodyState, SoftBody
 from egs_warp.locomotion import StepReport
 from egs_warp.objectives import Objective, SpinObjective
 from egs_warp.stance import Ground, heading_between, sole_shares
+from egs_warp.terrain import Solid, surface_above
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,8 @@ class Place:
     """(k, 3) points of the body on the ground, metres."""
     step: float
     """Seconds of a solver step."""
+    solids: tuple[Solid, ...] = ()
+    """What there is to stand on, the ground among it."""
 
     def now(self, positions: np.ndarray) -> Place:
         """The same stance turned about up and moved to where the feet of ``positions`` (N, 3) are."""
@@ -37,10 +40,17 @@ class Place:
         turn = self.ground.turn(angle)
         return replace(
             self,
-            ground=Ground(self.ground.axes @ turn.T, moved + (self.ground.origin - feet) @ turn.T, self.ground.normal),
+            ground=Ground(
+                self.ground.axes @ turn.T, moved + (self.ground.origin - feet) @ turn.T, self.ground.surface_normal
+            ),
             standing=moved + (self.standing - feet) @ turn.T,
             touching=moved + (self.touching - feet) @ turn.T,
         )
+
+    def rise_at(self, point: np.ndarray) -> float:
+        """Metres from ``point`` (3,) up to the highest surface over or under it; 0 if there is none."""
+        rise = surface_above(self.solids, point, self.ground.axes[2])
+        return rise if np.isfinite(rise) else 0.0
 
     def facing(self, direction: np.ndarray) -> Place:
         """The same stance with another way forward (3,); the body is not turned."""

@@ -48,21 +48,20 @@ class Ground:
     """(3, 3)."""
     origin: np.ndarray
     """(3,) metres, on the plane."""
-    normal: np.ndarray | None = None
-    """(3,) of the plane where it is not up: on a slope."""
-
-    @property
-    def surface_normal(self) -> np.ndarray:
-        """(3,) unit, of the plane under the feet."""
-        return self.axes[2] if self.normal is None else self.normal
+    surface_normal: np.ndarray
+    """(3,) unit, of the plane; up, but on a slope."""
 
     @classmethod
-    def on(cls, plane: Plane, forward: np.ndarray, below: np.ndarray) -> Ground:
-        """Frame with its origin on the plane under the point ``below``; ``forward`` is made horizontal."""
-        flat = forward - (forward @ plane.normal) * plane.normal
+    def on(cls, plane: Plane, forward: np.ndarray, below: np.ndarray, *, up: np.ndarray | None = None) -> Ground:
+        """Frame with its origin on the plane under the point ``below``; ``forward`` is made horizontal.
+
+        ``up`` (3,) is against gravity where the plane is a slope.
+        """
+        vertical = plane.normal if up is None else up
+        flat = forward - (forward @ vertical) * vertical
         flat /= np.linalg.norm(flat)
-        axes = np.stack([flat, np.cross(plane.normal, flat), plane.normal])
-        return cls(axes, below - plane.heights(below) * plane.normal)
+        origin = below - plane.heights(below) / (plane.normal @ vertical) * vertical
+        return cls(np.stack([flat, np.cross(vertical, flat), vertical]), origin, plane.normal)
 
     def turn(self, angle: float) -> np.ndarray:
         """(3, 3) rotation by ``angle`` radians about up, world axes."""

@@ -35,6 +35,8 @@ class Trajectory:
     """(3,)."""
     planes: np.ndarray
     """(P, 4) rows n, d of n.x + d = 0; the first is the ground."""
+    solid_from_plane: np.ndarray
+    """(P,) int32: a point is inside a solid if it is below all of its planes; a solid of one plane is a half space."""
     friction: float
     drag: float
     """1/s."""
@@ -128,6 +130,7 @@ def record(
         node_mass=body.node_mass,
         gravity=body.gravity,
         planes=np.array([[*plane.normal, plane.offset] for plane in geometry.planes]),
+        solid_from_plane=geometry.solid_of_each_plane,
         friction=geometry.friction,
         drag=drag,
         height=body.height,

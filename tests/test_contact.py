@@ -18,6 +18,7 @@ from egs_warp.contact import (
 from egs_warp.embedding import embed_points
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.plane import Plane
+from egs_warp.terrain import Solid, step
 from egs_warp.tetmesh import TetMesh
 from tests.meshes import block_mesh
 
@@ -85,6 +86,28 @@ def test_gaps_kernel_equals_its_twin(device: str) -> None:
     gaps, nearest = ContactDetector(geometry, device=device).gaps(x)
     assert np.abs(gaps - heights.min(axis=0)).max() < 1e-13
     assert np.array_equal(nearest, heights.argmin(axis=0)) and set(nearest) == {0, 1, 2}
+
+
+def test_gaps_to_a_step_and_a_wall_equal_their_twin(device: str) -> None:
+    """Eq. (8): a step (two faces) and a wall beside the floor; on the step its top counts, before it its riser."""
+    mesh = block_mesh()
+    low = mesh.nodes.min(axis=0)
+    size = np.ptp(mesh.nodes, axis=0)
+    stair = step(FLOOR, low + 0.5 * size, np.array([1.0, 0.0, 0.3]), 0.3 * size[2])
+    wall = Solid((Plane.from_coefficients(0.0, -1.0, 0.0, low[1] + 0.9 * size[1]),))
+    geometry = contact_geometry(surface_cloud(mesh, 300), mesh, (FLOOR,), solids=(stair, wall), device=device)
+    assert geometry.solid_from_plane == (0, 1, 1, 2) and len(geometry.planes) == 4
+    x = mesh.nodes + 0.2 * size * np.random.default_rng(2).standard_normal(mesh.nodes.shape)
+    points = np.einsum("pw,pwi->pi", geometry.weights, x[mesh.tets[geometry.tet_from_point]])
+    floor, top, riser, side = (plane.heights(points) for plane in geometry.planes)
+    expected = np.minimum(np.minimum(floor, np.maximum(top, riser)), side)
+    gaps, facing = ContactDetector(geometry, device=device).gaps(x)
+    assert np.abs(gaps - expected).max() < 1e-13
+    assert set(facing) == {0, 1, 2, 3}
+    on_top, before = facing == 1, facing == 2
+    assert (top[on_top] >= riser[on_top]).all() and (riser[before] > top[before]).all()
+    axes = ContactDetector(geometry, device=device).contact_set(np.flatnonzero(before), x).axes
+    assert np.allclose(axes[:, 0], [-1.0, 0.0, 0.0])
 
 
 def test_endpoints_are_shortened_to_the_plane_at_rest() -> None:

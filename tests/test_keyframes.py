@@ -112,7 +112,7 @@ def test_malformed_csv(tmp_path: Path, content: str, message: str) -> None:
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="key frames are read from .json or .csv"):
+    with pytest.raises(UserError, match=r"key frames are read from \.json or \.csv"):
         read_keyframes(tmp_path / "k.txt")
     with pytest.raises(UserError, match=r"none.csv: cannot be read \(No such file or directory\)"):
         read_keyframes(tmp_path / "none.csv")

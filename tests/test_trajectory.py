@@ -37,6 +37,7 @@ def flight() -> Trajectory:
         node_mass=mass,
         gravity=GRAVITY,
         planes=np.array([[0.0, 0.0, 1.0, 0.0]]),
+        solid_from_plane=np.zeros(1, np.int32),
         friction=0.8,
         drag=0.0,
         height=1.0,
