@@ -171,6 +171,7 @@ def animate(
     background: GaussianCloud | None = None,
     solids: tuple[Solid, ...] = (),
     gravity_up: np.ndarray | None = None,
+    forward: np.ndarray | None = None,
     options: AnimateOptions | None = None,
     source: str = "capture",
     notes: tuple[str, ...] = (),
@@ -179,8 +180,8 @@ def animate(
     """Bring ``cloud`` (scene units) to life and write video, contact sheet, report and trajectory into ``out``.
 
     ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.script``). ``background`` is drawn
-    behind the object instead of the plain floor. ``solids`` and ``gravity_up``: see ``make_creature``. Returns the report
-    (docs/report.md). Raises ``UserError`` for bad input, before any file of an earlier run is touched.
+    behind the object instead of the plain floor. ``solids`` and ``gravity_up``: see ``make_creature``; ``forward`` (3,): see
+    ``first_place``. Returns the report (docs/report.md). Raises ``UserError`` for bad input, before any file of an earlier run is touched.
     """
     options = options or AnimateOptions()
     flags = {"distance": options.distance, "height": options.height, "heading_degrees": options.heading_degrees}
@@ -198,7 +199,7 @@ def animate(
             gravity_up=gravity_up,
         )
         bar.update()
-    place = first_place(creature)
+    place = first_place(creature, forward)
     sequence = MotionSequence(place, parts_of(requests, creature.body.height))
     frames = options.frames or cut_off
     with tqdm(total=frames, desc="simulate", unit="frame", disable=quiet) as bar:
@@ -254,21 +255,24 @@ def animate(
     return report
 
 
-def first_place(creature: Creature) -> Place:
-    """Where the creature stands at the start, facing along its footprint."""
+def first_place(creature: Creature, forward: np.ndarray | None = None) -> Place:
+    """Where the creature stands at the start; ``forward`` (3,) is the way of its motions, else the long axis of its footprint."""
     body, start = creature.body, creature.start
+    up = -body.gravity / np.linalg.norm(body.gravity)
+    if forward is None:
+        forward = _forward(creature)
+    if np.linalg.norm(np.cross(forward, up)) < 1e-3 * np.linalg.norm(forward):
+        raise UserError(
+            f"--forward {','.join(f'{x:g}' for x in forward)}: points up or down; give a way along the ground"
+        )
     return Place(
         body,
-        Ground.on(creature.plane, _forward(creature), body.centre_of_mass(start.positions), up=_up(body)),
+        Ground.on(creature.plane, forward, body.centre_of_mass(start.positions), up=up),
         start.positions,
         creature.stepper.detector.points_within(start.positions, 0.01 * body.height),
         1.0 / (FRAME_RATE * steps_per_frame(body)),
         creature.solids,
     )
-
-
-def _up(body: SoftBody) -> np.ndarray:
-    return -body.gravity / np.linalg.norm(body.gravity)
 
 
 def _forward(creature: Creature) -> np.ndarray:

@@ -19,6 +19,20 @@ def parse_up(text: str) -> np.ndarray:
     return up
 
 
+def parse_direction(flag: str, text: str) -> np.ndarray:
+    """(3,) unit vector from ``x,y,z``, or of an axis name such as ``-y``. Raises ``UserError`` otherwise."""
+    if text.strip().lower().lstrip("+-") in _AXES:
+        return parse_up(text)
+    try:
+        direction = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        direction = np.zeros(0)
+    length = float(np.linalg.norm(direction))
+    if len(direction) != 3 or not np.isfinite(length) or length == 0.0:
+        raise UserError(f"--{flag} {text}: give three numbers x,y,z or an axis as -y (write --{flag}=-y)")
+    return direction / length
+
+
 def parse_plane(text: str):
     """Plane from ``nx,ny,nz,d``. Raises ``UserError`` otherwise."""
     from egs_warp.plane import Plane

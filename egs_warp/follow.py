@@ -60,12 +60,8 @@ class Follow:
 
     def planned(self) -> dict[str, float]:
         """How many keys there are, how long they take (seconds), and the worst miss so far, in the unit of its quantity."""
-        misses = [float(np.linalg.norm(self.miss(index))) for index in self._reached]
+        misses = [float(np.linalg.norm(self._miss(index))) for index in self._reached]
         return {"keys": float(len(self.keys)), "duration": self._end, "worst_miss": max(misses, default=0.0)}
-
-    def miss(self, index: int) -> np.ndarray:
-        """(3,) value at the time of key ``index`` minus the key's, in its unit."""
-        return self._reached[index] - np.array(self.keys[index].value)
 
     def notes(self) -> list[str]:
         """Which keys were missed."""
@@ -75,10 +71,14 @@ class Follow:
             name = f"{key.where}: {key.part} {key.quantity.value} at {key.time:g} s"
             if index not in self._reached:
                 notes.append(f"{name} was not reached in time")
-            elif np.linalg.norm(self.miss(index)) > MISSED * max(group):
+            elif np.linalg.norm(self._miss(index)) > MISSED * max(group):
                 told = ", ".join(f"{value:.3g}" for value in self._reached[index])
                 notes.append(f"{name}: reached ({told})")
         return notes
+
+    def _miss(self, index: int) -> np.ndarray:
+        """(3,) value at the time of a key minus the key's, in its unit."""
+        return self._reached[index] - np.array(self.keys[index].value)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import numpy as np
+
 from egs_warp.animation import AnimateOptions, animate, summary
 from egs_warp.scenes import scene
 from egs_warp.scenes.rooms import SQUARE
@@ -26,6 +28,7 @@ def main(arguments: list[str] | None = None) -> dict:
         motion=f"hop x{chosen.hops}",
         plane=chess.plane,
         background=chess.background,
+        forward=np.array([1.0, 0.0, 0.0]),
         options=AnimateOptions(distance=SQUARE, frames=chosen.frames, size=chosen.size),
         source="pawn",
     )

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from egs_warp.cli_input import check_device, parse_plane, parse_up
+from egs_warp.cli_input import check_device, parse_direction, parse_plane, parse_up
 
 
 def add_parser(commands) -> None:
@@ -24,6 +24,11 @@ def add_parser(commands) -> None:
     animate.add_argument("--up", help="axis that points up: x, y, z or with a minus, as --up=-y; else it is guessed")
     animate.add_argument(
         "--plane", help="nx,ny,nz,d of the ground n.x + d = 0 in the capture's units; else it is found"
+    )
+    animate.add_argument("--forward", help="x,y,z or an axis: the way of motions; else along the feet")
+    animate.add_argument("--gravity-up", help="x,y,z or an axis: against gravity, if the ground is a slope")
+    animate.add_argument(
+        "--terrain", type=Path, help="JSON with steps and walls: solids as lists of faces [nx,ny,nz,d]"
     )
     animate.add_argument("--distance", type=float, help="of a jump or hop, body heights (0.5; 0.7)")
     animate.add_argument("--height", type=float, help="rise of the centre of mass, body heights (0.2)")
@@ -44,6 +49,7 @@ def _animate(chosen: argparse.Namespace) -> int:
     from egs_warp.animation import animate, as_options, summary
     from egs_warp.base_plane import guess_up
     from egs_warp.io import read_capture
+    from egs_warp.terrain import read_terrain
 
     options = as_options(
         distance=chosen.distance,
@@ -73,10 +79,13 @@ def _animate(chosen: argparse.Namespace) -> int:
         motion=chosen.motion,
         up=up,
         plane=plane,
+        forward=parse_direction("forward", chosen.forward) if chosen.forward else None,
+        gravity_up=parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up else None,
+        solids=read_terrain(chosen.terrain) if chosen.terrain else (),
         options=options,
         source=Path(chosen.capture).name,
         notes=tuple(notes),
     )
     print(summary(report))
-    print(f"wrote {chosen.out}/{chosen.motion}.mp4, sheet.png, report.json, trajectory.npz")
+    print(f"wrote the video, sheet.png, report.json, trajectory.npz into {chosen.out}")
     return 0
