@@ -4,8 +4,7 @@ Aims: ``cuda_beats_gswarp`` (faster in every cell), ``cuda_within_1_3_of_gsplat`
 ``same_picture`` (mean difference below 1e-5, and below 1e-3 off the alpha-cut boundaries), ``cpu_vs_twin`` (20 times a
 tile-batched PyTorch rasteriser with the same culling), ``cpu_two_threads`` (1.7 times one thread).
 
-CPU peers that were tried and do not run on one: splax 0.2.3 (JAX refuses its Warp calls on a CPU) and taichi-splatting
-0.13 (its taichi-nightly is in no index; with taichi 1.7.4 its import asks for a CUDA toolkit).
+No peer that claims a CPU runs on one: ``render_peers.cpu_peers`` tries and says why.
 """
 
 from __future__ import annotations
@@ -199,6 +198,7 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> dict[s
     picture = wp.to_torch(render(cloud, camera, background=(0, 0, 0), threads=threads).colour)
     return {
         "kind": "cpu",
+        "peers": peers.cpu_peers(scene, camera),
         "gaussians": cloud.count,
         "pairs": projected.slot_count,
         "width": 640,
@@ -359,6 +359,8 @@ def main() -> None:
         elif row["kind"] == "cpu":
             figures = "  ".join(f"{k} {row[k]:.1f}" for k in ("one_thread", "two_threads", "twin"))
             print(f"{row['gaussians']:>9} {row['width']}x{row['height']} cpu               {figures} ms")
+            for name, peer in row["peers"].items():
+                print(f"{name}: {peer['ms'] or peer['outcome']}")
     print(json.dumps({name: result[name] for name in ("aims", "why_null", "against_gsplat")}, indent=1))
     if options.json:
         options.json.write_text(json.dumps(result, indent=1))

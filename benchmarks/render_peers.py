@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
+import statistics
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -159,6 +162,56 @@ def gswarp_renderer() -> Renderer:
         return colour.permute(1, 2, 0)
 
     return draw
+
+
+def cpu_peers(scene: Scene, camera: Camera) -> dict[str, dict[str, Any]]:
+    """Each renderer of the package index that claims a CPU, by name: its milliseconds, or None and why not.
+
+    ``scene`` is in the capture's own terms (``ours_scene``).
+
+    Tried with splax 0.2.3 on JAX 0.10.2, which refuses splax's Warp calls on a CPU ("JaxCallableGraphMode.WARP is not
+    supported for JAX CPU FFI calls"), and taichi-splatting 0.13 on taichi 1.7.4 (the taichi-nightly that it asks for is
+    in no index), whose import compiles CUDA code ("CUDA_HOME environment variable is not set").
+    """
+    outcomes: dict[str, dict[str, Any]] = {}
+    for name, attempt in (("splax", _splax_ms), ("taichi-splatting", _taichi_splatting_ms)):
+        try:
+            outcomes[name] = {"ms": attempt(scene, camera), "outcome": "runs"}
+        # A stranger's package fails in its own ways; which one is the result.
+        except Exception as error:
+            reason = str(error).strip().splitlines()
+            outcomes[name] = {"ms": None, "outcome": f"{type(error).__name__}: {reason[0] if reason else ''}"}
+    return outcomes
+
+
+def _splax_ms(scene: Scene, camera: Camera) -> float:
+    import jax.numpy as jnp  # pyright: ignore[reportMissingImports]
+    import splax  # pyright: ignore[reportMissingImports]
+
+    names = ("means", "scales", "rotations", "colours", "opacities")
+    arrays = [jnp.asarray(getattr(scene, name).detach().numpy()) for name in names]
+    view = np.eye(4, dtype=np.float32)
+    view[:3, :3], view[:3, 3] = camera.rotation, camera.translation
+
+    times = []
+    for _ in range(4):
+        start = time.perf_counter()
+        splax.render(
+            *arrays,
+            viewmat=jnp.asarray(view),
+            background=jnp.zeros(3),
+            img_shape=(camera.height, camera.width),
+            f=(camera.fx, camera.fy),
+            c=(camera.cx, camera.cy),
+        )[0].block_until_ready()
+        times.append((time.perf_counter() - start) * 1e3)
+    return statistics.median(times[1:])
+
+
+def _taichi_splatting_ms(scene: Scene, camera: Camera) -> float | None:
+    """None: nothing past the import has been reached on a CPU."""
+    importlib.import_module("taichi_splatting")
+    return None
 
 
 def composite_in_torch(projected: ProjectedGaussians, lists: TileLists, camera: Camera) -> torch.Tensor:
