@@ -217,9 +217,11 @@ def _voted(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> tuple[np.ndarra
     """Gaussians that the masks claim, and those that they do not show."""
     for view in masks:
         check_size(view)
-        if not view.mask.any():
-            raise UserError(f"{view.name}: the mask is empty; mark the object in it")
-    votes: Votes = blending_votes(cloud, masks)
+    # Where the object is out of sight its mask is empty, and says nothing.
+    marked = [view for view in masks if view.mask.any()]
+    if not marked:
+        raise UserError(f"{masks[0].name}: the mask is empty; mark the object in it")
+    votes: Votes = blending_votes(cloud, marked)
     if not (votes.inside + votes.outside > 0.0).any():
         raise UserError("object: the masks' cameras see nothing of the capture; check that both share one frame")
     seen = votes.share_seen() >= _SEEN
