@@ -196,3 +196,34 @@ def test_screen_positions_get_their_gradient_where_asked_for(device: str) -> Non
             sides.append(float((weights(camera)["colour"] * picture["colour"]).sum()))
         expected = (sides[0] - sides[1]) / (2 * step)
         assert float(screen.grad[:, axis].sum()) == pytest.approx(expected, rel=2e-3, abs=2e-3)
+
+
+@pytest.mark.parametrize(
+    "case", ["none visible", "covers all", "one pixel", "inside", "opaque", "clear", "tiny", "flat"]
+)
+def test_odd_cases_have_finite_gradients(device: str, case: str) -> None:
+    """Nothing seen gives exact zeros; nothing odd gives NaN or infinity, in the mode that divides by the area too."""
+    values, camera = clear_scene()
+    values = {name: value.copy() for name, value in values.items()}
+    if case == "none visible":
+        values["means"] += 100.0 * camera.rotation[2] * np.array([-1.0])
+    elif case == "covers all":
+        values["log_scales"] += 6.0
+    elif case == "one pixel":
+        camera = replace(camera, width=1, height=1, cx=0.5, cy=0.5)
+    elif case == "inside":
+        values["means"][3] = camera.centre + 0.02 * camera.rotation[2]
+    elif case == "opaque":
+        values["opacity_logits"][:] = 100.0
+    elif case == "clear":
+        values["opacity_logits"][:] = -100.0
+    elif case == "tiny":
+        values["log_scales"][:] = -10.0
+    elif case == "flat":
+        values["log_scales"][:, 2] = -15.0
+    for antialiased in (False, True):
+        got = gradients(values, camera, device, antialiased=antialiased)
+        for name, value in got.items():
+            assert np.isfinite(value).all(), (name, antialiased)
+            if case in ("none visible", "clear"):
+                assert not value.any(), (name, antialiased)
