@@ -10,7 +10,11 @@ from egs_warp.contact import tangent_directions
 
 SEPARATE = -2
 STATIC = -1
-"""A state is SEPARATE, STATIC, or k >= 0: friction along +D_k and slip along -D_k."""
+"""A state is SEPARATE, STATIC, or slide k: friction along +D_k and slip along -D_k for 0 <= k < n_d; n_d + k: friction anywhere
+between D_k and D_(k+1), slip midway."""
+
+Pivot = tuple[float, int, int]
+"""(gain, contact, new state)."""
 
 
 @dataclass(frozen=True)
@@ -49,31 +53,30 @@ class ContactLayout:
         shift = self.variables - self.activations
         return slice(part.start + shift, part.stop + shift)
 
-    def bounds(self, states: np.ndarray, *, soft: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper bounds of all rows: each state holds one side of each pair at zero.
+    def free_directions(self, states: np.ndarray) -> np.ndarray:
+        """(n, n_d) whether friction along D_k is free (and the slip row held)."""
+        nd = self.directions
+        free = np.zeros((self.contacts, nd), bool)
+        free[states == STATIC] = True
+        sliding = np.flatnonzero(states >= 0)
+        free[sliding, states[sliding] % nd] = True
+        between = np.flatnonzero(states >= nd)
+        free[between, (states[between] + 1) % nd] = True
+        return free
 
-        ``soft`` drops the friction cone and the sign of f_n, so that some force always fits the states' velocities.
-        """
-        n, nd = self.contacts, self.directions
+    def bounds(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bounds of all rows: each state (n,) holds one side of each pair at zero."""
         lower = np.zeros(2 * self.variables - self.activations)
         upper = np.full_like(lower, np.inf)
         lower[: self.activations], upper[: self.activations] = -1.0, 1.0
         touching = states >= STATIC
-        sliding = states >= 0
-        held_tangent = np.ones((n, nd), bool)
-        held_tangent[states == STATIC] = False
-        held_tangent[np.flatnonzero(sliding), states[sliding]] = False
+        free = self.free_directions(states).ravel()
         upper[self.normal][~touching] = 0.0
         upper[self.paired(self.normal)][touching] = 0.0
-        upper[self.tangent][held_tangent.ravel()] = 0.0
-        upper[self.paired(self.tangent)][~held_tangent.ravel()] = 0.0
+        upper[self.tangent][~free] = 0.0
+        upper[self.paired(self.tangent)][free] = 0.0
         upper[self.slip][states == STATIC] = 0.0
         upper[self.paired(self.slip)][states != STATIC] = 0.0
-        if soft:
-            lower[self.normal][touching] = -np.inf
-            lower[self.tangent][~held_tangent.ravel()] = -np.inf
-            lower[self.paired(self.slip)] = -np.inf
-            upper[self.paired(self.slip)] = np.inf
         return lower, upper
 
 
@@ -87,51 +90,126 @@ def states_from_prediction(
     return np.where(normal_forces <= 0.0, SEPARATE, np.where(static, STATIC, slide)).astype(int)
 
 
+def states_of_pairs(layout: ContactLayout, x: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """(n,) states of the larger side of each pair: x and w (pairs,) as ``ContactProgram.pairs`` gives them."""
+    n, nd = layout.contacts, layout.directions
+    f_n, f_t, lam = x[:n], x[n : n + n * nd].reshape(n, nd), x[n + n * nd :]
+    c, w_t, cone = w[:n], w[n : n + n * nd].reshape(n, nd), w[n + n * nd :]
+    side = f_t - w_t
+    first = np.argmax(side, axis=1)
+    states, rows, rounding = first.copy(), np.arange(n), 1e-9
+    after, before = side[rows, (first + 1) % nd], side[rows, (first - 1) % nd]
+    between = nd + np.where(after >= before, first, (first - 1) % nd)
+    both = (np.maximum(after, before) > rounding) & (side[rows, first] > rounding)
+    states[both] = between[both]
+    states[cone >= lam - rounding] = STATIC
+    states[f_n <= c + rounding] = SEPARATE
+    return states
+
+
 def proposed_pivots(
     layout: ContactLayout,
     states: np.ndarray,
     x: np.ndarray,
+    w: np.ndarray,
     multipliers: np.ndarray,
-    tangential_velocity: np.ndarray,
-    friction: float,
-) -> list[tuple[float, int, int]]:
-    """(gain, contact, new state), best first, read from the multipliers of the rows held at zero (DESIGN 8).
+    *,
+    zero: float = 1e-4,
+) -> list[Pivot]:
+    """(gain, contact, new state), best first, read from the multipliers (rows,) of the rows held at zero (DESIGN 8).
 
-    ``tangential_velocity`` (n, 2) in the units of lambda.
+    ``x`` and ``w`` (pairs,) as ``ContactProgram.pairs`` gives them. Only states that the point itself obeys are proposed, so no
+    proposal is infeasible, nor are several contacts' proposals together. ``zero`` is the accuracy of x, w and the multipliers.
     """
     n, nd = layout.contacts, layout.directions
     table = tangent_directions(nd)
-    f_n = x[layout.normal]
-    f_t = x[layout.tangent].reshape(n, nd)
-    y_force = multipliers[layout.normal]
-    y_tangent_force = multipliers[layout.tangent].reshape(n, nd)
-    y_slip = multipliers[layout.slip]
-    y_normal = multipliers[layout.paired(layout.normal)]
-    y_tangent = multipliers[layout.paired(layout.tangent)].reshape(n, nd)
-    tolerance = 1e-6
-    pivots: list[tuple[float, int, int]] = []
+    friction, slip = slice(n, n + n * nd), slice(n + n * nd, None)
+    f_n, f_t, lam = x[:n], x[friction].reshape(n, nd), x[slip]
+    c, w_t, cone = w[:n], w[friction].reshape(n, nd), w[slip]
+    y_x, y_w = multipliers[layout.activations : layout.variables], multipliers[layout.variables :]
+    y_force, y_friction = y_x[:n], y_x[friction].reshape(n, nd)
+    y_normal, y_slip, y_cone = y_w[:n], y_w[friction].reshape(n, nd), y_w[slip]
+    pivots: list[Pivot] = []
+
+    def propose(gain: float, contact: int, state: int) -> None:
+        if gain > zero:
+            pivots.append((float(gain), contact, int(state)))
+
     for i, state in enumerate(states):
-        if state == STATIC:
-            pull = y_tangent[i] @ table
-            if f_n[i] <= tolerance:
-                gain = max(y_normal[i], float(np.linalg.norm(pull)))
-                if gain > tolerance:
-                    pivots.append((gain, i, SEPARATE))
-            elif f_t[i].sum() >= friction * f_n[i] - tolerance:
+        if state == SEPARATE:
+            if c[i] <= zero:
+                along = w_t[i] - lam[i]
+                propose(y_force[i], i, np.argmin(along) if along.min() < -zero else STATIC)
+        elif state == STATIC:
+            # The rows of a static contact are redundant: only their sum along D means something.
+            pull = y_slip[i] @ table
+            size = float(np.linalg.norm(pull))
+            if f_n[i] <= zero:
+                propose(max(y_normal[i], size), i, SEPARATE)
+                propose(size, i, np.argmin(table @ pull))
+            elif cone[i] <= zero:
                 k = int(np.argmax(f_t[i]))
                 along = float(table[k] @ pull)
                 across = float(np.linalg.norm(pull - along * table[k]))
-                if along < np.tan(np.pi / nd) * across and np.linalg.norm(pull) > tolerance:
-                    pivots.append((float(np.linalg.norm(pull)), i, k))
-        elif state == SEPARATE:
-            if y_force[i] > tolerance:
-                slip = table @ tangential_velocity[i]
-                closed = int(np.argmin(slip)) if slip.min() < -tolerance else STATIC
-                pivots.append((float(y_force[i]), i, closed))
+                after, before = (k + 1) % nd, (k - 1) % nd
+                beside = after if f_t[i, after] >= f_t[i, before] else before
+                if f_t[i, beside] > zero:
+                    middle = table[k] + table[beside]
+                    if middle @ pull < 0.0:
+                        propose(-float(middle @ pull), i, nd + (k if beside == after else before))
+                elif along < np.tan(np.pi / nd) * across:
+                    propose(size, i, k)
         else:
-            stick = max(y_slip[i], float(y_tangent_force[i].max(initial=0.0)))
-            if x[layout.slip][i] <= tolerance and stick > tolerance:
-                pivots.append((stick, i, STATIC))
-            elif f_n[i] <= tolerance and y_normal[i] > tolerance:
-                pivots.append((float(y_normal[i]), i, SEPARATE))
+            k = int(state % nd)
+            if lam[i] <= zero:
+                propose(max(y_cone[i], y_friction[i].max(initial=0.0)), i, STATIC)
+            if f_n[i] <= zero:
+                propose(y_normal[i], i, SEPARATE)
+            if state < nd:
+                for between, other in ((nd + k, (k + 1) % nd), (nd + (k - 1) % nd, (k - 1) % nd)):
+                    if w_t[i, other] <= zero:
+                        propose(y_friction[i, other], i, between)
+            else:
+                for held, other in ((k, (k + 1) % nd), ((k + 1) % nd, k)):
+                    if f_t[i, held] <= zero:
+                        propose(y_slip[i, held], i, other)
+    return sorted(pivots, key=lambda p: -p[0])
+
+
+def plain_pivots(
+    layout: ContactLayout,
+    states: np.ndarray,
+    x: np.ndarray,
+    w: np.ndarray,
+    multipliers: np.ndarray,
+    *,
+    zero: float = 1e-4,
+) -> list[Pivot]:
+    """The moves of ``proposed_pivots`` as a QPCC pivots without our corrections: each multiplier is taken at its word.
+
+    A contact whose free side is zero goes to the state in which the multiplier's row is free: static to separate or slide k, slide k
+    to static, separate or slide j, separate to static. For the baseline.
+    """
+    n, nd = layout.contacts, layout.directions
+    friction, slip = slice(n, n + n * nd), slice(n + n * nd, None)
+    f_n, f_t, lam = x[:n], x[friction].reshape(n, nd), x[slip]
+    c, w_t, cone = w[:n], w[friction].reshape(n, nd), w[slip]
+    y_x, y_w = multipliers[layout.activations : layout.variables], multipliers[layout.variables :]
+    y_force, y_friction, y_lambda = y_x[:n], y_x[friction].reshape(n, nd), y_x[slip]
+    y_normal, y_slip, y_cone = y_w[:n], y_w[friction].reshape(n, nd), y_w[slip]
+    pivots: list[Pivot] = []
+    for i, state in enumerate(states):
+        k = int(state)
+        if state == SEPARATE:
+            gains = [(y_force[i], STATIC)] if c[i] <= zero else []
+        elif state == STATIC:
+            gains = [(y_normal[i], SEPARATE)] if f_n[i] <= zero else []
+            if cone[i] <= zero:
+                # Raising lambda opens every direction's row; friction stays where it is largest.
+                gains.append((max(y_lambda[i], y_slip[i].max()), int(np.argmax(f_t[i]))))
+        else:
+            gains = [(y_cone[i], STATIC)] if lam[i] <= zero else []
+            gains += [(y_normal[i], SEPARATE)] if f_n[i] <= zero else []
+            gains += [(y_friction[i, j], j) for j in range(nd) if j != k and w_t[i, j] <= zero]
+        pivots += [(float(gain), i, int(new)) for gain, new in gains if gain > zero]
     return sorted(pivots, key=lambda p: -p[0])

@@ -1,14 +1,20 @@
-"""Quadratic programs whose bounds change; the one place that imports OSQP."""
+"""Quadratic programs whose bounds change; the one place that imports OSQP and DAQP."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import osqp
+import scipy.linalg as dense
 import scipy.sparse as sparse
+
+from egs_warp.errors import UserError
+
+LARGEST_BREACH = 3e-3
+"""By which a point of OSQP's iteration limit may leave its bounds and still be used."""
 
 
 class QpStatus(Enum):
@@ -16,8 +22,18 @@ class QpStatus(Enum):
 
     SOLVED = "solved"
     INEXACT = "solved to a lower accuracy; the best point found is used"
-    INFEASIBLE = "no point satisfies the bounds; soften them"
+    ITERATION_LIMIT = "the iteration limit was reached near the bounds; the last point is used"
+    INFEASIBLE = "no point satisfies the bounds; choose other contact states"
     FAILED = "the solver gave up; scale the problem"
+
+
+class QpSolver(Enum):
+    """Who solves; chosen by name."""
+
+    OSQP = "osqp"
+    """Operator splitting: to an accuracy, warm-started, never stuck."""
+    DAQP = "daqp"
+    """Dual active set: to rounding."""
 
 
 @dataclass(frozen=True)
@@ -34,19 +50,39 @@ class QpSolution:
     @property
     def usable(self) -> bool:
         """Whether ``x`` may be read."""
-        return self.status in (QpStatus.SOLVED, QpStatus.INEXACT)
+        return self.status in (QpStatus.SOLVED, QpStatus.INEXACT, QpStatus.ITERATION_LIMIT)
 
 
-class QuadraticProgram:
+class QuadraticProgram(Protocol):
     """min 1/2 x^T P x + q^T x subject to l <= A x <= u, set up once; a re-solve changes only l and u."""
+
+    def solve(self, lower: np.ndarray, upper: np.ndarray) -> QpSolution:
+        """Solve with these bounds (m,), warm-started from the last solution."""
+        ...
+
+
+def quadratic_program(
+    P: np.ndarray, q: np.ndarray, A: np.ndarray, *, solver: QpSolver = QpSolver.OSQP, accuracy: float = 3e-5
+) -> QuadraticProgram:
+    """The program with P (n, n), q (n,) and A (m, n) for ``solver``; ``accuracy`` is that of OSQP."""
+    return OsqpProgram(P, q, A, accuracy=accuracy) if solver is QpSolver.OSQP else DaqpProgram(P, q, A)
+
+
+class OsqpProgram:
+    """A ``QuadraticProgram`` for OSQP."""
 
     def __init__(self, P: np.ndarray, q: np.ndarray, A: np.ndarray, *, accuracy: float = 3e-5) -> None:
         self._P, self._q, self._A = P, q, A
         self._accuracy = accuracy
         self._solver: osqp.OSQP | None = None
+        self._free_minimum = dense.cho_solve(dense.cho_factor(P), -q)
 
     def solve(self, lower: np.ndarray, upper: np.ndarray) -> QpSolution:
-        """Solve with these bounds (m,), warm-started from the last solution."""
+        """See ``QuadraticProgram``."""
+        free = self._A @ self._free_minimum
+        if (free >= lower).all() and (free <= upper).all():
+            # As in flight; OSQP would print a line about having nothing to polish.
+            return _solution(QpStatus.SOLVED, self._P, self._q, self._free_minimum, np.zeros(len(free)), len(free))
         if self._solver is None:
             self._solver = osqp.OSQP(algebra="builtin")
             self._solver.setup(
@@ -73,13 +109,62 @@ class QuadraticProgram:
         status = {
             codes.OSQP_SOLVED: QpStatus.SOLVED,
             codes.OSQP_SOLVED_INACCURATE: QpStatus.INEXACT,
-            codes.OSQP_MAX_ITER_REACHED: QpStatus.INEXACT,
+            codes.OSQP_MAX_ITER_REACHED: QpStatus.ITERATION_LIMIT,
             codes.OSQP_PRIMAL_INFEASIBLE: QpStatus.INFEASIBLE,
             codes.OSQP_PRIMAL_INFEASIBLE_INACCURATE: QpStatus.INFEASIBLE,
         }.get(result.info.status_val, QpStatus.FAILED)
-        solution = QpSolution(status, result.x, result.y, float("inf"))
-        if not solution.usable or result.x is None or not np.isfinite(result.x).all():
-            failed = QpStatus.INFEASIBLE if status is QpStatus.INFEASIBLE else QpStatus.FAILED
-            return QpSolution(failed, np.zeros(len(self._q)), np.zeros(len(lower)), float("inf"))
-        value = float(0.5 * result.x @ self._P @ result.x + self._q @ result.x)
-        return QpSolution(status, result.x, result.y, value)
+        if status is QpStatus.ITERATION_LIMIT:
+            rows = self._A @ result.x
+            broken = max(float((lower - rows).max()), float((rows - upper).max()))
+            status = status if broken <= LARGEST_BREACH else QpStatus.FAILED
+        return _solution(status, self._P, self._q, result.x, result.y, len(lower))
+
+
+class DaqpProgram:
+    """A ``QuadraticProgram`` for DAQP (MIT); P must be positive definite."""
+
+    def __init__(self, P: np.ndarray, q: np.ndarray, A: np.ndarray) -> None:
+        self._P, self._q = np.ascontiguousarray(P), q
+        try:
+            import daqp
+        except ImportError as error:
+            raise UserError("QP solver daqp: the package is not installed; pip install daqp, or use osqp") from error
+        count = len(q)
+        # DAQP takes leading rows of the identity as plain bounds.
+        plain = A.shape[0] >= count and np.array_equal(A[:count], np.eye(count))
+        self._rows = np.ascontiguousarray(A[count:] if plain else A)
+        self._model = daqp.Model()
+        # A static contact's rows repeat each other: without reduction DAQP takes some sets of them for contradictory.
+        self._model.settings = {"eq_reduction": 1}
+        self._ready = False
+
+    def solve(self, lower: np.ndarray, upper: np.ndarray) -> QpSolution:
+        """See ``QuadraticProgram``."""
+        low, high = np.maximum(lower, -1e30), np.minimum(upper, 1e30)
+        held = np.where(high - low < 1e-13, 5, 0).astype(np.int32)
+        # Setting up already finds held rows that contradict each other.
+        if self._ready:
+            flag = self._model.update(bupper=high, blower=low, sense=held)
+        else:
+            flag, _ = self._model.setup(self._P, self._q, self._rows, high, low, held)
+            self._ready = flag >= 0
+        x, multipliers = None, None
+        if flag >= 0:
+            x, _, flag, info = self._model.solve()
+            multipliers = np.asarray(info["lam"])
+        status = {
+            1: QpStatus.SOLVED,
+            2: QpStatus.INEXACT,
+            -1: QpStatus.INFEASIBLE,
+            -4: QpStatus.ITERATION_LIMIT,
+            -6: QpStatus.INFEASIBLE,  # held rows contradict each other
+        }.get(flag, QpStatus.FAILED)
+        return _solution(status, self._P, self._q, x, multipliers, len(lower))
+
+
+def _solution(status: QpStatus, P: np.ndarray, q: np.ndarray, x: Any, multipliers: Any, rows: int) -> QpSolution:
+    solution = QpSolution(status, x, multipliers, float("inf"))
+    if not solution.usable or x is None or not np.isfinite(x).all():
+        failed = QpStatus.INFEASIBLE if status is QpStatus.INFEASIBLE else QpStatus.FAILED
+        return QpSolution(failed, np.zeros(len(q)), np.zeros(rows), float("inf"))
+    return QpSolution(status, x, multipliers, float(0.5 * x @ P @ x + q @ x))

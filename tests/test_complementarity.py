@@ -1,81 +1,38 @@
-"""Contact states as bounds (Eq. 9, 12, 13): each state's rows, and pivots against brute force over all states."""
+"""Contact states as bounds (Eq. 9, 12, 13): each state's rows, and moves between states against brute force over all of them."""
 
 from __future__ import annotations
 
-import itertools
-from dataclasses import dataclass
-from types import SimpleNamespace
-
-import daqp
 import numpy as np
 import pytest
 
-from egs_warp.complementarity import SEPARATE, STATIC, ContactLayout, proposed_pivots, states_from_prediction
+from egs_warp.complementarity import (
+    SEPARATE,
+    STATIC,
+    ContactLayout,
+    plain_pivots,
+    proposed_pivots,
+    states_from_prediction,
+    states_of_pairs,
+)
 from egs_warp.contact import tangent_directions
-from egs_warp.locomotion import _pivot, _rows
-from egs_warp.qp import QuadraticProgram
-
-FRICTION = 0.8
-
-
-@dataclass(frozen=True)
-class SmallProblem:
-    """Two contacts, three activations, eight degrees of freedom; units of weight and speed are 1."""
-
-    layout: ContactLayout
-    base: np.ndarray
-    response: np.ndarray
-    frame: np.ndarray
-    shift: np.ndarray
-    P: np.ndarray
-    q: np.ndarray
-    A: np.ndarray
-    offset: np.ndarray
-
-    def velocities(self, x: np.ndarray) -> np.ndarray:
-        return (self.frame @ (self.base + self.response @ x)).reshape(-1, 3)
+from egs_warp.contact_program import ContactProgram
+from egs_warp.qp import QpSolver, quadratic_program
+from tests.contact_programs import FRICTION, optimum_of_each, small_problem
 
 
-def small_problem(seed: int, *, contacts: int = 2, activations: int = 3, directions: int = 4) -> SmallProblem:
-    """v = base + R a + J^T f with random J whose normals share a direction, asked to reach a random velocity."""
-    rng = np.random.default_rng(seed)
-    layout = ContactLayout(activations, contacts, directions)
-    frame = rng.standard_normal((3 * contacts, 8))
-    frame[0::3, 0] = 2.0
-    base = rng.standard_normal(8) - 1.5 * np.eye(8)[0]
-    push = frame.T.reshape(8, contacts, 3)
-    table = tangent_directions(directions)
-    tangent = np.einsum("vnt,dt->vnd", push[:, :, 1:], table).reshape(8, -1)
-    response = np.hstack([rng.standard_normal((8, activations)), push[:, :, 0], tangent, np.zeros((8, contacts))])
-    shift = rng.uniform(-0.1, 0.3, contacts)
-    wanted = rng.standard_normal((4, 8))
-    rows, gap = wanted @ response, wanted @ base - rng.standard_normal(4)
-    P = 2.0 * rows.T @ rows + 1e-3 * np.eye(layout.variables)
-    set_of = SimpleNamespace(frame=frame, count=contacts)
-    A, offset = _rows(SimpleNamespace(base=base, response=response), set_of, shift, layout, FRICTION, 1.0)
-    return SmallProblem(layout, base, response, frame, shift, P, 2.0 * rows.T @ gap, A, offset)
-
-
-def exact(problem: SmallProblem, states: np.ndarray) -> tuple[float, np.ndarray]:
-    """Optimum for one choice of states by DAQP; infinite where infeasible."""
-    lower, upper = problem.layout.bounds(states)
-    lower, upper = np.maximum(lower - problem.offset, -1e30), np.minimum(upper - problem.offset, 1e30)
-    sense = np.where(upper - lower < 1e-12, 5, 0).astype(np.int32)
-    x, value, flag, _ = daqp.solve(problem.P, problem.q, problem.A, upper, lower, sense)
-    return (value, np.array(x)) if flag > 0 else (np.inf, np.array(x))
-
-
-def all_states(layout: ContactLayout) -> list[np.ndarray]:
-    choices = range(SEPARATE, layout.directions)
-    return [np.array(s) for s in itertools.product(choices, repeat=layout.contacts)]
+def obeys(program: ContactProgram, y: np.ndarray, states: np.ndarray) -> bool:
+    """Whether ``y`` is a feasible point of these states."""
+    lower, upper = program.bounds(states)
+    rows = program.A @ y
+    return bool((rows - lower).min() > -2e-5 and (upper - rows).min() > -2e-5)
 
 
 def test_rows_are_the_terms_of_the_lcp() -> None:
     """Eq. (9), Eq. (13): rows A y + offset are y, c = u_n + shift, D^T u + E lambda and mu f_n - E^T f_t, one by one."""
     problem = small_problem(0, contacts=3, directions=6)
-    layout = problem.layout
+    program, layout = problem.program, problem.program.layout
     y = np.random.default_rng(1).standard_normal(layout.variables)
-    rows = problem.A @ y + problem.offset
+    rows = program.A @ y + program.offset
     u, table = problem.velocities(y), tangent_directions(6)
     assert np.array_equal(rows[: layout.variables], y)
     assert np.allclose(rows[layout.paired(layout.normal)], u[:, 0] + problem.shift)
@@ -86,32 +43,36 @@ def test_rows_are_the_terms_of_the_lcp() -> None:
         f_t = y[layout.tangent][6 * i : 6 * i + 6]
         assert rows[layout.paired(layout.slip)][i] == pytest.approx(FRICTION * y[layout.normal][i] - f_t.sum())
     assert layout.paired(layout.slip).stop == len(rows)
+    x, w = program.pairs(y)
+    assert np.array_equal(np.concatenate([y[:3], x, w]), rows)
 
 
 def test_every_state_satisfies_the_complementarity_conditions() -> None:
     """Eq. (9), Eq. (13): whatever the states, a feasible point has 0 <= x, 0 <= w, x.w = 0, and moves as its states say."""
-    feasible = 0
-    for seed in range(6):
+    feasible = between = 0
+    for seed in range(8):
         problem = small_problem(seed)
-        layout, table = problem.layout, tangent_directions(4)
-        for states in all_states(layout):
-            value, y = exact(problem, states)
-            if not np.isfinite(value):
-                continue
+        layout, table = problem.program.layout, tangent_directions(4)
+        for states, (_, y) in optimum_of_each(problem.program).items():
             feasible += 1
-            rows = problem.A @ y + problem.offset
-            x, w = rows[layout.activations : layout.variables], rows[layout.variables :]
-            assert x.min() > -1e-7 and w.min() > -1e-7 and np.abs(x * w).max() < 1e-6
+            x, w = problem.program.pairs(y)
+            assert x.min() > -1e-6 and w.min() > -1e-6 and np.abs(x * w).max() < 1e-5
             u, f_t = problem.velocities(y), y[layout.tangent].reshape(-1, 4) @ table
+            f_n = y[layout.normal]
             for i, state in enumerate(states):
                 if state == SEPARATE:
-                    assert abs(y[layout.normal][i]) < 1e-7 and np.abs(f_t[i]).max() < 1e-7
+                    assert abs(f_n[i]) < 1e-6 and np.abs(f_t[i]).max() < 1e-5
                 elif state == STATIC:
-                    assert np.abs(u[i, 1:]).max() < 1e-6
+                    assert np.abs(u[i, 1:]).max() < 1e-5
+                elif state < 4:
+                    assert np.allclose(f_t[i], FRICTION * f_n[i] * table[state], atol=1e-5)
+                    assert table[state] @ u[i, 1:] < 1e-5
                 else:
-                    assert np.allclose(f_t[i], FRICTION * y[layout.normal][i] * table[state], atol=1e-6)
-                    assert table[state] @ u[i, 1:] < 1e-6
-    assert feasible > 40
+                    between += 1
+                    first, second = table[state % 4], table[(state + 1) % 4]
+                    assert first @ f_t[i] + second @ f_t[i] == pytest.approx(FRICTION * f_n[i], abs=1e-5)
+                    assert first @ u[i, 1:] == pytest.approx(second @ u[i, 1:], abs=1e-5)
+    assert feasible > 100 and between > 20
 
 
 def test_states_from_prediction() -> None:
@@ -124,69 +85,73 @@ def test_states_from_prediction() -> None:
     assert states.tolist() == [SEPARATE, STATIC, 2, 1, 0]
 
 
-def test_soft_bounds_keep_the_velocities_and_free_the_forces() -> None:
-    """DESIGN 8: softened, the all-static choice always has a point, and whatever is solved still moves as its states say."""
-    for seed in range(4):
-        problem = small_problem(seed)
-        program = QuadraticProgram(problem.P, problem.q, problem.A)
-        for states in (np.full(2, STATIC), np.array([STATIC, SEPARATE]), np.array([0, STATIC]), np.array([2, 3])):
-            lower, upper = problem.layout.bounds(states, soft=True)
-            solution = program.solve(lower - problem.offset, upper - problem.offset)
-            if not solution.usable:
-                assert (states != STATIC).any()
-                continue
-            u = problem.velocities(solution.x)
-            closed = states >= STATIC
-            assert np.abs((u[:, 0] + problem.shift)[closed]).max(initial=0.0) < 1e-3
-            assert np.abs(u[states == STATIC, 1:]).max(initial=0.0) < 1e-3
+def test_states_of_pairs_are_states_the_point_obeys() -> None:
+    """Eq. (9): the states read from a complementary point have that point among their own, whatever states made it."""
+    read = same = 0
+    for seed in range(8):
+        program = small_problem(seed).program
+        for states, (_, y) in optimum_of_each(program).items():
+            found = states_of_pairs(program.layout, *program.pairs(y))
+            assert obeys(program, y, found)
+            read += 1
+            same += tuple(found) == states
+    assert read > 100 and same > 0.15 * read
 
 
-def pivoted(problem: SmallProblem, states: np.ndarray, limit: int) -> tuple[float, int]:
-    program = QuadraticProgram(problem.P, problem.q, problem.A)
-    linear = SimpleNamespace(base=problem.base, response=problem.response)
-    stepper = SimpleNamespace(speed_scale=1.0, geometry=SimpleNamespace(friction=FRICTION))
-    contacts = SimpleNamespace(frame=problem.frame)
-    best, count, _ = _pivot(program, problem.layout, states, problem.offset, linear, contacts, stepper, limit)
-    assert best is not None and count <= limit
-    return best.objective, count
+def test_moves_are_feasible_and_almost_always_better() -> None:
+    """DESIGN 8: the optimum of any states obeys the states of each proposed move, and of all together; most moves are better.
 
-
-def test_pivots_never_return_a_worse_objective_and_are_bounded_by_brute_force() -> None:
-    """Eq. (13): from every feasible start of 12 problems, brute-force optimum <= pivoted <= start.
-
-    Pivots only see what the multipliers show of the next state, so many end in a local optimum.
+    A move that one multiplier proposes without regard to the contact's other rows is often not feasible at all.
     """
-    reached = starts = improved = 0
+    proposed = solved = better = plain = plain_lost = 0
     for seed in range(12):
-        problem = small_problem(seed)
-        values = {tuple(s): exact(problem, s)[0] for s in all_states(problem.layout)}
-        optimum = min(values.values())
-        for states, start in values.items():
-            if not np.isfinite(start):
-                continue
-            value, _ = pivoted(problem, np.array(states), 30)
-            tolerance = 2e-3 * (1.0 + abs(optimum))
-            assert optimum - tolerance <= value <= start + 1e-2 * (1.0 + abs(start))  # OSQP stops at 3e-5
-            starts += 1
-            improved += value < start - tolerance
-            reached += value < optimum + tolerance
-    assert starts > 100 and improved > 0.3 * starts and reached > 0.25 * starts
+        program = small_problem(seed, directions=6 if seed % 2 else 4).program
+        qp = quadratic_program(program.P, program.q, program.A, solver=QpSolver.DAQP)
+        values = optimum_of_each(program)
+        for states, (value, _) in values.items():
+            solution = qp.solve(*program.bounds(np.array(states)))
+            arguments = (program.layout, np.array(states), *program.pairs(solution.x), solution.multipliers)
+            together = np.array(states)
+            for gain, contact, state in proposed_pivots(*arguments, zero=1e-5)[::-1]:
+                together[contact] = state
+                moved = (*states[:contact], state, *states[contact + 1 :])
+                assert gain > 0.0 and obeys(program, solution.x, np.array(moved))
+                proposed += 1
+                if moved in values:
+                    solved += 1
+                    better += values[moved][0] < value - 1e-9
+                    assert values[moved][0] < value + 1e-5 * (1.0 + abs(value))
+            assert obeys(program, solution.x, together)
+            for _, contact, state in plain_pivots(*arguments, zero=1e-5):
+                plain += 1
+                plain_lost += not obeys(
+                    program, solution.x, np.array((*states[:contact], state, *states[contact + 1 :]))
+                )
+    assert proposed > 400 and solved > 0.95 * proposed and better > 0.8 * solved
+    assert plain_lost > 0.1 * plain
 
 
-def test_pivots_name_the_contact_that_helps() -> None:
+def test_moves_name_the_contact_that_helps() -> None:
     """DESIGN 8: a closed contact that holds the body down is opened, an open one that could help is closed to sliding."""
     layout = ContactLayout(0, 1, 4)
-    rows = 2 * layout.variables
-    x, y = np.zeros(layout.variables), np.zeros(rows)
-    y[layout.paired(layout.normal)] = 0.5
-    assert proposed_pivots(layout, np.array([STATIC]), x, y, np.zeros((1, 2)), FRICTION) == [(0.5, 0, SEPARATE)]
-    y = np.zeros(rows)
-    y[layout.normal] = 0.2
-    moving = np.array([[-1.0, 0.1]])
-    assert proposed_pivots(layout, np.array([SEPARATE]), x, y, moving, FRICTION) == [(0.2, 0, 0)]
-    assert proposed_pivots(layout, np.array([SEPARATE]), x, y, 0 * moving, FRICTION) == [(0.2, 0, STATIC)]
-    y = np.zeros(rows)
-    y[layout.tangent.start + 3] = 0.3
-    x[layout.normal] = 1.0
-    assert proposed_pivots(layout, np.array([2]), x, y, 0 * moving, FRICTION) == [(0.3, 0, STATIC)]
-    assert proposed_pivots(layout, np.array([2]), x, -y, 0 * moving, FRICTION) == []
+    zeros, lam = np.zeros(6), slice(5, 6)
+
+    def moves(state: int, x: np.ndarray, w: np.ndarray, **rows: float) -> list[tuple[float, int, int]]:
+        y = np.zeros(12)
+        for name, value in rows.items():
+            y[{"f_n": 0, "f_3": 4, "c": 6, "w_0": 7, "w_1": 8, "cone": 11}[name]] = value
+        return proposed_pivots(layout, np.array([state]), x, w, y)
+
+    assert moves(STATIC, zeros, zeros, c=0.5) == [(0.5, 0, SEPARATE)]
+    along = np.array([0.0, -1.0, 0.1, 1.0, -0.1, 0.0])
+    assert moves(SEPARATE, zeros, along, f_n=0.2) == [(0.2, 0, 0)]
+    assert moves(SEPARATE, zeros, zeros, f_n=0.2) == [(0.2, 0, STATIC)]
+    assert moves(SEPARATE, zeros, along + np.eye(6)[0], f_n=0.2) == []  # it has speed to spare
+    loaded = np.eye(6)[0]
+    assert moves(2, loaded, zeros, f_3=0.3) == [(0.3, 0, STATIC), (0.3, 0, 4 + 2)]
+    assert moves(2, loaded, zeros, cone=0.4) == [(0.4, 0, STATIC)]
+    assert moves(2, loaded, zeros, f_3=-0.3) == []
+    sliding = loaded.copy()
+    sliding[lam] = 1.0
+    assert moves(2, sliding, np.zeros(6), f_3=0.3) == [(0.3, 0, 4 + 2)]
+    assert moves(4 + 0, sliding, zeros, w_1=0.3) == [(0.3, 0, 0)]

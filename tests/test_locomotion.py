@@ -11,18 +11,26 @@ from egs_warp.body import BodyState, SoftBody, make_body
 from egs_warp.contact import ContactGeometry
 from egs_warp.embedding import embed_points
 from egs_warp.fibres import Fibre, FibreKind
-from egs_warp.locomotion import LocomotionStepper, StepMemory, StepReport
+from egs_warp.locomotion import LocomotionSettings, LocomotionStepper, StepMemory, StepReport
 from egs_warp.muscles import attach_fibres
 from egs_warp.objectives import Objective, SpinObjective, centre_of_mass_velocity, node_velocities
 from egs_warp.plane import Plane
+from egs_warp.qp import QpSolver
+from egs_warp.strategies import Strategy
 from tests.meshes import block_mesh
 
 DT, FRICTION = 1 / 60, 0.8
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 
 
-def muscular_block(device: str = "cpu") -> LocomotionStepper:
-    """A block with eight longitudinal and four radial fibres and 25 contact points under its base."""
+SIDE = np.linspace(-0.2, 0.2, 5)
+GRID = np.array([[x, y] for x in SIDE for y in SIDE])
+
+
+def muscular_block(
+    device: str = "cpu", *, feet: np.ndarray = GRID, settings: LocomotionSettings | None = None
+) -> LocomotionStepper:
+    """A block with eight longitudinal and six radial fibres and contact points ``feet`` (n, 2) under its base."""
     mesh = block_mesh()
     body = make_body(mesh, FLOOR, sag=0.03, device=device)
     heights = np.array([0.02, 0.26, 0.5, 0.74, 0.98])
@@ -35,10 +43,9 @@ def muscular_block(device: str = "cpu") -> LocomotionStepper:
         for axis in np.eye(3)[:2]:
             ends = np.stack([-0.18 * axis, 0.18 * axis]) + [0, 0, z]
             fibres.append(Fibre(f"radial{k}{axis}", FibreKind.RADIAL, ends, 2.0 * body.weight))
-    side = np.linspace(-0.2, 0.2, 5)
-    embedding = embed_points(mesh, np.array([[x, y, 0.0] for x in side for y in side]), device="cpu")
+    embedding = embed_points(mesh, np.column_stack([feet, np.zeros(len(feet))]), device="cpu")
     geometry = ContactGeometry(mesh, (FLOOR,), FRICTION, embedding.tets.numpy(), embedding.weights.numpy(), 0, 0.0)
-    return LocomotionStepper(body, attach_fibres(mesh, fibres), geometry, device=device)
+    return LocomotionStepper(body, attach_fibres(mesh, fibres), geometry, settings=settings, device=device)
 
 
 def hop(body: SoftBody, step: int) -> list[Objective | SpinObjective]:
@@ -114,6 +121,38 @@ def test_two_runs_are_bit_identical() -> None:
         for r, s in zip(reports, twins, strict=True):
             assert r.forces.tobytes() == s.forces.tobytes() and r.activations.tobytes() == s.activations.tobytes()
             assert np.array_equal(r.contacts.points, s.contacts.points) and r.qp_count == s.qp_count
+
+
+@pytest.mark.parametrize("solver", list(QpSolver))
+@pytest.mark.parametrize(
+    "feet",
+    [
+        np.column_stack([np.linspace(-0.2, 0.2, 7), np.zeros(7)]),
+        np.repeat([[-0.2, -0.2], [0.2, -0.2], [0.0, 0.2]], 4, axis=0),
+        np.zeros((1, 2)),
+        np.random.default_rng(0).uniform(-0.2, 0.2, (40, 2)),
+    ],
+    ids=["line", "duplicates", "one point", "forty points"],
+)
+def test_degenerate_contact_sets_never_lose_a_frame(feet: np.ndarray, solver: QpSolver) -> None:
+    """Eq. (9), Eq. (13): every step converges, finds feasible states and keeps its points out of the ground."""
+    stepper = muscular_block(feet=feet, settings=LocomotionSettings(contact_pivot_tolerance=0.0, qp_solver=solver))
+    _, reports = run_hop(stepper, 8)
+    assert len(reports) == 8
+    for report in reports:
+        assert report.converged and report.qp_count >= 1 and report.qp_infeasible == 0
+        assert np.isfinite(report.state.velocities).all() and np.isfinite(report.forces).all()
+        assert report.min_gap > -0.01 * stepper.body.height
+    assert any(report.contacts.count > 0 for report in reports)
+
+
+@pytest.mark.parametrize("strategy", [Strategy.STATIC, Strategy.QPCC, Strategy.TWO_STAGE])
+def test_every_strategy_drives_the_stepper(strategy: Strategy) -> None:
+    """Eq. (12), Eq. (13): the same steps with another search; all static takes one QP, two where that has no solution."""
+    settings = LocomotionSettings(strategy=strategy, qp_limit=6, qp_solver=QpSolver.DAQP)
+    _, reports = run_hop(muscular_block(settings=settings), 6)
+    assert all(report.converged for report in reports)
+    assert strategy is not Strategy.STATIC or max(report.qp_count for report in reports) <= 2
 
 
 class LateStepper(LocomotionStepper):

@@ -1,0 +1,192 @@
+"""Frames for the solver benchmarks: an animation made with known activations, and each of its steps as a program."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.cluster.vq import kmeans2
+
+from egs_warp.base_plane import find_base_plane
+from egs_warp.body import BodyState, make_body
+from egs_warp.cage import build_cage
+from egs_warp.complementarity import ContactLayout, states_from_prediction
+from egs_warp.contact import contact_geometry
+from egs_warp.contact_program import ContactProgram, CostScales, contact_program, linear_response
+from egs_warp.contact_step import contact_step
+from egs_warp.dynamics import Factorisation, ImplicitStep, conserve_angular_momentum
+from egs_warp.io import read_capture
+from egs_warp.locomotion import LocomotionSettings, LocomotionStepper
+from egs_warp.muscles import MuscleColumns, MuscleSet, automatic_muscles
+from egs_warp.objectives import SpinObjective, centre_of_mass_velocity, node_velocities
+from egs_warp.prediction import predict
+from egs_warp.scenes import pawn, stool
+from egs_warp.simulation import FRAME_RATE, settle
+from egs_warp.stance import Weights
+
+CAPTURES = {"monkey": ("monkey.ply", (0.0, 1.0, 0.0)), "plush dog": ("plush_dog.ply", (0.0, -1.0, 0.0))}
+"""File and up axis of real captures in the data folder."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One step of the animation as every strategy gets it."""
+
+    program: ContactProgram
+    predicted: np.ndarray
+    """(n,) states of stage 1."""
+    previous: np.ndarray
+    """(M,) the known activations of the step before, in their bounds."""
+    known: np.ndarray
+    """(M,) those of this step."""
+
+
+def data_folder() -> Path:
+    """Folder of the real captures: $EGS_WARP_DATA, else beside the repository."""
+    return Path(os.environ.get("EGS_WARP_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+@dataclass(frozen=True)
+class BenchBody:
+    """A standing body with muscles and a ground."""
+
+    stepper: LocomotionStepper
+    start: BodyState
+    device: str
+
+
+def body_named(name: str, device: str, *, nodes: int = 250) -> BenchBody:
+    """A built-in body ("pawn", "stool") or a real capture of ``CAPTURES``, 1 m tall, with a cage of about ``nodes`` nodes."""
+    if name in CAPTURES:
+        file, up = CAPTURES[name]
+        cloud = read_capture(data_folder() / "objects" / file, device=device).cloud
+        plane = find_base_plane(cloud, np.array(up))
+    else:
+        scene = {"pawn": pawn, "stool": stool}[name](device=device)
+        cloud, plane = scene.cloud, scene.plane
+    cage = build_cage(cloud, plane, target_nodes=nodes)
+    scale = 1.0 / cage.height(plane)
+    cloud, plane, cage = cloud.scaled(scale), plane.scaled(scale), cage.scaled(scale)
+    body = make_body(cage.mesh, plane, sag=0.02, device=device)
+    muscles = automatic_muscles(
+        cage.mesh,
+        plane.normal,
+        body_weight=body.weight,
+        height=body.height,
+        strength=body.stiffening,
+        young_modulus=body.young_modulus,
+    )
+    geometry = contact_geometry(cloud, cage.mesh, (plane,), device=device)
+    stepper = LocomotionStepper(body, muscles, geometry, device=device)
+    return BenchBody(stepper, settle(stepper), device)
+
+
+def grouped_segments(muscles: MuscleSet, nodes: np.ndarray, groups: int, seed: int) -> np.ndarray:
+    """(M, groups) 0 or 1: each group is neighbouring segments of a like direction that act as one; ``nodes`` (N, 3) at rest."""
+    ends = muscles.end_points(nodes)
+    first, second = ends[muscles.segments[:, 0]], ends[muscles.segments[:, 1]]
+    upright = np.abs(second - first)[:, 2] / np.linalg.norm(second - first, axis=1)
+    features = np.column_stack([0.5 * (first + second), 0.5 * upright * np.ptp(nodes, axis=0).max()])
+    _, group = kmeans2(features, groups, minit="++", seed=seed)
+    return np.eye(groups)[group]
+
+
+def spread_points(bench: BenchBody, count: int) -> np.ndarray:
+    """(count,) contact points far apart from each other among those on the ground at rest."""
+    gaps, _ = bench.stepper.detector.gaps(bench.start.positions)
+    near = np.flatnonzero(gaps < 0.01 * bench.stepper.body.height)
+    nodes = bench.stepper.geometry.mesh.tets[bench.stepper.geometry.tet_from_point[near]]
+    places = np.einsum("kw,kwi->ki", bench.stepper.geometry.weights[near], bench.start.positions[nodes])
+    chosen = [int(np.argmax(np.linalg.norm(places - places.mean(axis=0), axis=1)))]
+    while len(chosen) < count:
+        distances = np.linalg.norm(places[:, None] - places[chosen], axis=2).min(axis=1)
+        chosen.append(int(np.argmax(distances)))
+    return near[chosen]
+
+
+def known_activations(count: int, frames: int, strength: float, seed: int) -> np.ndarray:
+    """(frames + 1, count) smooth signals in [-strength, strength] that begin at rest."""
+    random = np.random.default_rng(seed)
+    time = np.arange(frames + 1)[:, None, None]
+    periods = random.uniform(5.0, 25.0, (1, count, 3))
+    waves = np.sin(2.0 * np.pi * (time / periods + random.random((1, count, 3))))
+    ramp = np.minimum(np.arange(frames + 1) / 5.0, 1.0)[:, None]
+    return strength * ramp * waves.mean(axis=2) / np.abs(waves.mean(axis=2)).max()
+
+
+def animation_frames(
+    bench: BenchBody,
+    *,
+    frames: int = 50,
+    activations: int = 10,
+    contacts: int = 5,
+    directions: int = 8,
+    strength: float = 0.3,
+    seed: int = 0,
+) -> list[Frame]:
+    """An animation with known activations of muscle groups and exact contact at a few points; each step as a program.
+
+    A step asks for the animation's own end velocity: that of the centre of mass, the spin and the pose.
+    """
+    body, stepper = bench.stepper.body, bench.stepper
+    settings = LocomotionSettings()
+    groups = grouped_segments(bench.stepper.muscles, body.mesh.nodes, activations, seed)
+    points = spread_points(bench, contacts)
+    columns = MuscleColumns(bench.stepper.muscles, device=bench.device)
+    known = known_activations(activations, frames, strength, seed)
+    weight = body.node_mass[:, None] * body.gravity
+    dt, cap = 1.0 / FRAME_RATE, settings.push_out_cap * stepper.speed_scale
+    scales = CostScales(stepper.speed_scale, settings.activation_weight, settings.activation_change_weight)
+    layout = ContactLayout(activations, contacts, directions)
+    friction, weights = bench.stepper.geometry.friction, Weights()
+    factorisation = Factorisation(body)
+    state, forces = bench.start, np.zeros((contacts, 3))
+    made = []
+    for previous, current in zip(known[:-1], known[1:], strict=True):
+        step = ImplicitStep(body, state, dt, factorisation)
+        actuation = (columns.sparse(state.positions).multiply(bench.stepper.muscles.bounds)).tocsr() @ groups
+        result = contact_step(
+            step,
+            stepper.detector,
+            points,
+            weight + (actuation @ current).reshape(-1, 3),
+            start_velocities=state.velocities,
+            start_forces=forces,
+            push_out_cap=cap,
+            penetration_tolerance=np.inf,
+        )
+        if not result.converged:
+            raise RuntimeError(f"the animation failed at frame {len(made)}; use less strength")
+        end = step.end_positions(result.velocities)
+        velocities, _ = conserve_angular_momentum(body, state, end, result.velocities, result.nodal_forces, dt)
+        contact_set = stepper.detector.contact_set(points, state.positions)
+        prediction = predict(
+            step,
+            contact_set,
+            weight + (actuation @ previous).reshape(-1, 3),
+            state.velocities,
+            normal_forces=forces[:, 0],
+            friction=friction,
+            push_out_cap=cap,
+        )
+        linear = linear_response(step, actuation, contact_set, prediction.velocities, layout)
+        objectives = [
+            centre_of_mass_velocity(body, body.centre_of_mass(result.velocities), weights.com),
+            SpinObjective(body.angular_momentum(end, velocities), weights.spin),
+            node_velocities(body, result.velocities, weights.pose),
+        ]
+        program = contact_program(
+            step, linear, contact_set, layout, objectives, previous, friction=friction, push_out_cap=cap, scales=scales
+        )
+        predicted = states_from_prediction(
+            prediction.normal_forces,
+            prediction.tangential_forces,
+            prediction.tangential_velocities,
+            friction,
+            directions,
+        )
+        made.append(Frame(program, predicted, previous, current))
+        state, forces = BodyState(end, velocities, state.time + dt), result.forces
+    return made

@@ -1,0 +1,52 @@
+"""Linear complementarity problems by Lemke's method."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def lemke(matrix: np.ndarray, q: np.ndarray, *, pivot_limit: int = 2000) -> np.ndarray | None:
+    """z (n,) with 0 <= z, 0 <= matrix z + q and their product zero; None on a secondary ray or at ``pivot_limit``.
+
+    For the contact rows of Eq. (9) the matrix is copositive and the method ends at a solution (Anitescu and Potra 1997). Ties
+    are broken lexicographically by the columns of the basis inverse, so degenerate problems cannot cycle.
+    """
+    count = len(q)
+    if count == 0 or q.min() >= 0.0:
+        return np.zeros(count)
+    # Columns: w (n), z (n), the covering variable, the right-hand side. w - M z - e z0 = q.
+    tableau = np.hstack([np.eye(count), -matrix, -np.ones((count, 1)), q[:, None]])
+    basis = np.arange(count)
+    scale = 1e-11 * max(1.0, float(np.abs(matrix).max()))
+    row, entering = int(np.argmin(q)), 2 * count
+    for _ in range(pivot_limit):
+        leaving = basis[row]
+        tableau[row] /= tableau[row, entering]
+        others = np.arange(count) != row
+        tableau[others] -= np.outer(tableau[others, entering], tableau[row])
+        basis[row] = entering
+        if leaving == 2 * count:
+            solution = np.zeros(2 * count + 1)
+            solution[basis] = tableau[:, -1]
+            return np.maximum(solution[count : 2 * count], 0.0)
+        entering = leaving + count if leaving < count else leaving - count
+        column = tableau[:, entering]
+        usable = np.flatnonzero(column > scale)
+        if len(usable) == 0:
+            return None
+        row = _smallest_ratio(tableau, column, usable, basis, 2 * count)
+    return None
+
+
+def _smallest_ratio(tableau: np.ndarray, column: np.ndarray, rows: np.ndarray, basis: np.ndarray, cover: int) -> int:
+    """Row of the smallest ratio; the covering variable leaves first, other ties go to the lexicographic minimum."""
+    count = len(tableau)
+    for index in (-1, *range(count)):
+        ratios = tableau[rows, index] / column[rows]
+        low = ratios.min()
+        rows = rows[ratios <= low + 1e-12 * max(1.0, abs(low))]
+        if len(rows) == 1:
+            break
+        if index == -1 and (basis[rows] == cover).any():
+            return int(rows[basis[rows] == cover][0])
+    return int(rows[0])
