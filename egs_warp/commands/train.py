@@ -152,7 +152,9 @@ def _writer(out: Path):
 
 def _report(chosen: argparse.Namespace, result, progress: _Progress, seconds: float) -> dict:
     import platform
-    from importlib.metadata import version
+
+    import torch
+    import warp as wp
 
     import egs_warp
 
@@ -181,7 +183,9 @@ def _report(chosen: argparse.Namespace, result, progress: _Progress, seconds: fl
         "versions": {
             "egs-warp": egs_warp.__version__,
             "python": platform.python_version(),
-            **{name: version(name) for name in ("warp-lang", "numpy", "torch")},
+            "warp-lang": wp.__version__,
+            "numpy": np.__version__,
+            "torch": torch.__version__,
         },
     }
 
