@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from egs_warp.body import BodyState
 from egs_warp.motions import Jump, JumpPhase, JumpTarget
+from egs_warp.objectives import Objective, SpinObjective
 from egs_warp.sequence import Place
 from egs_warp.stance import Ground, Measurement, PoseFamily, Weights
 
+DEEPEST_CROUCH = 0.3
+"""Of the height of the centre of mass; a higher jump thrusts harder instead."""
+FOOTHOLD = 0.4
+"""Of the footprint: how far from the capture point the feet may be put down for the sake of the target."""
 CALM = 0.03
 """Speed of the centre of mass, in sqrt(g H), below which a body that has landed is at rest."""
 
@@ -47,12 +55,48 @@ class Leap(Jump):
             self._landing.world(ground.local(place.standing)),
             self._landing.world(ground.local(place.touching)),
         )
+        crouch = min(self.plan.crouch_depth, DEEPEST_CROUCH * self.pose.standing_height)
+        stroke = crouch + self.plan.extension
+        self.plan = replace(self.plan, crouch_depth=crouch, thrust_time=2.0 * stroke / self.plan.speed_up)
         self._calm_since: float | None = None
 
     @property
     def left_ground(self) -> bool:
         """Whether the motion is told in the frame of the landing."""
         return self.pose is self._landing_pose
+
+    def _thrust_velocity(
+        self, com_velocity: np.ndarray, seen: Measurement, position: np.ndarray, dt: float
+    ) -> np.ndarray:
+        """Along the ground the speed that brings the centre of mass from where it is to where it shall touch down."""
+        plan, velocity = self.plan, super()._thrust_velocity(com_velocity, seen, position, dt)
+        left = max((plan.speed_up - seen.velocity[2]) / plan.speed_up * plan.thrust_time, dt)
+        goal = np.array([self._landing_com(position)[0], self._start_com[1]])
+        needed = (goal - seen.com[:2] - 0.5 * left * seen.velocity[:2]) / (plan.flight_time + 0.5 * left)
+        change = (needed - seen.velocity[:2]) * dt / left
+        return self._balanced(seen, np.array([*(seen.velocity[:2] + change), velocity[2]]), dt)
+
+    def _falling(self, seen: Measurement, dt: float) -> tuple[np.ndarray, float, np.ndarray]:
+        """As for any jump, but the feet touch down when they have fallen by their distance to the ground now."""
+        touch_down, latest, velocity = super()._falling(seen, dt)
+        speed, gap = seen.velocity[2], max(seen.sole_height, 0.0)
+        left = min(max((speed + np.sqrt(speed**2 + 2.0 * self.gravity * gap)) / self.gravity, dt), latest)
+        touch_down[:2] = seen.com[:2] + seen.velocity[:2] * left
+        return touch_down, left, velocity
+
+    def _fly(self, state: BodyState, seen: Measurement, dt: float) -> list[Objective | SpinObjective]:
+        touch_down, _, velocity = self._falling(seen, dt)
+        pose = self.pose.over_base(touch_down, self._foothold(seen, touch_down))
+        # A foot that lags on the ground must not push any more.
+        momentum = self.body.angular_momentum(state.positions, state.velocities)
+        return self._write(state, velocity, pose, np.linalg.solve(self.body.inertia(state.positions), momentum), dt)
+
+    def _foothold(self, seen: Measurement, touch_down: np.ndarray) -> np.ndarray:
+        """(2,) where to put the feet: the target, if the body that comes in so can stop over it."""
+        capture_time = np.sqrt(self.pose.standing_height / self.gravity)
+        capture = touch_down[:2] + seen.velocity[:2] * capture_time + self.pose.base_offset
+        low, high = self.pose.support_low, self.pose.support_high
+        return np.clip(self._goal_base, capture + FOOTHOLD * low, capture + FOOTHOLD * high)
 
     def _advance_phase(self, seen: Measurement, time: float, dt: float) -> None:
         super()._advance_phase(seen, time, dt)

@@ -163,11 +163,17 @@ class Jump:
             com_velocity = velocity + rate * (position - velocity * dt - seen.com)
             com_velocity = self._balanced(seen, com_velocity, dt)
             if self.phase is JumpPhase.THRUST:
-                com_velocity[2] = min(com_velocity[2], self._sufficient_speed(seen, dt))
-                forward = (self._landing_com(position)[0] - seen.com[0]) / self.plan.flight_time
-                com_velocity[0] = min(com_velocity[0], max(forward, 0.0))
+                com_velocity = self._thrust_velocity(com_velocity, seen, position, dt)
             return self._stand(state, com_velocity, position, self._start_base, dt)
         return self._land(state, seen, dt)
+
+    def _thrust_velocity(
+        self, com_velocity: np.ndarray, seen: Measurement, position: np.ndarray, dt: float
+    ) -> np.ndarray:
+        """``com_velocity`` (3,) m/s, no faster than free flight to the target needs; ``position`` (3,) is the reference's."""
+        forward = (self._landing_com(position)[0] - seen.com[0]) / self.plan.flight_time
+        speed_up = min(com_velocity[2], self._sufficient_speed(seen, dt))
+        return np.array([min(com_velocity[0], max(forward, 0.0)), com_velocity[1], speed_up])
 
     def _advance_phase(self, seen: Measurement, time: float, dt: float) -> None:
         elapsed, plan = time - self._entered, self.plan
