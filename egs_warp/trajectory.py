@@ -69,7 +69,9 @@ class Trajectory:
     def load(cls, path: Path) -> Trajectory:
         """Read what ``save`` wrote."""
         with np.load(path) as data:
-            values = {name: data[name] for name in cls.__dataclass_fields__}
+            values = {name: data[name] for name in cls.__dataclass_fields__ if name in data}
+        # Files of before there were solids: every plane a half space.
+        values.setdefault("solid_from_plane", np.arange(len(values["planes"]), dtype=np.int32))
         for name in ("friction", "drag", "height"):
             values[name] = float(values[name])
         return cls(**values)
