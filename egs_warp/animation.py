@@ -223,7 +223,7 @@ def animate(
                 entry.motion.planned(),
                 measure(simulation.trajectory, first=first, last=last),
                 entry.motion.notes(),
-                also_reached(entry.motion, simulation.trajectory.positions[last]),
+                also_reached(entry.motion, simulation.trajectory, first, last),
             )
             for entry, (first, last) in zip(sequence.done, sequence.spans(simulation.trajectory.time), strict=True)
         ],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 
 import numpy as np
 
@@ -13,10 +14,14 @@ from egs_warp.leap import Leap
 from egs_warp.motions import JumpTarget
 from egs_warp.script import MotionRequest
 from egs_warp.sequence import BodyMotion, Part, Place
+from egs_warp.trajectory import Trajectory
 from egs_warp.twist import Twist
+from egs_warp.walk import Walk
 
-FRAMES: Mapping[str, int] = {"jump": 120, "hop": 150, "twist": 120, "walk": 120}
+FRAMES: Mapping[str, int] = {"jump": 120, "hop": 150, "twist": 120, "walk": 170}
 """Frames at 60 Hz within which a motion of each kind comes to rest; one that takes longer is cut off."""
+STEP_FRAMES = 36
+"""Frames of each step of a walk, on top."""
 TRAJECTORY_TAIL = 30
 """Frames shown after the last key of a trajectory."""
 
@@ -32,7 +37,15 @@ def _twist(asked: Mapping[str, float], place: Place) -> BodyMotion:
     return Twist(place, target, float(np.radians(asked["heading_degrees"])))
 
 
-_BEGIN: Mapping[str, Callable[[Mapping[str, float], Place], BodyMotion]] = {"jump": _jump, "twist": _twist}
+def _walk(asked: Mapping[str, float], place: Place) -> BodyMotion:
+    return Walk(place, int(asked["steps"]), asked["step_length"] * place.body.height)
+
+
+_BEGIN: Mapping[str, Callable[[Mapping[str, float], Place], BodyMotion]] = {
+    "jump": _jump,
+    "twist": _twist,
+    "walk": _walk,
+}
 
 
 def parts_of(requests: Sequence[MotionRequest], height: float) -> list[Part]:
@@ -49,15 +62,19 @@ def parts_of(requests: Sequence[MotionRequest], height: float) -> list[Part]:
             parts += [Part(request.name, asked, lambda place, keys=keys: Follow(place, keys))] * request.repeat
         else:
             begin = _BEGIN[request.name]
+            if request.name == "walk":
+                asked = {**asked, "distance": asked["steps"] * asked["step_length"]}
             for _ in range(request.repeat):
                 parts.append(Part(request.name, asked, lambda place, asked=asked, begin=begin: begin(asked, place)))
     return parts
 
 
-def also_reached(motion: BodyMotion, positions: np.ndarray) -> dict[str, float]:
-    """What a report says of a motion beside the measures that all have; ``positions`` (N, 3) at its end."""
+def also_reached(motion: BodyMotion, trajectory: Trajectory, first: int, last: int) -> dict[str, float]:
+    """What a report says of a motion beside the measures that all have; ``first`` and ``last`` are indices into ``time``."""
     if isinstance(motion, Hop):
-        return {"square_miss": motion.miss(positions) / motion.target.distance}
+        return {"square_miss": motion.miss(trajectory.positions[last]) / motion.target.distance}
+    if isinstance(motion, Walk):
+        return asdict(motion.footfalls(trajectory, first, last))
     if isinstance(motion, Follow):
         return {"worst_miss": motion.planned()["worst_miss"]}
     return {}
@@ -71,5 +88,6 @@ def longest(requests: Sequence[MotionRequest]) -> int:
             seconds = max(key.time for key in read_keyframes(request.file))
             total += request.repeat * (int(np.ceil(60.0 * seconds)) + TRAJECTORY_TAIL)
         else:
-            total += request.repeat * FRAMES[request.name]
+            steps = int(request.asked.get("steps", 0))
+            total += request.repeat * (FRAMES[request.name] + STEP_FRAMES * steps)
     return total
