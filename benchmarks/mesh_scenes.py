@@ -124,8 +124,8 @@ def microphone() -> PaintedMesh:
     return PaintedMesh("microphone", vertices, faces, checkers(0.06, ((0.15, 0.15, 0.2), (0.75, 0.75, 0.8))))
 
 
-def bar(cell: float = 0.125) -> PaintedMesh:
-    """The checkered bar of Figure 8: a quarter as thick as it is high."""
+def bar() -> PaintedMesh:
+    """The checkered bar of Figure 8: a quarter as thick as it is high, in bricks of long sides, as long Gaussians want."""
     corners = np.array([[x, y, z] for x in (-0.125, 0.125) for y in (-0.125, 0.125) for z in (0.0, 1.0)])
     faces = np.array(
         [[0, 1, 3], [0, 3, 2], [4, 7, 5], [4, 6, 7], [0, 5, 1], [0, 4, 5], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4]]
@@ -137,7 +137,7 @@ def bar(cell: float = 0.125) -> PaintedMesh:
     def paint(points: np.ndarray) -> np.ndarray:
         # Faces lie on borders between cells; looked up a little inside, so that rounding does not choose their colour.
         inside = (points - [0.0, 0.0, 0.5]) * 0.99 + [0.0, 0.0, 0.5]
-        parity = np.floor(inside / cell).astype(int).sum(axis=1) % 2
+        parity = np.floor(inside / [0.125, 0.125, 0.25]).astype(int).sum(axis=1) % 2
         return np.where(parity[:, None] == 0, [[0.9, 0.9, 0.85]], [[0.15, 0.2, 0.45]])
 
     return PaintedMesh("bar", vertices, faces, paint)
@@ -179,26 +179,22 @@ def twist_by(degrees: float) -> Motion:
     return twist
 
 
-def fall(points: np.ndarray) -> np.ndarray:
-    """The shape at the impact of a fall: squashed to 60 % at the floor and swollen above it, the middle buckled, leaning."""
-    x, y, z = points.T
-    flat = np.clip(1.0 - z / 0.5, 0.0, 1.0)
-    # z - 0.4 (z - z^2) has slope 0.6 on the floor and 1 at half height, where it meets z - 0.1.
-    squashed = np.where(z < 0.5, z - 0.4 * (z - z**2), z - 0.1)
-    swell = 1.0 + 0.7 * flat * (1.0 - flat)
-    buckle = 0.12 * np.sin(np.pi * np.clip(z, 0.0, 1.0) * 1.5)
-    return np.stack([swell * x + buckle + 0.15 * z**2, swell * y, squashed], axis=1)
-
-
-def ring(count: int, size: int, *, elevations: tuple[float, ...], phase: float = 0.0) -> list[Camera]:
-    """Cameras around the unit-high object, at each elevation (degrees) in turn."""
+def ring(
+    vertices: np.ndarray, count: int, size: int, *, elevations: tuple[float, ...], phase: float = 0.0
+) -> list[Camera]:
+    """Cameras around ``vertices`` (V, 3), which fill their pictures, at each elevation (degrees) in turn."""
+    lower, upper = vertices.min(axis=0), vertices.max(axis=0)
+    centre, distance = 0.5 * (lower + upper), 1.5 * float(np.linalg.norm(upper - lower))
+    vertical = np.array([0.0, 0.0, 1.0])
     cameras = []
     for index in range(count):
         azimuth = 2 * np.pi * (index + phase) / count
         up = np.radians(elevations[index % len(elevations)])
-        eye = 2.6 * np.array([np.cos(up) * np.cos(azimuth), np.cos(up) * np.sin(azimuth), np.sin(up)])
-        centre = np.array([0.0, 0.0, 0.5])
-        cameras.append(Camera.look_at(eye + centre, centre, np.array([0.0, 0.0, 1.0]), width=size, height=size))
+        eye = centre + distance * np.array([np.cos(up) * np.cos(azimuth), np.cos(up) * np.sin(azimuth), np.sin(up)])
+        wide = Camera.look_at(eye, centre, vertical, width=size, height=size)
+        seen = (vertices - eye) @ wide.rotation.T
+        fov = 2.0 * np.degrees(np.arctan(1.05 * np.abs(seen[:, :2] / seen[:, 2:]).max()))
+        cameras.append(Camera.look_at(eye, centre, vertical, width=size, height=size, vertical_fov_degrees=fov))
     return cameras
 
 
@@ -283,6 +279,19 @@ def surface_points(mesh: PaintedMesh, count: int, seed: int) -> np.ndarray:
     return chosen[:, 0] + u * (chosen[:, 1] - chosen[:, 0]) + v * (chosen[:, 2] - chosen[:, 0])
 
 
+def surface_cloud(mesh: PaintedMesh, count: int, *, device: str) -> GaussianCloud:
+    """Small opaque round Gaussians spread evenly over the surface."""
+    points = surface_points(mesh, count, seed=0)
+    return GaussianCloud.from_numpy(
+        points,
+        np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+        np.full((count, 3), np.log(0.006)),
+        np.full(count, 3.0),
+        np.zeros((count, 1, 3)),
+        device=device,
+    )
+
+
 def trained(
     mesh: PaintedMesh, *, size: int, views: int, gaussians: int, iterations: int, seed: int, device: str
 ) -> GaussianCloud:
@@ -298,13 +307,19 @@ def trained(
         ((mesh.paint(points) - 0.5) / 0.28209479177387814)[:, None],
         device=device,
     )
-    cameras = ring(views, size, elevations=(15.0, 50.0, -15.0))
+    # From below and from above too: a deformation turns what was hidden towards the eye.
+    cameras = ring(mesh.vertices, views, size, elevations=(15.0, 50.0, -15.0, 75.0, -50.0))
     photos = photograph(mesh, mesh.vertices, cameras, device)
-    training = [TrainingView(camera, colour) for camera, (colour, _) in zip(cameras, photos, strict=True)]
+    # Before white alone, white haze around the object would cost nothing, and a deformation would show it.
+    training = [
+        TrainingView(camera, (colour - (1.0 - cover[..., None])) / np.maximum(cover[..., None], 1e-6), cover)
+        for camera, (colour, cover) in zip(cameras, photos, strict=True)
+    ]
     options = FinetuneOptions(
         iterations=iterations,
         densification=Densification.RELOCATION if iterations >= 1000 else Densification.NONE,
         max_gaussians=gaussians,
+        background=None,
         seed=seed,
     )
     return finetune(cloud, training, options=options).cloud

@@ -16,7 +16,7 @@ from egs_warp.kernels.deformation import tet_gradients_kernel
 from egs_warp.kernels.spherical_harmonics import rotate_sh_kernel
 from egs_warp.launching import launch_rows
 from egs_warp.precision import Vec3
-from egs_warp.splitting import SplitRule, split_for_motion
+from egs_warp.splitting import SPLIT_DEGREES, SplitRule, split_for_motion
 from egs_warp.tetmesh import TetMesh
 
 LOCAL_REACH = 3.0 / np.sqrt(3.0)
@@ -45,19 +45,27 @@ def carry(
     *,
     method: CarryMethod = CarryMethod.BIDIRECTIONAL,
     rule: SplitRule = SplitRule.MEASURED,
-    threshold_degrees: float = 9.0,
+    threshold_degrees: float = SPLIT_DEGREES,
+    min_error: float | None = None,
     max_depth: int = 3,
 ) -> list[GaussianCloud]:
     """The cloud in each of ``frames``: node positions (N, 3) or (N,) vec3d, metres, of the cage ``mesh``.
 
-    ``rule``, ``threshold_degrees`` and ``max_depth`` are those of ``split_for_motion`` and matter to ``BIDIRECTIONAL``.
+    ``rule``, ``threshold_degrees``, ``min_error`` and ``max_depth`` are those of ``split_for_motion`` and matter to
+    ``BIDIRECTIONAL``.
     """
     cage = mesh if isinstance(mesh, CageLocator) else CageLocator(mesh, device=cloud.device)
     if method in (CarryMethod.BIDIRECTIONAL, CarryMethod.BIDIRECTIONAL_NO_SPLIT):
         embedding = embed_gaussians(cloud, cage)
         if method is CarryMethod.BIDIRECTIONAL:
             split = split_for_motion(
-                cloud, embedding, frames, rule=rule, threshold_degrees=threshold_degrees, max_depth=max_depth
+                cloud,
+                embedding,
+                frames,
+                rule=rule,
+                threshold_degrees=threshold_degrees,
+                min_error=min_error,
+                max_depth=max_depth,
             )
             cloud, embedding = split.cloud, split.embedding
         # A Deformer of its own for each frame, since all results are kept.
@@ -106,7 +114,7 @@ class _Peer:
             opacity_logits=rest.opacity_logits,
             sh=wp.clone(rest.sh),
         )
-        turns = wp.empty(rest.count, dtype=wp.mat33, device=rest.device)
+        turns = wp.empty(rest.count, dtype=wp.vec4, device=rest.device)
         outputs = [cloud.means, cloud.rotations, cloud.log_scales, turns]
         shape = [rest.rotations, rest.log_scales]
         if self._method is CarryMethod.SURFACE:

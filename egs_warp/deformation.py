@@ -19,6 +19,9 @@ from egs_warp.precision import Vec3
 MAX_STRETCH = 1.5
 """An arm may be stretched this many times more than the matter at its two ends; beyond that it would be a spike."""
 
+LEAST_BRIDGE = 1e-3
+"""Arms shorter than this, over the cage's diagonal, are never carried by a difference of positions: float32 is too coarse."""
+
 
 @dataclass(frozen=True)
 class DeformedGaussians:
@@ -27,7 +30,7 @@ class DeformedGaussians:
     cloud: GaussianCloud
     """(n,) at their new places. ``opacity_logits`` is the rest cloud's own array."""
     turns: wp.array
-    """(n,) mat33, the rotation R_polar of F by which each Gaussian and its colour were turned."""
+    """(n,) vec4, unit quaternions w, x, y, z: the rotation R_polar of F by which each Gaussian and its colour were turned."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,11 @@ class Deformer:
         self.max_stretch = max_stretch
         self._degree = cloud.sh_degree
         with wp.ScopedDevice(cloud.device):
-            self._gradients = wp.empty(len(embedding.cage.mesh.tets), dtype=wp.mat33)
+            self._carried_tets = wp.empty(kernels.TET_ROWS * len(embedding.cage.mesh.tets), dtype=wp.vec4)
+            self._rest_nodes = wp.array(embedding.cage.mesh.nodes, dtype=Vec3)
+            self._mean_tets = wp.empty(cloud.count, dtype=wp.int32)
+            self._end_tets = wp.empty((6, cloud.count), dtype=wp.int32)
+            self._shares = wp.empty((6, cloud.count), dtype=wp.float32)
             self._deformed = DeformedGaussians(
                 GaussianCloud(
                     means=wp.empty_like(cloud.means),
@@ -61,26 +68,38 @@ class Deformer:
                     # Band 0 never changes; without higher bands the colour is the rest cloud's own.
                     sh=wp.clone(cloud.sh) if self._degree else cloud.sh,
                 ),
-                turns=wp.empty(cloud.count, dtype=wp.mat33),
+                turns=wp.empty(cloud.count, dtype=wp.vec4),
             )
+        points, cage = embedding.points, embedding.cage
+        launch_rows(
+            kernels.plan_arms_kernel,
+            cloud.count,
+            inputs=[
+                cloud.rotations,
+                points.tets,
+                points.weights,
+                embedding.arms,
+                cage.tets,
+                cage.inverse_edges,
+                LEAST_BRIDGE * cage.extent,
+            ],
+            outputs=[self._mean_tets, self._end_tets, self._shares],
+            device=cloud.device,
+        )
 
     def deform(self, positions: wp.array | np.ndarray) -> DeformedGaussians:
         """The cloud for node positions (N, 3) or (N,) vec3d, metres (Eq. 14, 15); the next call overwrites it."""
-        deformed, cloud = self._deformed, self._deformed.cloud
-        launch_rows(
-            kernels.deform_kernel,
-            self.rest.count,
-            inputs=[self.rest.rotations, self.rest.log_scales, *self._carrying_inputs(positions)],
-            outputs=[cloud.means, cloud.rotations, cloud.log_scales, deformed.turns],
-            device=self.rest.device,
-        )
+        deformed, cloud, rest = self._deformed, self._deformed.cloud, self.rest
+        inputs = self._carrying_inputs(positions)
+        outputs = [cloud.means, cloud.rotations, cloud.log_scales, deformed.turns]
+        launch_rows(kernels.deform_kernel, rest.count, inputs=inputs, outputs=outputs, device=rest.device)
         if self._degree:
             launch_rows(
                 rotate_sh_kernel,
-                self.rest.count,
-                inputs=[deformed.turns, self.rest.sh, self._degree],
+                rest.count,
+                inputs=[deformed.turns, rest.sh, self._degree],
                 outputs=[cloud.sh],
-                device=self.rest.device,
+                device=rest.device,
             )
         return deformed
 
@@ -95,31 +114,32 @@ class Deformer:
             launch_rows(
                 kernels.measure_bend_kernel,
                 count,
-                inputs=[self.rest.rotations, self.rest.log_scales, *self._carrying_inputs(positions)],
+                inputs=self._carrying_inputs(positions),
                 outputs=[bend, curl, error],
                 device=self.rest.device,
             )
         return BendMeasure(bend.numpy(), curl.numpy(), error.numpy())
 
     def _carrying_inputs(self, positions: wp.array | np.ndarray) -> list[object]:
-        cage = self.embedding.cage
-        uploaded = node_positions(positions, len(cage.mesh.nodes), self.rest.device)
+        cage, rest = self.embedding.cage, self.rest
+        uploaded = node_positions(positions, len(cage.mesh.nodes), rest.device)
         launch_rows(
-            kernels.tet_gradients_kernel,
+            kernels.carry_tets_kernel,
             len(cage.mesh.tets),
-            inputs=[uploaded, cage.tets, cage.inverse_edges],
-            outputs=[self._gradients],
-            device=self.rest.device,
+            inputs=[uploaded, self._rest_nodes, cage.tets, cage.inverse_edges],
+            outputs=[self._carried_tets],
+            device=rest.device,
         )
-        points = self.embedding.points
         return [
-            uploaded,
-            cage.tets,
-            self._gradients,
-            points.tets,
-            points.weights,
-            self.embedding.arms,
+            rest.means,
+            rest.rotations,
+            rest.log_scales,
             self.max_stretch,
+            self._carried_tets,
+            self._mean_tets,
+            self._end_tets,
+            self._shares,
+            self.embedding.arms,
         ]
 
 

@@ -18,6 +18,14 @@ from egs_warp.launching import launch_rows
 MIN_OPACITY = 2.0 / 255.0
 """A Gaussian that never exceeds this cannot be seen to be wrong."""
 
+SPLIT_DEGREES = 4.0
+"""Ends of an axis turned against each other by less than this are left alone. With arms of sqrt 3 standard deviations; the
+paper's 15 degrees at 3 are 9 here, which gave 0.02 to 0.13 dB less in benchmarks/table1.py."""
+
+LEAST_MISFIT = 7e-4
+"""Over the cage's diagonal: an affine motion that is wrong by less than this is good enough. Less would follow a motion
+better still (benchmarks/table1.py), but of a fuzzy capture so many would split that 45 dB at rest are missed."""
+
 
 class SplitRule(Enum):
     """Which Gaussians split, along which axis, and into what. Every rule keeps mass, mean and covariance exactly."""
@@ -98,7 +106,7 @@ def split_bent(
     embedding: GaussianEmbedding,
     bend: BendMeasure,
     *,
-    threshold_degrees: float = 9.0,
+    threshold_degrees: float = SPLIT_DEGREES,
     min_error: float | None = None,
     rule: SplitRule = SplitRule.MEASURED,
     parents: np.ndarray | None = None,
@@ -109,9 +117,8 @@ def split_bent(
     """Replace each Gaussian that ``bend`` marks by its children, once (Eq. 17). Everything stays at rest.
 
     ``MEASURED`` marks an axis whose ends are turned against each other by more than ``threshold_degrees``, if the affine
-    motion is wrong by more than ``min_error`` metres at one standard deviation (default: 1e-3 of the cage's diagonal: of
-    2e-4 to 2e-3, best in benchmarks/table1.py). Angles grow with the arms: 9 degrees at gamma sqrt 3 are the paper's 15
-    at gamma 3. ``PAPER`` marks theta of Eq. (16) alone. ``parents`` and ``depths``
+    motion is wrong by more than ``min_error`` metres at one standard deviation (default: ``LEAST_MISFIT`` of the cage's
+    diagonal). ``PAPER`` marks theta of Eq. (16) alone. ``parents`` and ``depths``
     (n,) are those of an earlier call; a Gaussian of ``max_depth`` is not split again. Where there would be more than
     ``max_count`` Gaussians, those with the largest misfit are split.
     """
@@ -123,7 +130,7 @@ def split_bent(
         axes = np.argmax(cloud.log_scales.numpy(), axis=1)
         marked = bend.bend_degrees > threshold_degrees
     else:
-        least = 1e-3 * embedding.cage.extent if min_error is None else min_error
+        least = LEAST_MISFIT * embedding.cage.extent if min_error is None else min_error
         error = np.where(bend.curl_degrees > threshold_degrees, bend.fit_error, 0.0)
         axes = np.argmax(error, axis=1)
         marked = error.max(axis=1) > least
@@ -159,7 +166,7 @@ def split_for_motion(
     embedding: GaussianEmbedding,
     frames: Sequence[wp.array | np.ndarray],
     *,
-    threshold_degrees: float = 9.0,
+    threshold_degrees: float = SPLIT_DEGREES,
     min_error: float | None = None,
     rule: SplitRule = SplitRule.MEASURED,
     max_depth: int = 3,

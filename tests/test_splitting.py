@@ -13,7 +13,15 @@ from egs_warp.embedding import embed_gaussians
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.io.capture import read_capture
 from egs_warp.render.rasteriser import render
-from egs_warp.splitting import SplitRule, child_layout, child_opacities, split_bent, split_for_motion
+from egs_warp.splitting import (
+    LEAST_MISFIT,
+    SPLIT_DEGREES,
+    SplitRule,
+    child_layout,
+    child_opacities,
+    split_bent,
+    split_for_motion,
+)
 from tests.carrying_scenes import bent, box, covariances, random_cloud
 
 
@@ -93,7 +101,7 @@ def test_splitting_for_a_motion_makes_every_part_nearly_affine() -> None:
     within, before_within = (e.points.inside.numpy().reshape(-1, 7).all(axis=1) for e in (result.embedding, embedding))
     assert within.mean() > 0.5
     assert after.fit_error[visible & within].max() < 0.6 * before.fit_error[before_within].max()
-    wrong = (after.curl_degrees > 9.0) & (after.fit_error > 1e-3 * embedding.cage.extent)
+    wrong = (after.curl_degrees > SPLIT_DEGREES) & (after.fit_error > LEAST_MISFIT * embedding.cage.extent)
     assert not (wrong.any(axis=1) & (result.depths < 3) & visible).any()
     capped = split_for_motion(cloud, embedding, frames, max_growth=1.5)
     assert cloud.count < capped.cloud.count <= 1.5 * cloud.count

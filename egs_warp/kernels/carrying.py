@@ -66,7 +66,7 @@ def carry_local_tetrahedron_kernel(
     means_out: wp.array[wp.vec3],
     rotations_out: wp.array[wp.vec4],
     log_scales_out: wp.array[wp.vec3],
-    turns_out: wp.array[wp.mat33],
+    turns_out: wp.array[wp.vec4],
 ):
     """F from the corners of each Gaussian's own tetrahedron, which the cage has carried (VR-GS, two-level embedding)."""
     row = first_row + wp.tid()
@@ -99,7 +99,7 @@ def carry_gradient_kernel(
     means_out: wp.array[wp.vec3],
     rotations_out: wp.array[wp.vec4],
     log_scales_out: wp.array[wp.vec3],
-    turns_out: wp.array[wp.mat33],
+    turns_out: wp.array[wp.vec4],
 ):
     """One F, that of the tetrahedron which holds the mean (PhysGaussian)."""
     row = first_row + wp.tid()
@@ -130,7 +130,7 @@ def carry_surface_kernel(
     means_out: wp.array[wp.vec3],
     rotations_out: wp.array[wp.vec4],
     log_scales_out: wp.array[wp.vec3],
-    turns_out: wp.array[wp.mat33],
+    turns_out: wp.array[wp.vec4],
 ):
     """F of the nearest surface triangle, whose thickness does not change (SuGaR: Gaussians bound to triangles)."""
     row = first_row + wp.tid()

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from egs_warp.kernels.embedding import axes_from_quaternion
 from egs_warp.precision import Mat33, Vec3, Vec4, real
 
 wp.set_module_options({"enable_backward": False})
@@ -15,6 +16,23 @@ LEAST_SCALE = wp.constant(wp.float32(1.0e-12))
 def turn_of(q: wp.vec4) -> wp.mat33:
     """Rotation matrix [r1 r2 r3] of a w, x, y, z quaternion."""
     return wp.quat_to_matrix(wp.normalize(wp.quat(q[1], q[2], q[3], q[0])))
+
+
+@wp.func
+def quaternion_of(m: wp.mat33) -> wp.vec4:
+    """w, x, y, z of a rotation matrix, from the largest of the four; without an index, which would cost memory."""
+    xx = m[0, 0]
+    yy = m[1, 1]
+    zz = m[2, 2]
+    q = wp.vec4(1.0 + xx + yy + zz, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1])
+    if xx + yy + zz < 0.0:
+        if xx >= yy and xx >= zz:
+            q = wp.vec4(m[2, 1] - m[1, 2], 1.0 + xx - yy - zz, m[0, 1] + m[1, 0], m[0, 2] + m[2, 0])
+        elif yy >= zz:
+            q = wp.vec4(m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 1.0 - xx + yy - zz, m[1, 2] + m[2, 1])
+        else:
+            q = wp.vec4(m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1.0 - xx - yy + zz)
+    return wp.normalize(q)
 
 
 @wp.struct
@@ -179,11 +197,17 @@ def matched_order(frame: wp.mat33, carried: wp.mat33) -> wp.vec3i:
 
 
 @wp.func
+def chosen(m: wp.mat33, k: wp.int32) -> wp.vec3:
+    """Column k, by comparison: an index that is not known in advance would put the matrix into memory."""
+    return wp.where(k == 0, column(m, 0), wp.where(k == 1, column(m, 1), column(m, 2)))
+
+
+@wp.func
 def signed_as(frame: wp.mat33, order: wp.vec3i, carried: wp.mat33) -> wp.mat33:
     """Columns of ``frame`` in that order, turned to the side of ``carried``; the least aligned one makes det = +1."""
-    a = column(frame, order[0])
-    b = column(frame, order[1])
-    c = column(frame, order[2])
+    a = chosen(frame, order[0])
+    b = chosen(frame, order[1])
+    c = chosen(frame, order[2])
     da = wp.dot(a, column(carried, 0))
     db = wp.dot(b, column(carried, 1))
     dc = wp.dot(c, column(carried, 2))
@@ -243,33 +267,188 @@ def tet_gradients_kernel(
     gradients_out[t] = single_matrix(edges * inverse_edges[t])
 
 
-@wp.func
-def carried_arm(
-    row: wp.int32,
-    mean: Vec3,
-    axis: wp.vec3,
-    along_mean: wp.vec3,
-    arm: wp.float32,
-    max_stretch: wp.float32,
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const float4 v = __ldg(reinterpret_cast<const float4*>(rows.data) + row);
+    return wp::vec_t<4, float>(v.x, v.y, v.z, v.w);
+#else
+    return rows.data[row];
+#endif
+""")
+def load_row(rows: wp.array[wp.vec4], row: wp.int32) -> wp.vec4:
+    """``rows[row]`` in one 16-byte load, which Warp's own indexing makes four of."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    reinterpret_cast<float4*>(rows.data)[row] = make_float4(value[0], value[1], value[2], value[3]);
+#else
+    rows.data[row] = value;
+#endif
+""")
+def store_row(rows: wp.array[wp.vec4], row: wp.int32, value: wp.vec4):
+    """``rows[row] = value`` in one 16-byte store."""
+    ...
+
+
+TET_ROWS = wp.constant(5)
+"""Rows of a carried tetrahedron: three rows of F, each with one coordinate of x0' behind it; x0; R_polar as w, x, y, z."""
+
+
+@wp.kernel
+def carry_tets_kernel(
+    first_row: wp.int32,
+    # In:
     positions: wp.array[Vec3],
+    rest: wp.array[Vec3],
     tets: wp.array[wp.vec4i],
-    gradients: wp.array[wp.mat33],
+    inverse_edges: wp.array[Mat33],
+    # Out:
+    carried_out: wp.array[wp.vec4],
+):
+    """The affine map x0' + F (x - x0) of each tetrahedron and the rotation of F, as ``TET_ROWS`` rows."""
+    t = first_row + wp.tid()
+    corners = tets[t]
+    x0 = positions[corners[0]]
+    edges = wp.matrix_from_cols(positions[corners[1]] - x0, positions[corners[2]] - x0, positions[corners[3]] - x0)
+    f = single_matrix(edges * inverse_edges[t])
+    moved = single(x0)
+    start = single(rest[corners[0]])
+    for i in range(3):
+        carried_out[TET_ROWS * t + i] = wp.vec4(f[i, 0], f[i, 1], f[i, 2], moved[i])
+    carried_out[TET_ROWS * t + 3] = wp.vec4(start[0], start[1], start[2], 0.0)
+    carried_out[TET_ROWS * t + 4] = quaternion_of(rotation_part(column(f, 0), column(f, 1), column(f, 2)))
+
+
+@wp.struct
+class Affine:
+    """x -> moved + gradient (x - start)."""
+
+    gradient: wp.mat33
+    start: wp.vec3
+    moved: wp.vec3
+
+
+@wp.func
+def affine_of(carried: wp.array[wp.vec4], tet: wp.int32) -> Affine:
+    a = load_row(carried, TET_ROWS * tet)
+    b = load_row(carried, TET_ROWS * tet + 1)
+    c = load_row(carried, TET_ROWS * tet + 2)
+    s = load_row(carried, TET_ROWS * tet + 3)
+    result = Affine()
+    result.gradient = wp.mat33(a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2])
+    result.moved = wp.vec3(a[3], b[3], c[3])
+    result.start = wp.vec3(s[0], s[1], s[2])
+    return result
+
+
+@wp.func
+def image(map: Affine, point: wp.vec3) -> wp.vec3:
+    return map.moved + map.gradient * (point - map.start)
+
+
+BRIDGES = wp.constant(wp.float32(2.0))
+"""Share that marks an arm whose end has nothing to do with the tetrahedron of the mean: look where the end has gone."""
+
+
+@wp.kernel
+def plan_arms_kernel(
+    first_row: wp.int32,
+    # In:
+    rotations: wp.array[wp.vec4],
     point_tets: wp.array[wp.int32],
     weights: wp.array[Vec4],
-) -> wp.vec3:
-    """Where one arm has gone, per length: a column of D_s D_m^-1 R (Eq. 14), for an end on the side of ``axis``.
+    arms: wp.array2d[wp.float32],
+    tets: wp.array[wp.vec4i],
+    inverse_edges: wp.array[Mat33],
+    least_bridge: wp.float32,
+    # Out:
+    mean_tets_out: wp.array[wp.int32],
+    end_tets_out: wp.array2d[wp.int32],
+    shares_out: wp.array2d[wp.float32],
+):
+    """What ``carried_arms`` wants to know about each Gaussian, once for all frames.
 
-    An arm can be stretched far more than the matter at either end where it extrapolates, or bridges a gap between two
-    limbs. That is a spike: its length is held to ``max_stretch`` times the larger stretch at its two ends.
+    The motion is continuous and linear in each tetrahedron. So an arm that goes from the tetrahedron of the mean (gradient F)
+    through a face into the next one (gradient G) is carried to (u F + (1 - u) G) r per length, u the share of it before
+    the face: no difference of positions, which for a tiny arm would be mostly rounding. A longer arm that ends elsewhere
+    ``BRIDGES``.
     """
-    tet = point_tets[row]
-    end = interpolated(tets[tet], weights[row], positions)
-    moved = single((end - mean) / real(arm))
-    limit = max_stretch * wp.max(wp.length(along_mean), wp.length(gradients[tet] * axis))
-    length = wp.length(moved)
+    row = first_row + wp.tid()
+    mean_tet = point_tets[7 * row]
+    corners = tets[mean_tet]
+    axes = axes_from_quaternion(rotations[row])
+    straddles = wp.bool(False)
+    for k in range(6):
+        tet = point_tets[7 * row + 1 + k]
+        share = wp.float32(1.0)
+        if tet != mean_tet:
+            straddles = wp.bool(True)
+            others = tets[tet]
+            apart = wp.int32(0)
+            opposite = wp.int32(0)
+            for j in range(4):
+                c = corners[j]
+                if c != others[0] and c != others[1] and c != others[2] and c != others[3]:
+                    apart += 1
+                    opposite = j
+            share = wp.float32(0.5)
+            if apart == 1:
+                axis = k % 3
+                direction = Vec3(axes[0, axis], axes[1, axis], axes[2, axis])
+                slopes = inverse_edges[mean_tet] * direction
+                slope = -(slopes[0] + slopes[1] + slopes[2])
+                if opposite > 0:
+                    slope = slopes[opposite - 1]
+                if k >= 3:
+                    slope = -slope
+                height = weights[7 * row][opposite]
+                drop = -slope * real(arms[row, k])
+                if drop > real(0.0):
+                    share = wp.float32(wp.clamp(height / drop, real(0.0), real(1.0)))
+            elif arms[row, k] > least_bridge:
+                share = BRIDGES
+        end_tets_out[k, row] = tet
+        shares_out[k, row] = share
+    # One's complement marks a Gaussian that reaches into more than one tetrahedron.
+    mean_tets_out[row] = wp.where(straddles, -1 - mean_tet, mean_tet)
+
+
+@wp.func
+def carried_arm(
+    k: wp.int32,
+    gaussian: wp.int32,
+    mean_tet: wp.int32,
+    mean: wp.vec3,
+    moved_mean: wp.vec3,
+    axis: wp.vec3,
+    through: wp.vec3,
+    max_stretch: wp.float32,
+    carried: wp.array[wp.vec4],
+    end_tets: wp.array2d[wp.int32],
+    shares: wp.array2d[wp.float32],
+    arms: wp.array2d[wp.float32],
+) -> wp.vec3:
+    """Where one arm along ``axis`` has gone, per length: a column of D_s D_m^-1 R (Eq. 14). ``through`` is F axis.
+
+    An arm that bridges a gap between two limbs can be stretched far more than the matter at either end. That is a spike:
+    its length is held to ``max_stretch`` times the larger stretch at its two ends.
+    """
+    tet = end_tets[k, gaussian]
+    if tet == mean_tet:
+        return through
+    end = affine_of(carried, tet)
+    there = end.gradient * axis
+    share = shares[k, gaussian]
+    if share <= 1.0:
+        return share * through + (1.0 - share) * there
+    result = there + (image(end, mean) - moved_mean) / arms[gaussian, k]
+    limit = max_stretch * wp.max(wp.length(through), wp.length(there))
+    length = wp.length(result)
     if length > limit:
-        moved = moved * (limit / length)
-    return moved
+        result = result * (limit / length)
+    return result
 
 
 @wp.struct
@@ -278,62 +457,50 @@ class CarriedArms:
 
     plus: wp.mat33
     minus: wp.mat33
-    mean: Vec3
+    through: wp.mat33
+    """F R of the tetrahedron of the mean."""
+    mean: wp.vec3
 
 
 @wp.func
 def carried_arms(
     gaussian: wp.int32,
+    mean: wp.vec3,
     axes: wp.mat33,
     max_stretch: wp.float32,
-    positions: wp.array[Vec3],
-    tets: wp.array[wp.vec4i],
-    gradients: wp.array[wp.mat33],
-    point_tets: wp.array[wp.int32],
-    weights: wp.array[Vec4],
+    carried: wp.array[wp.vec4],
+    mean_tets: wp.array[wp.int32],
+    end_tets: wp.array2d[wp.int32],
+    shares: wp.array2d[wp.float32],
     arms: wp.array2d[wp.float32],
 ) -> CarriedArms:
     """F+ R and F- R of Eq. (14)."""
-    first = 7 * gaussian
-    tet = point_tets[first]
-    mean = interpolated(tets[tet], weights[first], positions)
-    through = gradients[tet] * axes
+    code = mean_tets[gaussian]
+    tet = wp.where(code < 0, -1 - code, code)
+    around = affine_of(carried, tet)
     result = CarriedArms()
-    result.mean = mean
-    result.plus = through
-    result.minus = through
+    result.mean = image(around, mean)
+    result.through = around.gradient * axes
+    result.plus = result.through
+    result.minus = result.through
     # Most Gaussians are small and lie in one tetrahedron, whose gradient is then the answer.
-    alone = wp.bool(True)
-    for k in range(1, 7):
-        alone = alone and point_tets[first + k] == tet
-    if not alone:
+    if code < 0:
         r0 = column(axes, 0)
         r1 = column(axes, 1)
         r2 = column(axes, 2)
-        t0 = column(through, 0)
-        t1 = column(through, 1)
-        t2 = column(through, 2)
+        t0 = column(result.through, 0)
+        t1 = column(result.through, 1)
+        t2 = column(result.through, 2)
+        m = result.mean
         result.plus = wp.matrix_from_cols(
-            carried_arm(
-                first + 1, mean, r0, t0, arms[gaussian, 0], max_stretch, positions, tets, gradients, point_tets, weights
-            ),
-            carried_arm(
-                first + 2, mean, r1, t1, arms[gaussian, 1], max_stretch, positions, tets, gradients, point_tets, weights
-            ),
-            carried_arm(
-                first + 3, mean, r2, t2, arms[gaussian, 2], max_stretch, positions, tets, gradients, point_tets, weights
-            ),
+            carried_arm(0, gaussian, tet, mean, m, r0, t0, max_stretch, carried, end_tets, shares, arms),
+            carried_arm(1, gaussian, tet, mean, m, r1, t1, max_stretch, carried, end_tets, shares, arms),
+            carried_arm(2, gaussian, tet, mean, m, r2, t2, max_stretch, carried, end_tets, shares, arms),
         )
         result.minus = -wp.matrix_from_cols(
-            carried_arm(
-                first + 4, mean, r0, t0, arms[gaussian, 3], max_stretch, positions, tets, gradients, point_tets, weights
-            ),
-            carried_arm(
-                first + 5, mean, r1, t1, arms[gaussian, 4], max_stretch, positions, tets, gradients, point_tets, weights
-            ),
-            carried_arm(
-                first + 6, mean, r2, t2, arms[gaussian, 5], max_stretch, positions, tets, gradients, point_tets, weights
-            ),
+            carried_arm(3, gaussian, tet, mean, m, -r0, -t0, max_stretch, carried, end_tets, shares, arms),
+            carried_arm(4, gaussian, tet, mean, m, -r1, -t1, max_stretch, carried, end_tets, shares, arms),
+            carried_arm(5, gaussian, tet, mean, m, -r2, -t2, max_stretch, carried, end_tets, shares, arms),
         )
     return result
 
@@ -348,6 +515,30 @@ def exponential(v: wp.vec3) -> wp.vec3:
     return wp.vec3(wp.exp(v[0]), wp.exp(v[1]), wp.exp(v[2]))
 
 
+@wp.struct
+class CarriedShape:
+    rotation: wp.vec4
+    log_scales: wp.vec3
+
+
+@wp.func
+def carried_shape(stretched: wp.mat33, scales: wp.vec3, carried: wp.mat33) -> CarriedShape:
+    """Eq. (15) for ``stretched`` = F R: the SVD of F R S, its axes matched in order and sign to R_polar r_i."""
+    factor = scaled_columns(stretched, scales)
+    m = orthogonal_columns(column(factor, 0), column(factor, 1), column(factor, 2))
+    frame = proper_frame(m.a, m.b, m.c)
+    columns = wp.matrix_from_cols(m.a, m.b, m.c)
+    order = matched_order(frame, carried)
+    result = CarriedShape()
+    result.rotation = quaternion_of(signed_as(frame, order, carried))
+    result.log_scales = wp.vec3(
+        wp.log(wp.max(wp.length(chosen(columns, order[0])), LEAST_SCALE)),
+        wp.log(wp.max(wp.length(chosen(columns, order[1])), LEAST_SCALE)),
+        wp.log(wp.max(wp.length(chosen(columns, order[2])), LEAST_SCALE)),
+    )
+    return result
+
+
 @wp.func
 def write_gaussian(
     row: wp.int32,
@@ -356,62 +547,111 @@ def write_gaussian(
     scales: wp.vec3,
     rotations_out: wp.array[wp.vec4],
     log_scales_out: wp.array[wp.vec3],
-    turns_out: wp.array[wp.mat33],
+    turns_out: wp.array[wp.vec4],
 ):
-    """Eq. (15) for ``stretched`` = F R: the SVD of F R S, its axes matched in order and sign to R_polar r_i."""
+    """Shape and turn of Eq. (15) for ``stretched`` = F R."""
     carried = rotation_part(column(stretched, 0), column(stretched, 1), column(stretched, 2))
-    factor = scaled_columns(stretched, scales)
-    m = orthogonal_columns(column(factor, 0), column(factor, 1), column(factor, 2))
-    frame = proper_frame(m.a, m.b, m.c)
-    lengths = wp.vec3(wp.length(m.a), wp.length(m.b), wp.length(m.c))
-    order = matched_order(frame, carried)
-    q = wp.quat_from_matrix(signed_as(frame, order, carried))
-    rotations_out[row] = wp.vec4(q[3], q[0], q[1], q[2])
-    log_scales_out[row] = wp.vec3(
-        wp.log(wp.max(lengths[order[0]], LEAST_SCALE)),
-        wp.log(wp.max(lengths[order[1]], LEAST_SCALE)),
-        wp.log(wp.max(lengths[order[2]], LEAST_SCALE)),
-    )
-    turns_out[row] = carried * wp.transpose(axes)
+    shape = carried_shape(stretched, scales, carried)
+    rotations_out[row] = shape.rotation
+    log_scales_out[row] = shape.log_scales
+    turns_out[row] = quaternion_of(carried * wp.transpose(axes))
+
+
+@wp.struct
+class CarriedGaussian:
+    mean: wp.vec3
+    rotation: wp.vec4
+    log_scales: wp.vec3
+    turn: wp.vec4
+
+
+@wp.func
+def carried_gaussian(
+    row: wp.int32,
+    mean: wp.vec3,
+    rotation: wp.vec4,
+    log_scales: wp.vec3,
+    max_stretch: wp.float32,
+    carried: wp.array[wp.vec4],
+    mean_tets: wp.array[wp.int32],
+    end_tets: wp.array2d[wp.int32],
+    shares: wp.array2d[wp.float32],
+    arms: wp.array2d[wp.float32],
+) -> CarriedGaussian:
+    """F = (F+ + F-)/2 (Eq. 14), or the F of the mean's tetrahedron where det F <= 0, then Eq. (15).
+
+    The mean goes where the Gaussian's mass goes, to second order (beyond the paper, which carries the mean as a point):
+    E[x(m + sum z_k s_k r_k)] = x(m) + sum s_k^2 x_kk / 2, and x_kk is seen from the difference of the two arms.
+    """
+    axes = turn_of(rotation)
+    scales = exponential(log_scales)
+    both = carried_arms(row, mean, axes, max_stretch, carried, mean_tets, end_tets, shares, arms)
+    result = CarriedGaussian()
+    result.mean = both.mean
+    stretched = both.through
+    code = mean_tets[row]
+    # Alone in one tetrahedron, or where F is turned inside out: the rotation of that tetrahedron, found once for all.
+    own = wp.bool(True)
+    if code < 0:
+        bulge = wp.vec3(0.0)
+        for k in range(3):
+            reach = wp.max(arms[row, k] + arms[row, 3 + k], 3.0 * scales[k])
+            bulge += (scales[k] * scales[k] / reach) * (column(both.plus, k) - column(both.minus, k))
+        result.mean += bulge
+        average = 0.5 * (both.plus + both.minus)
+        if wp.determinant(average) > 0.0:
+            stretched = average
+            own = wp.bool(False)
+    turned = wp.mat33()
+    if own:
+        result.turn = load_row(carried, TET_ROWS * wp.where(code < 0, -1 - code, code) + 4)
+        turned = turn_of(result.turn) * axes
+    else:
+        turned = rotation_part(column(stretched, 0), column(stretched, 1), column(stretched, 2))
+        result.turn = quaternion_of(turned * wp.transpose(axes))
+    shape = carried_shape(stretched, scales, turned)
+    result.rotation = shape.rotation
+    result.log_scales = shape.log_scales
+    return result
 
 
 @wp.kernel
 def deform_kernel(
     first_row: wp.int32,
     # In:
+    means: wp.array[wp.vec3],
     rotations: wp.array[wp.vec4],
     log_scales: wp.array[wp.vec3],
-    positions: wp.array[Vec3],
-    tets: wp.array[wp.vec4i],
-    gradients: wp.array[wp.mat33],
-    point_tets: wp.array[wp.int32],
-    weights: wp.array[Vec4],
-    arms: wp.array2d[wp.float32],
     max_stretch: wp.float32,
+    carried: wp.array[wp.vec4],
+    mean_tets: wp.array[wp.int32],
+    end_tets: wp.array2d[wp.int32],
+    shares: wp.array2d[wp.float32],
+    arms: wp.array2d[wp.float32],
     # Out:
     means_out: wp.array[wp.vec3],
     rotations_out: wp.array[wp.vec4],
     log_scales_out: wp.array[wp.vec3],
-    turns_out: wp.array[wp.mat33],
+    turns_out: wp.array[wp.vec4],
 ):
-    """F = (F+ + F-)/2 (Eq. 14), or the F of the mean's tetrahedron where det F <= 0, then Eq. (15).
-
-    The mean goes where the Gaussian's mass goes, to second order (beyond the paper, which carries the mean as a point):
-    E[x(m + sum z_k s_k r_k)] = x(m) + sum s_k^2 x_kk / 2, and x_kk is seen from the difference of the two arms.
-    """
+    """Each Gaussian as the cage has carried it (Eq. 14, 15)."""
     row = first_row + wp.tid()
-    axes = turn_of(rotations[row])
-    both = carried_arms(row, axes, max_stretch, positions, tets, gradients, point_tets, weights, arms)
-    scales = exponential(log_scales[row])
-    bulge = wp.vec3(0.0)
-    for k in range(3):
-        reach = wp.max(arms[row, k] + arms[row, 3 + k], 3.0 * scales[k])
-        bulge += (scales[k] * scales[k] / reach) * (column(both.plus, k) - column(both.minus, k))
-    stretched = 0.5 * (both.plus + both.minus)
-    if wp.determinant(stretched) <= 0.0:
-        stretched = gradients[point_tets[7 * row]] * axes
-    means_out[row] = single(both.mean) + bulge
-    write_gaussian(row, stretched, axes, scales, rotations_out, log_scales_out, turns_out)
+    result = carried_gaussian(
+        row,
+        means[row],
+        load_row(rotations, row),
+        log_scales[row],
+        max_stretch,
+        carried,
+        mean_tets,
+        end_tets,
+        shares,
+        arms,
+    )
+    means_out[row] = result.mean
+    store_row(rotations_out, row, result.rotation)
+    log_scales_out[row] = result.log_scales
+    store_row(turns_out, row, result.turn)
 
 
 @wp.func
@@ -436,15 +676,15 @@ def bend_frame(side: wp.mat33, scales: wp.vec3) -> wp.mat33:
 def measure_bend_kernel(
     first_row: wp.int32,
     # In:
+    means: wp.array[wp.vec3],
     rotations: wp.array[wp.vec4],
     log_scales: wp.array[wp.vec3],
-    positions: wp.array[Vec3],
-    tets: wp.array[wp.vec4i],
-    gradients: wp.array[wp.mat33],
-    point_tets: wp.array[wp.int32],
-    weights: wp.array[Vec4],
-    arms: wp.array2d[wp.float32],
     max_stretch: wp.float32,
+    carried: wp.array[wp.vec4],
+    mean_tets: wp.array[wp.int32],
+    end_tets: wp.array2d[wp.int32],
+    shares: wp.array2d[wp.float32],
+    arms: wp.array2d[wp.float32],
     # In and out:
     bend_out: wp.array[wp.float32],
     curl_out: wp.array[wp.vec3],
@@ -459,7 +699,7 @@ def measure_bend_kernel(
     row = first_row + wp.tid()
     scales = exponential(log_scales[row])
     axes = turn_of(rotations[row])
-    both = carried_arms(row, axes, max_stretch, positions, tets, gradients, point_tets, weights, arms)
+    both = carried_arms(row, means[row], axes, max_stretch, carried, mean_tets, end_tets, shares, arms)
     between = wp.transpose(bend_frame(both.plus, scales)) * bend_frame(both.minus, scales)
     twice_sine = wp.length(
         wp.vec3(between[2, 1] - between[1, 2], between[0, 2] - between[2, 0], between[1, 0] - between[0, 1])
@@ -469,8 +709,8 @@ def measure_bend_kernel(
     curl = curl_out[row]
     error = error_out[row]
     for k in range(3):
-        f_plus = gradients[point_tets[7 * row + 1 + k]] * axes
-        f_minus = gradients[point_tets[7 * row + 4 + k]] * axes
+        f_plus = affine_of(carried, end_tets[k, row]).gradient * axes
+        f_minus = affine_of(carried, end_tets[3 + k, row]).gradient * axes
         # Gradients jump between tetrahedra; over a much shortened arm the jump is no derivative.
         reach = wp.max(arms[row, k] + arms[row, 3 + k], 3.0 * scales[k])
         for j in range(3):

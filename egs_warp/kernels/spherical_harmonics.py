@@ -13,6 +13,7 @@ Vec5 = wp.types.vector(length=5, dtype=wp.float32)
 Vec7 = wp.types.vector(length=7, dtype=wp.float32)
 Mat55 = wp.types.matrix(shape=(5, 5), dtype=wp.float32)
 Mat77 = wp.types.matrix(shape=(7, 7), dtype=wp.float32)
+Mat53 = wp.types.matrix(shape=(5, 3), dtype=wp.float32)
 Mat73 = wp.types.matrix(shape=(7, 3), dtype=wp.float32)
 
 
@@ -95,70 +96,68 @@ BAND_2_FROM_VALUES = wp.constant(Mat55(*np.linalg.inv(_basis(2, _DIRECTIONS[:5])
 BAND_3_FROM_VALUES = wp.constant(Mat77(*np.linalg.inv(_basis(3, _DIRECTIONS)).ravel()))
 
 
+@wp.func
+def turned_band_1(c: wp.mat33, turn: wp.mat33) -> wp.mat33:
+    """Coefficients 1 to 3, a row each, after the rotation ``turn``: the linear function w.d with w = (-c3, -c1, c2)."""
+    w = wp.mat33(-c[2, 0], -c[2, 1], -c[2, 2], -c[0, 0], -c[0, 1], -c[0, 2], c[1, 0], c[1, 1], c[1, 2])
+    w = turn * w
+    return wp.mat33(-w[1, 0], -w[1, 1], -w[1, 2], w[2, 0], w[2, 1], w[2, 2], -w[0, 0], -w[0, 1], -w[0, 2])
+
+
+@wp.func
+def turned_band_2(c: Mat53, back: wp.mat33) -> Mat53:
+    """Coefficients 4 to 8, a row each, after the rotation whose transpose is ``back``."""
+    values = Mat53()
+    for i in range(5):
+        basis = band_2(back * wp.vec3(DIRECTIONS[i, 0], DIRECTIONS[i, 1], DIRECTIONS[i, 2]))
+        values[i] = basis @ c
+    return BAND_2_FROM_VALUES * values
+
+
+@wp.func
+def turned_band_3(c: Mat73, back: wp.mat33) -> Mat73:
+    """Coefficients 9 to 15, a row each, after the rotation whose transpose is ``back``."""
+    values = Mat73()
+    for i in range(7):
+        basis = band_3(back * wp.vec3(DIRECTIONS[i, 0], DIRECTIONS[i, 1], DIRECTIONS[i, 2]))
+        values[i] = basis @ c
+    return BAND_3_FROM_VALUES * values
+
+
 @wp.kernel
 def rotate_sh_kernel(
     first_row: wp.int32,
     # In:
-    turns: wp.array[wp.mat33],
+    turns: wp.array[wp.vec4],
     sh: wp.array2d[wp.vec3],
     degree: wp.int32,
     # Out:
     sh_out: wp.array2d[wp.vec3],
 ):
-    """Coefficients of each Gaussian's colour after the rotation ``turns``; band 0 is left alone."""
+    """Coefficients of each Gaussian's colour after the rotation ``turns`` (w, x, y, z); band 0 is left alone."""
     row = first_row + wp.tid()
-    turn = turns[row]
+    q = turns[row]
+    turn = wp.quat_to_matrix(wp.quat(q[1], q[2], q[3], q[0]))
     back = wp.transpose(turn)
+    # Each coefficient is read once: a row is 192 bytes, and neighbouring threads share no cache line.
     if degree >= 1:
-        # Band 1 is the linear function w.d with w = (-c3, -c1, c2).
-        x = -sh[row, 3]
-        y = -sh[row, 1]
-        z = sh[row, 2]
-        sh_out[row, 3] = -(turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z)
-        sh_out[row, 1] = -(turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z)
-        sh_out[row, 2] = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z
+        first = wp.mat33()
+        for j in range(3):
+            first[j] = sh[row, 1 + j]
+        first = turned_band_1(first, turn)
+        for j in range(3):
+            sh_out[row, 1 + j] = first[j]
     if degree >= 2:
-        # Each coefficient is read once: a row is 192 bytes, and neighbouring threads share no cache line.
-        red2 = Vec5()
-        green2 = Vec5()
-        blue2 = Vec5()
+        second = Mat53()
         for j in range(5):
-            c2 = sh[row, 4 + j]
-            red2[j] = c2[0]
-            green2[j] = c2[1]
-            blue2[j] = c2[2]
-        values_red = Vec5()
-        values_green = Vec5()
-        values_blue = Vec5()
-        for i in range(5):
-            basis = band_2(back * wp.vec3(DIRECTIONS[i, 0], DIRECTIONS[i, 1], DIRECTIONS[i, 2]))
-            values_red[i] = wp.dot(basis, red2)
-            values_green[i] = wp.dot(basis, green2)
-            values_blue[i] = wp.dot(basis, blue2)
-        red2 = BAND_2_FROM_VALUES * values_red
-        green2 = BAND_2_FROM_VALUES * values_green
-        blue2 = BAND_2_FROM_VALUES * values_blue
+            second[j] = sh[row, 4 + j]
+        second = turned_band_2(second, back)
         for j in range(5):
-            sh_out[row, 4 + j] = wp.vec3(red2[j], green2[j], blue2[j])
+            sh_out[row, 4 + j] = second[j]
     if degree >= 3:
-        red3 = Vec7()
-        green3 = Vec7()
-        blue3 = Vec7()
+        third = Mat73()
         for j in range(7):
-            c3 = sh[row, 9 + j]
-            red3[j] = c3[0]
-            green3[j] = c3[1]
-            blue3[j] = c3[2]
-        values3_red = Vec7()
-        values3_green = Vec7()
-        values3_blue = Vec7()
-        for i in range(7):
-            basis3 = band_3(back * wp.vec3(DIRECTIONS[i, 0], DIRECTIONS[i, 1], DIRECTIONS[i, 2]))
-            values3_red[i] = wp.dot(basis3, red3)
-            values3_green[i] = wp.dot(basis3, green3)
-            values3_blue[i] = wp.dot(basis3, blue3)
-        red3 = BAND_3_FROM_VALUES * values3_red
-        green3 = BAND_3_FROM_VALUES * values3_green
-        blue3 = BAND_3_FROM_VALUES * values3_blue
+            third[j] = sh[row, 9 + j]
+        third = turned_band_3(third, back)
         for j in range(7):
-            sh_out[row, 9 + j] = wp.vec3(red3[j], green3[j], blue3[j])
+            sh_out[row, 9 + j] = third[j]
