@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,12 +46,23 @@ _DETAILS = (
     _Detail(4, 1, 1, 2, 1, 1),
 )
 """From the richest to the poorest."""
+_LEG_DETAILS = (_Detail(4, 4, 1, 2, 1, 1), _Detail(4, 3, 1, 1, 1, 1), *_DETAILS[-2:])
+"""The same of each leg of a body on ``_LEGS`` or more. A foot is carried ahead and set down flat by a leg that bends one way
+above and the other way below, which takes three segments on each side of it."""
+_LEGS = 3
+_SEGMENTS, _LEGGED_SEGMENTS = 112, 120
+
+
+def is_legged(skeleton: Skeleton) -> bool:
+    """Whether the body stands on three legs or more."""
+    return sum(branch.starts_on_ground for branch in skeleton.branches) >= _LEGS
 
 
 def lay_fibres(
-    mesh: TetMesh, skeleton: Skeleton, *, max_force: float, max_stress: float, max_segments: int
+    mesh: TetMesh, skeleton: Skeleton, *, max_force: float, max_stress: float, max_segments: int | None = None
 ) -> list[Fibre]:
-    """Longitudinal, radial, circular and oblique fibres on every branch, at most ``max_segments`` segments in all.
+    """Longitudinal, radial, circular and oblique fibres on every branch, at most ``max_segments`` segments in all (112; for a
+    body on three legs or more 120).
 
     ``max_force`` in newtons bounds each segment; ``max_stress`` in pascals bounds all longitudinal fibres of one section
     together. Branches too many for the budget go without, the least voluminous first.
@@ -61,7 +71,7 @@ def lay_fibres(
     surface = _Surface(mesh)
     forward = _principal_horizontal(mesh, skeleton.up)
     fibres: list[Fibre] = []
-    for group, (branch, detail) in enumerate(_share_segments(skeleton.branches, edge, max_segments)):
+    for group, (branch, detail) in enumerate(_share_segments(skeleton, edge, max_segments)):
         tube = _Tube(branch, skeleton.up, forward, surface, edge, detail)
         name = "trunk" if group == 0 else f"limb {group}"
         fibres += [
@@ -71,32 +81,38 @@ def lay_fibres(
     return _with_partners(fibres, _centre(mesh), skeleton.up, forward, tolerance=0.75 * edge)
 
 
-def _share_segments(branches: Sequence[Branch], edge: float, budget: int) -> list[tuple[Branch, _Detail]]:
+def _share_segments(skeleton: Skeleton, edge: float, budget: int | None) -> list[tuple[Branch, _Detail]]:
     """The detail of each branch; like branches (the four legs of a stool) get the same."""
+    legged = is_legged(skeleton)
+    budget = budget or (_LEGGED_SEGMENTS if legged else _SEGMENTS)
     families: list[list[Branch]] = []
-    for branch in branches:
+    for branch in skeleton.branches:
         like = families[-1][0] if families else None
+        if legged and like and like.starts_on_ground != branch.starts_on_ground:
+            like = None
         if like and branch.volume > 0.7 * like.volume and 0.75 < branch.length / like.length < 1.33:
             families[-1].append(branch)
         else:
             families.append([branch])
     levels = [0] * len(families)
+    ladders = [_LEG_DETAILS if legged and family[0].starts_on_ground else _DETAILS for family in families]
 
     def detail(family: int) -> _Detail:
-        chosen = _DETAILS[levels[family]]
+        chosen = ladders[family][levels[family]]
         shortest = min(branch.length for branch in families[family])
         return replace(chosen, intervals=int(np.clip(round(shortest / (1.2 * edge)), 1, chosen.intervals)))
 
     def count(family: int) -> int:
         return len(families[family]) * detail(family).segment_count()
 
-    def greed(family: int) -> float:
-        """Segments against the volume they move; legs count double, since they alone push the ground."""
+    def greed(family: int) -> tuple[bool, float]:
+        """Segments against the volume they move; legs count double, since they alone push the ground, and those of a body on
+        many legs come last."""
         volume = sum(branch.volume * (2.0 if branch.starts_on_ground else 1.0) for branch in families[family])
-        return count(family) / volume**0.5
+        return ladders[family] is _DETAILS, count(family) / volume**0.5
 
     while sum(count(family) for family in range(len(families))) > budget:
-        reducible = [family for family in range(len(families)) if levels[family] < len(_DETAILS) - 1]
+        reducible = [family for family in range(len(families)) if levels[family] < len(ladders[family]) - 1]
         if reducible:
             levels[max(reducible, key=greed)] += 1
         elif len(families) > 1:

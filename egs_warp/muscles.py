@@ -13,7 +13,7 @@ import warp as wp
 
 from egs_warp.attachments import attachment_rows, mean_edge_length
 from egs_warp.errors import UserError
-from egs_warp.fibre_layout import lay_fibres
+from egs_warp.fibre_layout import is_legged, lay_fibres
 from egs_warp.fibres import Fibre, FibreKind
 from egs_warp.kernels.muscles import muscle_columns_kernel, muscle_entries_kernel
 from egs_warp.precision import Vec3, real
@@ -210,22 +210,23 @@ def automatic_muscles(
     strength: float = 4.0,
     max_strain: float = 0.3,
     young_modulus: float | None = None,
-    max_segments: int = 112,
+    max_segments: int | None = None,
 ) -> MuscleSet:
     """Muscles for any body: fibres of every kind along each branch of its curve skeleton (DESIGN 6).
 
     ``plane_normal`` (3,) points away from the ground; ``body_weight`` in newtons; ``height`` in metres along the normal;
     ``strength`` is F_max of a segment in body weights. It is lowered where the body is thin: all longitudinal fibres
     of a section together pull no harder than twice its area times E (``young_modulus``, pascals; default that of sag 0.05,
-    body_weight height / (0.05 volume)).
+    body_weight height / (0.05 volume)); of a body on three legs or more, whose legs would crumple, 0.4 times.
     """
     volume = float(mesh.volumes().sum())
     young = young_modulus or body_weight * height / (volume * 0.05)
+    branches = skeleton(mesh, plane_normal)
     fibres = lay_fibres(
         mesh,
-        skeleton(mesh, plane_normal),
+        branches,
         max_force=strength * body_weight,
-        max_stress=2.0 * young,
+        max_stress=(0.4 if is_legged(branches) else 2.0) * young,
         max_segments=max_segments,
     )
     return attach_fibres(mesh, _long_enough(mesh, fibres), max_strain=max_strain)
