@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -195,3 +196,17 @@ def test_impossible_training_is_refused(tmp_path: Path) -> None:
     )
     with pytest.raises(UserError, match="is not beside the poses; put the images there"):
         train(tmp_path)
+
+
+@pytest.mark.example
+def test_the_example_gives_the_pawn_its_colours_back(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script = Path(__file__).parents[1] / "examples" / "finetune.py"
+    monkeypatch.setattr("sys.argv", [str(script), "--out", str(tmp_path), "--steps", "12", "--size", "48"])
+    runpy.run_path(str(script), run_name="__main__")
+    quality = [float(line.split()[-2]) for line in capsys.readouterr().out.splitlines() if line.endswith("dB")]
+    as_it_was, colours_lost, trained = quality
+    assert as_it_was > 60.0
+    assert trained > colours_lost + 1.0
+    assert (tmp_path / "finetune.png").is_file()
