@@ -1,0 +1,43 @@
+"""The examples of single motions, each for a few frames: they run, and write what docs/report.md says."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from egs_warp.trajectory import Trajectory
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+def example(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.example
+@pytest.mark.parametrize(
+    ("name", "asked"),
+    [
+        ("twist", {"heading_degrees": 180.0, "distance": 0.0, "height": 0.2}),
+        ("hop", {"distance": 0.7, "height": 0.3, "square": 1.0}),
+    ],
+)
+def test_example_writes_its_files(tmp_path: Path, name: str, asked: dict[str, float]) -> None:
+    report = example(name).main(["--out", str(tmp_path), "--frames", "3", "--size", "64"])
+    assert json.loads((tmp_path / "report.json").read_text()) == json.loads(json.dumps(report))
+    (entry,) = report["motion"]
+    assert entry["name"] == name and entry["asked"] == asked
+    assert {"distance", "height", "heading_degrees", "tilt_degrees", "airborne_frames"} <= set(entry["reached"])
+    assert report["audit"]["momentum_residual"] < 1e-5 and report["audit"]["angular_momentum_residual"] < 1e-4
+    trajectory = Trajectory.load(tmp_path / "trajectory.npz")
+    assert len(trajectory.time) == 4 and np.isfinite(trajectory.positions).all()
+    assert (tmp_path / f"{name}.mp4").stat().st_size > 0 and (tmp_path / "sheet.png").stat().st_size > 0

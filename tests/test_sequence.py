@@ -1,0 +1,164 @@
+"""Motions in a row, and leaps to a place, on a block that is posed by hand: geometry and bookkeeping without a simulation."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import numpy as np
+import pytest
+
+from egs_warp.body import BodyState, make_body
+from egs_warp.hop import Hop, Squares
+from egs_warp.leap import Leap
+from egs_warp.motions import JumpPhase, JumpTarget
+from egs_warp.plane import Plane
+from egs_warp.repertoire import longest, parts_of
+from egs_warp.script import parse_script
+from egs_warp.sequence import MotionSequence, Part, Place
+from egs_warp.stance import Ground, sole_shares
+from egs_warp.terrain import Solid, step
+from egs_warp.twist import Twist
+from tests.meshes import block_mesh
+
+FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+FORWARD = np.array([1.0, 0.0, 0.0])
+DT = 1 / 60
+
+
+@pytest.fixture
+def place() -> Place:
+    mesh = block_mesh()
+    body = make_body(mesh, FLOOR, device="cpu")
+    standing = mesh.nodes - [0.0, 0.0, mesh.nodes[:, 2].min()]
+    ground = Ground.on(FLOOR, FORWARD, body.centre_of_mass(standing))
+    return Place(body, ground, standing, standing[standing[:, 2] < 1e-9], DT, (Solid((FLOOR,)),))
+
+
+def moved(place: Place, angle: float, shift: np.ndarray) -> np.ndarray:
+    com = place.body.centre_of_mass(place.standing)
+    return com + (place.standing - com) @ place.ground.turn(angle).T + shift
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7, -2.5, np.pi])
+def test_a_place_follows_the_feet(place: Place, angle: float) -> None:
+    """Turned and moved, to another level too, the stance is the body's own again and forward turns with it."""
+    shift = np.array([0.4, -1.2, 0.25])
+    now = place.now(moved(place, angle, shift))
+    assert np.abs(now.standing - moved(place, angle, shift)).max() < 1e-12
+    assert np.allclose(now.ground.axes[0], [np.cos(angle), np.sin(angle), 0.0])
+    assert np.allclose(now.ground.local(now.standing), place.ground.local(place.standing))
+    leaning = moved(place, angle, shift)
+    leaning[:, 0] += 0.3 * (leaning[:, 2] - leaning[:, 2].min())
+    feet = place.now(leaning).standing
+    assert np.ptp(feet[:, 2]) == pytest.approx(np.ptp(place.standing[:, 2]))
+
+
+def test_facing_turns_the_way_and_not_the_body(place: Place) -> None:
+    other = place.facing(np.array([0.0, 2.0, 5.0]))
+    assert np.allclose(other.ground.axes, [[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    assert other.standing is place.standing
+
+
+class Phase(Enum):
+    GO = "go"
+    REST = "rest"
+
+
+class Waits:
+    """Rests after three steps."""
+
+    def __init__(self, place: Place) -> None:
+        self.place, self.phase, self.steps = place, Phase.GO, 0
+
+    def objectives(self, state, report, dt):
+        self.steps += 1
+        self.phase = Phase.REST if self.steps >= 3 else Phase.GO
+        return []
+
+    def planned(self) -> dict[str, float]:
+        return {}
+
+    def notes(self) -> list[str]:
+        return []
+
+
+def test_motions_follow_each_other_from_where_the_body_is(place: Place) -> None:
+    sequence = MotionSequence(place, [Part("a", {}, Waits), Part("b", {}, Waits)])
+    times = [0.0]
+    for k in range(8):
+        assert sequence.finished == (k >= 6)
+        positions = moved(place, 0.1 * k, np.array([0.1 * k, 0.0, 0.0]))
+        sequence.objectives(BodyState(positions, 0 * positions, times[-1]), None, DT)
+        times.append(times[-1] + DT)
+    first, second = sequence.done
+    assert first.motion.place is place
+    assert np.allclose(second.motion.place.ground.axes[0], [np.cos(0.3), np.sin(0.3), 0.0])
+    assert sequence.spans(np.array(times)) == [(0, 3), (3, 8)]
+
+
+def test_a_script_becomes_parts(place: Place) -> None:
+    requests = parse_script("hop 0.6 x3, twist 90, jump x2")
+    parts = parts_of(requests, place.body.height)
+    assert [part.name for part in parts] == ["hop", "hop", "hop", "twist", "jump", "jump"]
+    assert [part.asked.get("square") for part in parts[:3]] == [1.0, 2.0, 3.0]
+    twist = parts[3].begin(place)
+    assert isinstance(twist, Twist) and twist.turn == pytest.approx(np.pi / 2)
+    jump = parts[4].begin(place)
+    assert isinstance(jump, Leap) and jump.target.distance == pytest.approx(0.5 * place.body.height)
+    assert longest(requests) == 3 * longest(parse_script("hop")) + longest(parse_script("twist, jump x2"))
+
+
+def test_hops_aim_at_squares_from_where_the_feet_are(place: Place) -> None:
+    """A hop that fell short and went aside is made up by the next; a square on a step is jumped up to."""
+    height = place.body.height
+    row = Squares(0.7, 0.2, 3, {"distance": 0.7})
+    begin = [part.begin for part in row.parts()]
+    first = begin[0](place)
+    assert isinstance(first, Hop) and first.target.distance == pytest.approx(0.7)
+    feet = sole_shares(place.body, place.ground, place.standing) @ place.standing
+    assert np.allclose(first.square, feet + [0.7, 0.0, 0.0])
+    again = begin[1](place.now(moved(place, 0.0, np.array([0.6, 0.1, 0.0]))))
+    assert isinstance(again, Hop) and again.target.distance == pytest.approx(np.hypot(0.8, 0.1))
+    assert np.allclose(again.ground.axes[0] * np.hypot(0.8, 0.1), [0.8, -0.1, 0.0])
+    assert again.miss(moved(place, 0.0, np.array([1.43, 0.04, 0.2]))) == pytest.approx(0.05)
+
+    stair = step(FLOOR, np.array([0.4, 0.0, 0.0]), FORWARD, 0.2 * height)
+    stairs = Place(place.body, place.ground, place.standing, place.touching, DT, (Solid((FLOOR,)), stair))
+    up = Squares(0.7, 0.2, 1, {}).parts()[0].begin(stairs)
+    assert isinstance(up, Hop) and up.target.rise == pytest.approx(0.2 * height)
+    assert up.target.height == pytest.approx(0.2 + 0.2 * height)
+    assert up.plan.flight_time < first.plan.flight_time + np.sqrt(2 * 0.2 * height / 9.81)
+    assert up.plan.speed_up > first.plan.speed_up
+
+
+def test_a_landing_frame_holds_the_landed_body(place: Place) -> None:
+    """From take-off on, a body that stands turned at the target has the coordinates of the start."""
+    target = JumpTarget(0.5, 0.3, 0.1)
+    leap = Leap(place, target, turn=0.8)
+    start = place.ground.local(place.standing)
+    leap.phase = JumpPhase.THRUST
+    flying = place.standing + [0.2, 0.0, 0.3]
+    leap.objectives(BodyState(flying, np.tile([1.0, 0.0, 2.5], (len(flying), 1)), 0.01), None, DT)
+    assert leap.phase is JumpPhase.FLIGHT and leap.left_ground
+    landed = moved(place, 0.8, np.array([0.5, 0.0, 0.1]))
+    assert np.allclose(leap.ground.local(landed), start)
+    assert leap.pose.measure(BodyState(landed, 0 * landed), None).heading == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.0 * np.pi])
+def test_a_twist_asks_friction_for_the_spin_that_is_left(place: Place, turn: float) -> None:
+    """In the thrust: up x L = I (angle left) / (time in the air) with a reserve; its own turning is counted beyond half turns."""
+    twist = Twist(place, JumpTarget(0.0, 0.2), turn)
+    twist.phase = JumpPhase.THRUST
+    still = np.zeros_like(place.standing)
+    inertia = float(place.body.inertia(place.standing)[2, 2])
+    asked = []
+    for angle in np.sign(turn) * np.array([0.0, 0.3, 0.6]):
+        report = twist.objectives(BodyState(moved(place, float(angle), np.zeros(3)), still, 0.0), None, DT)
+        asked.append(report[1].target[2] / inertia)
+    flight = 0.88 * twist.plan.flight_time / 1.1
+    left = abs(turn) - np.radians(5.0) - np.array([0.0, 0.3, 0.6])
+    assert np.allclose(np.abs(asked), left / flight, rtol=1e-2) and np.all(np.sign(asked) == np.sign(turn))
+    for angle in np.linspace(0.6, abs(turn), 12) * np.sign(turn):
+        twist.objectives(BodyState(moved(place, float(angle), np.zeros(3)), still, 0.0), None, DT)
+    assert twist._turned == pytest.approx(turn)
