@@ -1,0 +1,217 @@
+"""From a capture of a scene to an object, the plane it stands on, and a background without it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+
+import numpy as np
+
+from egs_warp.base_plane import guess_up
+from egs_warp.camera import Camera
+from egs_warp.camera_ring import ring_cameras
+from egs_warp.clearance import Clearing, ClearingOptions, clear_plane, reach_across
+from egs_warp.errors import UserError
+from egs_warp.gaussians import GaussianCloud
+from egs_warp.object_input import shrunk
+from egs_warp.plane import Plane
+from egs_warp.plane_fit import PlaneFit
+from egs_warp.plane_search import find_planes, plane_under, refine_plane
+from egs_warp.segmentation import ObjectSpec, Segmentation, segment
+from egs_warp.votes import blending_votes
+
+_PLANE_ELEVATIONS = (40.0, 58.0, 75.0)
+"""Degrees: seen at a grazing angle, splats in front hide those behind, and the floor seems to lie higher."""
+_PLANE_SIDE = 400
+"""Pixels of the pictures that the plane is fitted to."""
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """What may be chosen."""
+
+    clearing: Clearing | None = None
+    """None: fine-tuning where PyTorch is installed, else the static split."""
+    inpaint: bool = True
+    clearing_options: ClearingOptions = field(default_factory=ClearingOptions)
+
+
+@dataclass(frozen=True)
+class LocatedPlane:
+    """The plane under the object, and where on it the object is."""
+
+    plane: Plane
+    fit: PlaneFit | None
+    """None where the plane was given."""
+    centre: np.ndarray
+    """(3,) middle of the object."""
+    size: float
+    """Scene units: diagonal of the object's bounding box."""
+    segmentation: Segmentation
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PreparedScene:
+    """A capture taken apart; scene units."""
+
+    object: GaussianCloud
+    """Clear of the plane."""
+    background: GaussianCloud
+    """Without the object; with new floor where it stood, if that was asked for."""
+    bare: GaussianCloud
+    """The background before inpainting."""
+    plane: Plane
+    located: LocatedPlane
+    notes: tuple[str, ...]
+    """What was found and done, for the user."""
+
+
+def prepare_scene(
+    cloud: GaussianCloud,
+    spec: ObjectSpec,
+    *,
+    cameras: Sequence[Camera] = (),
+    up: np.ndarray | None = None,
+    plane: Plane | None = None,
+    options: SceneOptions | None = None,
+    progress: Callable[[str], None] = lambda stage: None,
+) -> PreparedScene:
+    """Everything between a capture and its animation: plane, segmentation, clearing of the plane, inpainting.
+
+    ``cameras`` are the capture's own, if known; ``up`` (3,) is roughly up, and guessed if not given; ``progress`` is
+    told the name of each stage. Raises ``UserError`` as the stages do.
+    """
+    options = options or SceneOptions()
+    progress("plane")
+    located = locate_plane(cloud, spec, cameras=cameras, up=up, plane=plane)
+    progress("segment")
+    thing, bare, notes = take_apart(cloud, located, options)
+    background = bare
+    if options.inpaint:
+        progress("inpaint")
+        # torch may be missing, and with it the training that inpainting ends with.
+        from egs_warp.holes import footprint
+        from egs_warp.inpainting import InpaintOptions, inpaint
+
+        steps = {} if has_torch() else {"steps": 0}
+        result = inpaint(bare, footprint(thing, located.plane), options=InpaintOptions(**steps))
+        background, notes = result.cloud, (*notes, *result.notes)
+    return PreparedScene(thing, background, bare, located.plane, located, (*located.notes, *notes))
+
+
+def take_apart(
+    cloud: GaussianCloud, located: LocatedPlane, options: SceneOptions
+) -> tuple[GaussianCloud, GaussianCloud, tuple[str, ...]]:
+    """Object, clear of the plane; background with a hole; and what there is to say."""
+    found = located.segmentation
+    method = options.clearing or (Clearing.FINETUNE if has_torch() else Clearing.SPLIT)
+    untouched = cloud.subset(found.object_mask)
+    heights, reach = reach_across(untouched, located.plane, options.clearing_options.reach)
+    thing = clear_plane(untouched, located.plane, method, options=options.clearing_options)
+    if not found.background_mask.any():
+        raise UserError("object: it is the whole capture, so there is no background; leave --object out")
+    notes = (
+        f"the object has {untouched.count} of {cloud.count} Gaussians; {int(found.buried_mask.sum())} under it and "
+        f"{int(found.floater_mask.sum())} floaters beside it were dropped",
+        f"{int((np.abs(heights) < reach).sum())} of the object's Gaussians straddled the plane: {method.value}",
+    )
+    return thing, cloud.subset(found.background_mask), notes
+
+
+def has_torch() -> bool:
+    """Whether training is possible."""
+    return find_spec("torch") is not None
+
+
+def locate_plane(
+    cloud: GaussianCloud,
+    spec: ObjectSpec,
+    *,
+    cameras: Sequence[Camera] = (),
+    up: np.ndarray | None = None,
+    plane: Plane | None = None,
+) -> LocatedPlane:
+    """The plane under the object, and the object on it.
+
+    A coarse plane is sampled from the Gaussians, the object found on it, and the plane then fitted to the depth rendered
+    beside the object, through ``cameras`` or else a ring of steep ones; then the object is found again. With ``plane``
+    given, only the object is sought.
+    """
+    notes: list[str] = []
+    if plane is not None:
+        found = segment(cloud, plane, spec)
+        return LocatedPlane(plane, None, _middle(cloud, found), found.size, found, ())
+    if up is None:
+        up, reason = _up_of(cloud, cameras)
+        notes.append(f"up is taken to be {','.join(f'{x:.2f}' for x in up)} ({reason}); if not, give --up")
+    coarse = _coarse_plane(cloud, spec, up)
+    found = segment(cloud, coarse, spec)
+    centre = _middle(cloud, found)
+    radius = 0.75 * found.size
+    if cameras:
+        views = [shrunk(camera, _PLANE_SIDE) for camera in cameras]
+    else:
+        level = centre - coarse.heights(centre) * coarse.normal
+        views = ring_cameras(coarse, level, radius, count=9, elevations=_PLANE_ELEVATIONS, size=_PLANE_SIDE)
+    fit = refine_plane(
+        cloud, coarse, views, centre=centre, radius=radius, object_mask=found.object_mask | found.buried_mask
+    )
+    found = segment(cloud, fit.plane, spec)
+    notes.append(
+        f"plane {','.join(f'{x:.4f}' for x in (*fit.plane.normal, fit.plane.offset))}: fits {fit.pixel_count} pixels "
+        f"to {100 * fit.noise:.2f} % of depth, {100 * fit.inlier_share:.0f} % of them inliers"
+    )
+    return LocatedPlane(fit.plane, fit, _middle(cloud, found), found.size, found, tuple(notes))
+
+
+def _middle(cloud: GaussianCloud, found: Segmentation) -> np.ndarray:
+    means = cloud.means.numpy()[found.object_mask].astype(np.float64)
+    return 0.5 * (np.quantile(means, 0.01, axis=0) + np.quantile(means, 0.99, axis=0))
+
+
+def _up_of(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray, str]:
+    if len(cameras) >= 3:
+        # Photographers hold cameras upright: the directions to the right span the level plane.
+        rights = np.stack([camera.rotation[0] for camera in cameras])
+        values, vectors = np.linalg.eigh(rights.T @ rights)
+        ups = -np.stack([camera.rotation[1] for camera in cameras]).mean(axis=0)
+        if values[0] < 0.1 * values[1]:
+            axis = vectors[:, 0]
+            return axis * (1.0 if axis @ ups > 0 else -1.0), "the cameras are held upright"
+    return guess_up(cloud)
+
+
+def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> Plane:
+    means = cloud.means.numpy().astype(np.float64)
+    searched, tilt, least_share = cloud, 25.0, 0.3
+    if spec.box is not None:
+        middle, half = 0.5 * (spec.box.low + spec.box.high), 0.5 * (spec.box.high - spec.box.low)
+        near = np.all(np.abs(means - middle) < 1.5 * half, axis=1)
+        if not spec.box.holds(means).any():
+            raise UserError("object: the box holds nothing of the capture; give it in the capture's units")
+        searched = cloud.subset(near)
+        corners = np.stack(np.meshgrid(*zip(spec.box.low, spec.box.high, strict=True)), axis=-1).reshape(-1, 3)
+        along = corners @ up
+        lowest = middle + (along.min() + 0.25 * np.ptp(along) - middle @ up) * up
+        tilt, least_share = 15.0, 0.5
+    elif spec.masks:
+        votes = blending_votes(cloud, [view for view in spec.masks if view.mask.any()])
+        inside = votes.inside * (votes.share_inside() > 0.5) * (votes.share_seen() > 0.02)
+        if inside.sum() <= 0.0:
+            segment(cloud, Plane(up, 0.0), spec)
+            raise UserError("object: nothing of the capture shows inside the masks; check masks and cameras")
+        order = np.argsort(means @ up)
+        share = np.cumsum(inside[order]) / inside.sum()
+        lowest = means[order[int(np.searchsorted(share, 0.3))]]
+    else:
+        assert spec.point is not None
+        lowest = spec.point
+    planes = find_planes(searched, up, tilt_degrees=tilt)
+    plane = plane_under(planes, lowest, tolerance=0.0, least_share=least_share)
+    if plane is None:
+        raise UserError(
+            "plane: none in sight under the object: nothing flat and level lies below it; check --up, or give --plane"
+        )
+    return plane
