@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg.blas import dger
 
 
 def lemke(matrix: np.ndarray, q: np.ndarray, *, pivot_limit: int = 2000) -> np.ndarray | None:
@@ -15,27 +16,34 @@ def lemke(matrix: np.ndarray, q: np.ndarray, *, pivot_limit: int = 2000) -> np.n
     if count == 0 or q.min() >= 0.0:
         return np.zeros(count)
     # Columns: w (n), z (n), the covering variable, the right-hand side. w - M z - e z0 = q.
-    tableau = np.hstack([np.eye(count), -matrix, -np.ones((count, 1)), q[:, None]])
+    tableau = np.asfortranarray(np.hstack([np.eye(count), -matrix, -np.ones((count, 1)), q[:, None]]))
     basis = np.arange(count)
     scale = 1e-11 * max(1.0, float(np.abs(matrix).max()))
     row, entering = int(np.argmin(q)), 2 * count
     for _ in range(pivot_limit):
         leaving = basis[row]
-        tableau[row] /= tableau[row, entering]
-        others = np.arange(count) != row
-        tableau[others] -= np.outer(tableau[others, entering], tableau[row])
+        pivot_row = tableau[row] / tableau[row, entering]
+        column = tableau[:, entering].copy()
+        column[row] -= 1.0
+        tableau = dger(-1.0, column, pivot_row, a=tableau, overwrite_a=True)
         basis[row] = entering
         if leaving == 2 * count:
-            solution = np.zeros(2 * count + 1)
-            solution[basis] = tableau[:, -1]
-            return np.maximum(solution[count : 2 * count], 0.0)
+            return _solution(tableau, basis)
         entering = leaving + count if leaving < count else leaving - count
         column = tableau[:, entering]
         usable = np.flatnonzero(column > scale)
         if len(usable) == 0:
-            return None
+            # A ray; but one that the covering variable is already too small to matter on is the solution.
+            return _solution(tableau, basis) if tableau[basis == 2 * count, -1].item() < 1e-11 else None
         row = _smallest_ratio(tableau, column, usable, basis, 2 * count)
     return None
+
+
+def _solution(tableau: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    count = len(tableau)
+    values = np.zeros(2 * count + 1)
+    values[basis] = tableau[:, -1]
+    return np.maximum(values[count : 2 * count], 0.0)
 
 
 def _smallest_ratio(tableau: np.ndarray, column: np.ndarray, rows: np.ndarray, basis: np.ndarray, cover: int) -> int:

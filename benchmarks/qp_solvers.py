@@ -1,0 +1,178 @@
+"""OSQP and DAQP on the engine's quadratic programs, over the number of contacts.
+
+python benchmarks/qp_solvers.py [--quick] [--device cpu] [--seed 0] [--body pawn] [--json PATH] [--plot PATH]
+
+The programs are steps of an animation (Eq. 13) with 40 muscle groups, 4 friction directions and 1 to 32 contacts. ``first`` is
+set-up and solve, ``again`` a re-solve for other contact states by a change of bounds alone, ``search`` the whole two-stage
+search of a step. Both solvers get the same programs in turn. ``breach`` is the worst violation of a bound (forces in body
+weights, speeds in sqrt(g H)); ``objective`` is relative to DAQP's. No aim is named for this benchmark.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+sys.path.insert(0, str(Path(__file__).parent))
+from contact_frames import Frame, animation_frames, body_named
+
+from egs_warp.complementarity import SEPARATE, states_of_pairs
+from egs_warp.qp import QpSolution, QpSolver, quadratic_program
+from egs_warp.report import versions
+from egs_warp.strategies import Strategy, contact_under, find_states
+
+CONTACTS = (1, 2, 4, 8, 16, 32)
+GROUPS = 40
+QP_LIMIT = 6
+
+
+def timed(action: Callable[[], Any]) -> tuple[Any, float]:
+    """Result and milliseconds."""
+    started = time.perf_counter()
+    result = action()
+    return result, 1e3 * (time.perf_counter() - started)
+
+
+def frame_figures(frame: Frame, solver: QpSolver) -> dict[str, Any]:
+    """Figures of one program."""
+    program = frame.program
+    y = contact_under(program, frame.previous)
+    states = frame.predicted if y is None else states_of_pairs(program.layout, *program.pairs(y))
+    other = contact_under(program, frame.known)
+    changed = (
+        np.full_like(states, SEPARATE) if other is None else states_of_pairs(program.layout, *program.pairs(other))
+    )
+
+    def first() -> tuple[Any, QpSolution]:
+        qp = quadratic_program(program.P, program.q, program.A, solver=solver)
+        return qp, qp.solve(*program.bounds(states))
+
+    (qp, solution), first_time = timed(first)
+    again, again_time = timed(lambda: qp.solve(*program.bounds(changed)))
+    found, search_time = timed(
+        lambda: find_states(
+            program, Strategy.TWO_STAGE, frame.predicted, frame.previous, qp_limit=QP_LIMIT, solver=solver
+        )
+    )
+    breach = 0.0
+    for result, chosen in ((solution, states), (again, changed)):
+        if result.usable:
+            lower, upper = program.bounds(chosen)
+            rows = program.A @ result.x
+            breach = max(breach, float((lower - rows).max()), float((rows - upper).max()))
+    return {
+        "first": first_time,
+        "again": again_time,
+        "search": search_time,
+        "breach": breach,
+        "lost": int(not solution.usable) + int(not again.usable),
+        "objective": found.objective,
+        "qps": found.qp_count,
+    }
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="10 frames a contact count in place of 40")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--body", default="pawn")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--plot", type=Path)
+    arguments = parser.parse_args()
+    wp.config.log_level = wp.LOG_WARNING
+    bench = body_named(arguments.body, arguments.device)
+    frames = 10 if arguments.quick else 40
+    rows = []
+    print(
+        f"{'contacts':>8}{'variables':>10}{'solver':>8}{'first ms':>10}{'again ms':>10}{'search ms':>11}{'QPs':>6}"
+        f"{'breach':>10}{'objective':>11}{'lost':>6}"
+    )
+    for contacts in CONTACTS:
+        made = animation_frames(
+            bench,
+            frames=frames + 4,
+            activations=GROUPS,
+            contacts=contacts,
+            directions=4,
+            strength=0.2,
+            seed=arguments.seed,
+        )[4:]
+        figures: dict[QpSolver, list[dict[str, Any]]] = {solver: [] for solver in QpSolver}
+        for frame in made:
+            for solver in QpSolver:
+                figures[solver].append(frame_figures(frame, solver))
+        reference = np.array([row["objective"] for row in figures[QpSolver.DAQP]])
+        for solver, measured in figures.items():
+            column = {name: np.array([row[name] for row in measured]) for name in measured[0]}
+            row = {
+                "contacts": contacts,
+                "variables": made[0].program.layout.variables,
+                "solver": solver.value,
+                **{name: float(np.median(column[name])) for name in ("first", "again", "search")},
+                "qps": float(column["qps"].mean()),
+                "breach": float(column["breach"].max()),
+                "objective": float(np.median((column["objective"] + 1e-12) / (reference + 1e-12))),
+                "lost": int(column["lost"].sum()),
+            }
+            rows.append(row)
+            print(
+                f"{contacts:>8}{row['variables']:>10}{row['solver']:>8}{row['first']:>10.2f}{row['again']:>10.2f}"
+                f"{row['search']:>11.2f}{row['qps']:>6.2f}{row['breach']:>10.1e}{row['objective']:>11.4f}{row['lost']:>6}",
+                flush=True,
+            )
+    result = {
+        "rows": rows,
+        "environment": {
+            "device": arguments.device,
+            "body": arguments.body,
+            "seed": arguments.seed,
+            "frames": frames,
+            **versions(),
+        },
+        "aims": {},
+        "why_null": {},
+    }
+    if arguments.json:
+        arguments.json.write_text(json.dumps(result, indent=2) + "\n")
+    if arguments.plot:
+        _plot(rows, arguments.plot)
+
+
+def _plot(rows: list[dict[str, Any]], path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6))
+    for solver, colour in ((QpSolver.OSQP, "tab:orange"), (QpSolver.DAQP, "tab:blue")):
+        own = [row for row in rows if row["solver"] == solver.value]
+        contacts = [row["contacts"] for row in own]
+        left.plot(contacts, [row["again"] for row in own], "o-", color=colour, label=f"{solver.value}, re-solve")
+        left.plot(contacts, [row["search"] for row in own], "s--", color=colour, label=f"{solver.value}, whole search")
+        right.plot(contacts, [max(row["breach"], 1e-17) for row in own], "o-", color=colour, label=solver.value)
+    for axes in (left, right):
+        axes.set_xscale("log", base=2)
+        axes.set_yscale("log")
+        axes.set_xticks(CONTACTS, [str(count) for count in CONTACTS])
+        axes.set_xlabel("contacts")
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8)
+    left.set_ylabel("milliseconds, median")
+    right.set_ylabel("worst violation of a bound")
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+
+
+if __name__ == "__main__":
+    main()
