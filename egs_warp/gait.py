@@ -62,13 +62,19 @@ class Gait:
 
     def lifted(self, progress: float) -> float:
         """Metres a foot is above the ground when ``progress`` (0 to 1) of its swing is over; it leaves and lands at rest."""
-        return self.lift * float(np.sin(np.pi * np.clip(progress, 0.0, 1.0) ** 0.8) ** 2)
+        return self.lift * float(_smooth(progress / 0.3) * (1.0 - _smooth((progress - 0.65) / 0.35)))
 
     @staticmethod
     def carried(progress: float) -> float:
-        """Part of its way that a foot has gone when ``progress`` (0 to 1) of its swing is over; it leaves and lands upright."""
-        s = float(np.clip((progress - 0.1) / 0.85, 0.0, 1.0))
-        return s * s * s * (10.0 - 15.0 * s + 6.0 * s * s)
+        """Part of its way that a foot has gone when ``progress`` (0 to 1) of its swing is over; it has arrived before it lands,
+        lest an early touch of the ground drag it."""
+        return float(_smooth((progress - 0.1) / 0.7))
+
+
+def _smooth(s: float) -> float:
+    """From 0 at 0 to 1 at 1, at rest and without acceleration at both."""
+    s = float(np.clip(s, 0.0, 1.0))
+    return s * s * s * (10.0 - 15.0 * s + 6.0 * s * s)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,31 @@
+"""The built-in stool walks: video, contact sheet, report and trajectory."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from egs_warp.animation import AnimateOptions, animate, summary
+from egs_warp.scenes import stool
+
+
+def main(arguments: list[str] | None = None) -> dict:
+    """Run the example; returns the report."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("out/walk"))
+    parser.add_argument("--steps", type=int, default=4)
+    parser.add_argument("--step-length", type=float, default=0.1, help="body heights")
+    parser.add_argument("--frames", type=int, help="default: until it rests")
+    parser.add_argument("--size", type=int, default=512)
+    parser.add_argument("--device", default="cpu")
+    chosen = parser.parse_args(arguments)
+    thing = stool(device=chosen.device)
+    options = AnimateOptions(frames=chosen.frames, size=chosen.size)
+    motion = f"walk {chosen.steps} {chosen.step_length}"
+    report = animate(thing.cloud, chosen.out, motion=motion, plane=thing.plane, options=options, source="stool")
+    print(summary(report))
+    return report
+
+
+if __name__ == "__main__":
+    main()
