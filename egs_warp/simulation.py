@@ -47,7 +47,10 @@ def steps_per_frame(body: SoftBody) -> int:
 
 
 def settle(stepper: LocomotionStepper) -> BodyState:
-    """The body at rest on its ground: contact steps from rest, long ones, each begun without velocity."""
+    """The body at rest on its ground: contact steps from rest, long ones, each begun without velocity.
+
+    One that gives way is not followed to the ground: it is returned once its centre of mass has gone 0.1 H.
+    """
     body = stepper.body
     state = BodyState(body.mesh.nodes.copy(), np.zeros_like(body.mesh.nodes))
     dt = 0.25 * np.sqrt(body.height / np.linalg.norm(body.gravity))
@@ -70,7 +73,8 @@ def settle(stepper: LocomotionStepper) -> BodyState:
         moved = dt * float(np.abs(result.velocities).max())
         state = BodyState(step.end_positions(result.velocities), np.zeros_like(state.positions))
         memory = stepper.remember(result, memory.activations)
-        if moved < 2e-4 * body.height:
+        gone = body.centre_of_mass(state.positions) - body.centre_of_mass(body.mesh.nodes)
+        if moved < 2e-4 * body.height or np.linalg.norm(gone) > 0.1 * body.height:
             break
     return state
 
