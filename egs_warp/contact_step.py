@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from egs_warp.contact import ContactDetector, ContactSet, coulomb_forces, push_out_speeds
+from egs_warp.contact import ContactDetector, ContactSet, push_out_speeds
+from egs_warp.coulomb import coulomb_forces
 from egs_warp.dynamics import ImplicitStep, NewtonStatus
 
 

@@ -10,11 +10,11 @@ from egs_warp.contact import (
     ContactDetector,
     ContactGeometry,
     contact_geometry,
-    coulomb_forces,
     independent_contacts,
     push_out_speeds,
     tangent_directions,
 )
+from egs_warp.coulomb import coulomb_forces
 from egs_warp.embedding import embed_points
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.plane import Plane
