@@ -16,6 +16,7 @@ import warp as wp
 from egs_warp.camera import Camera
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.kernels.render_ellipse import ALPHA_CUT, ALPHA_LIMIT, TILE, TILE_PIXELS, TRANSMITTANCE_STOP
+from egs_warp.launching import launch_rows
 from egs_warp.render.backward import backward
 from egs_warp.render.compositing import Background, composite
 from egs_warp.render.projection import ProjectedGaussians, project, view_from_camera
@@ -69,13 +70,14 @@ def hits_kernel(
 
 @wp.kernel
 def arithmetic_kernel(
+    first: wp.int32,
     # In:
     factor: wp.float32,
     # Out:
     sum_out: wp.array[wp.float32],
 ):
     """Eight independent chains of multiply and add: the most operations that this device can be brought to do."""
-    i = wp.tid()
+    i = wp.tid() + first
     a = wp.float32(i)
     b = a + 1.0
     c = a + 2.0
@@ -172,7 +174,7 @@ def device_limits(device: Any) -> tuple[float, float]:
     times = median_ms(
         {
             "copy": lambda: wp.copy(target, source),
-            "arithmetic": lambda: wp.launch(arithmetic_kernel, lanes, inputs=[0.999], outputs=[sums], device=device),
+            "arithmetic": lambda: wp.launch(arithmetic_kernel, lanes, inputs=[0, 0.999], outputs=[sums], device=device),
         },
         repeats=7,
         synchronise=lambda: wp.synchronize_device(device),
@@ -180,6 +182,19 @@ def device_limits(device: Any) -> tuple[float, float]:
     # Eight chains, two operations a step.
     operations = lanes * 2048 * 8 * 2
     return 2 * size / (times["copy"] * 1e-3), operations / (times["arithmetic"] * 1e-3)
+
+
+def arithmetic_by_threads(threads: int, sums: wp.array) -> None:
+    """Work that any second core halves: what ``threads`` threads of this machine can do at best."""
+    launch_rows(
+        arithmetic_kernel,
+        len(sums),
+        inputs=[0.999],
+        outputs=[sums],
+        device=sums.device,
+        threads=threads,
+        work=np.ones(len(sums)),
+    )
 
 
 def _counts(projected: ProjectedGaussians, lists: TileLists, view: Any) -> dict[str, float]:
