@@ -15,7 +15,7 @@ from egs_warp.motions import JumpTarget
 from egs_warp.script import MotionRequest
 from egs_warp.sequence import BodyMotion, Part, Place
 from egs_warp.trajectory import Trajectory
-from egs_warp.twist import Twist
+from egs_warp.turn import Turn
 from egs_warp.walk import Walk
 
 FRAMES: Mapping[str, int] = {"jump": 120, "hop": 150, "twist": 120, "walk": 170}
@@ -34,7 +34,7 @@ def _jump(asked: Mapping[str, float], place: Place) -> BodyMotion:
 def _twist(asked: Mapping[str, float], place: Place) -> BodyMotion:
     height = place.body.height
     target = JumpTarget(asked["distance"] * height, asked["height"] * height)
-    return Twist(place, target, float(np.radians(asked["heading_degrees"])))
+    return Turn(place, target, float(np.radians(asked["heading_degrees"])))
 
 
 def _walk(asked: Mapping[str, float], place: Place) -> BodyMotion:

@@ -37,6 +37,10 @@ class Twist(Leap):
         self._turned += float(np.remainder(facing - self._turned + np.pi, 2.0 * np.pi) - np.pi)
         return super().objectives(state, report, dt)
 
+    def left(self, state: BodyState) -> float:
+        """Radians by which the feet of the body that has landed are short of the asked turn."""
+        return -self.pose.sole_heading(state.positions)
+
     def _stand(
         self, state: BodyState, com_velocity: np.ndarray, position: np.ndarray, base: np.ndarray, dt: float
     ) -> list[Objective | SpinObjective]:

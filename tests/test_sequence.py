@@ -17,6 +17,7 @@ from egs_warp.script import parse_script
 from egs_warp.sequence import MotionSequence, Part, Place
 from egs_warp.stance import Ground, sole_shares
 from egs_warp.terrain import Solid, step
+from egs_warp.turn import Turn
 from egs_warp.twist import Twist
 from tests.meshes import block_mesh
 
@@ -101,8 +102,8 @@ def test_a_script_becomes_parts(place: Place) -> None:
     parts = parts_of(requests, place.body.height)
     assert [part.name for part in parts] == ["hop", "hop", "hop", "twist", "jump", "jump"]
     assert [part.asked.get("square") for part in parts[:3]] == [1.0, 2.0, 3.0]
-    twist = parts[3].begin(place)
-    assert isinstance(twist, Twist) and twist.turn == pytest.approx(np.pi / 2)
+    turn = parts[3].begin(place)
+    assert isinstance(turn, Turn) and turn.jumps[0].turn == pytest.approx(np.pi / 2)
     jump = parts[4].begin(place)
     assert isinstance(jump, Leap) and jump.target.distance == pytest.approx(0.5 * place.body.height)
     assert longest(requests) == 3 * longest(parse_script("hop")) + longest(parse_script("twist, jump x2"))
@@ -162,3 +163,24 @@ def test_a_twist_asks_friction_for_the_spin_that_is_left(place: Place, turn: flo
     for angle in np.linspace(0.6, abs(turn), 12) * np.sign(turn):
         twist.objectives(BodyState(moved(place, float(angle), np.zeros(3)), still, 0.0), None, DT)
     assert twist._turned == pytest.approx(turn)
+
+
+def test_a_turn_that_falls_short_is_made_up_where_it_began(place: Place) -> None:
+    """50 degrees short and 0.1 aside: the next jump turns by the rest and goes back; 5 degrees short is let be."""
+    turn = Turn(place, JumpTarget(0.0, 0.2), np.radians(120.0))
+    first = turn.jumps[0]
+    first.phase, first._entered = JumpPhase.LAND, 0.0
+    first.pose, first.ground = first._landing_pose, first._landing
+    short = moved(place, np.radians(70.0), np.array([0.1, 0.0, 0.0]))
+    state = BodyState(short, 0 * short, 10.0)
+    turn.objectives(state, None, DT)
+    assert len(turn.jumps) == 2 and turn.phase is JumpPhase.CROUCH  # it has settled already
+    second = turn.jumps[1]
+    assert np.degrees(second.turn) == pytest.approx(50.0) and second.target.distance == pytest.approx(0.1)
+    assert np.allclose(second.ground.axes[0], [-1.0, 0.0, 0.0])
+    assert turn.notes() == ["turned in 2 jumps: the first was 50 degrees short"] and turn.planned()["jumps"] == 2.0
+    second.phase, second._entered = JumpPhase.LAND, 0.0
+    second.pose, second.ground = second._landing_pose, second._landing
+    there = moved(place, np.radians(115.0), np.zeros(3))
+    turn.objectives(BodyState(there, 0 * there, 20.0), None, DT)
+    assert len(turn.jumps) == 2 and turn.phase is JumpPhase.REST
