@@ -24,7 +24,7 @@ import warp as wp
 
 sys.path.insert(0, str(Path(__file__).parent))
 import mesh_scenes as scenes
-from drop import simulated_drop
+from drop import Drop, simulated_drop
 
 from egs_warp.cage import build_cage
 from egs_warp.camera import Camera
@@ -47,12 +47,19 @@ AIMS = ("best_psnr_every_deformation", "best_ssim_every_deformation", "margin_ov
 OURS, UNSPLIT, VRGS = CarryMethod.BIDIRECTIONAL, CarryMethod.BIDIRECTIONAL_NO_SPLIT, CarryMethod.LOCAL_TETRAHEDRON
 
 
-def motions_of(mesh: scenes.PaintedMesh, cloud: GaussianCloud) -> dict[str, scenes.Motion]:
+def motions_of(mesh: scenes.PaintedMesh, cloud: GaussianCloud, folder: Path | None) -> dict[str, scenes.Motion]:
     """What is done to one object. The drop is simulated with a coarse cage; ``cloud`` tells where it touches the floor."""
-    started = time.perf_counter()
-    coarse = build_cage(cloud, FLOOR, target_nodes=250).mesh
-    dropped = simulated_drop(coarse, cloud, sag=0.15, height=0.6, tilt_degrees=20.0, seconds=0.3)
-    print(f"  drop: {len(coarse.nodes)} nodes, simulated in {time.perf_counter() - started:.0f} s", flush=True)
+    kept = folder / f"{mesh.name}_drop.npz" if folder else None
+    if kept is not None and kept.exists():
+        with np.load(kept) as arrays:
+            dropped = Drop(**arrays)
+    else:
+        started = time.perf_counter()
+        coarse = build_cage(cloud, FLOOR, target_nodes=250).mesh
+        dropped = simulated_drop(coarse, cloud, sag=0.15, height=0.6, tilt_degrees=20.0, seconds=0.3)
+        print(f"  drop: {len(coarse.nodes)} nodes, simulated in {time.perf_counter() - started:.0f} s", flush=True)
+        if kept is not None:
+            np.savez_compressed(kept, frames=dropped.frames, energies=dropped.energies, rest=dropped.rest)
     return {"bend": scenes.bend, "twist": scenes.twist_by(150.0), "fall": dropped.at_impact}
 
 
@@ -90,7 +97,7 @@ def object_rows(mesh: scenes.PaintedMesh, options: argparse.Namespace) -> tuple[
     surface = scenes.surface_cloud(mesh, 40_000, device="cpu")
     cage = build_cage(surface, FLOOR, target_nodes=options.nodes or CAGE_NODES[mesh.name]).mesh
     held = embed_points(cage, mesh.vertices, device=options.device).inside.numpy().mean()
-    motions = motions_of(mesh, surface)
+    motions = motions_of(mesh, surface, options.clouds)
 
     def cameras_around(vertices: np.ndarray) -> list[Camera]:
         return scenes.ring(vertices, 12 if full else 6, 800 if full else 128, elevations=(10.0, 40.0), phase=0.37)
@@ -200,7 +207,7 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int)
     parser.add_argument("--iterations", type=int)
     parser.add_argument("--nodes", type=int, help="nodes of the cage, about")
-    parser.add_argument("--clouds", type=Path, help="folder in which trained clouds are kept and looked for")
+    parser.add_argument("--clouds", type=Path, help="folder in which clouds and falls are kept, and looked for")
     parser.add_argument("--rule", default=SplitRule.MEASURED.value, choices=[rule.value for rule in SplitRule])
     parser.add_argument("--threshold", type=float, default=SPLIT_DEGREES)
     parser.add_argument("--min-error", type=float, help="least misfit that splits, metres")

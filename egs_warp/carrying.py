@@ -48,11 +48,12 @@ def carry(
     threshold_degrees: float = SPLIT_DEGREES,
     min_error: float | None = None,
     max_depth: int = 3,
+    max_growth: float = 4.0,
 ) -> list[GaussianCloud]:
     """The cloud in each of ``frames``: node positions (N, 3) or (N,) vec3d, metres, of the cage ``mesh``.
 
-    ``rule``, ``threshold_degrees``, ``min_error`` and ``max_depth`` are those of ``split_for_motion`` and matter to
-    ``BIDIRECTIONAL``.
+    ``rule``, ``threshold_degrees``, ``min_error``, ``max_depth`` and ``max_growth`` are those of ``split_for_motion`` and
+    matter to ``BIDIRECTIONAL``.
     """
     cage = mesh if isinstance(mesh, CageLocator) else CageLocator(mesh, device=cloud.device)
     if method in (CarryMethod.BIDIRECTIONAL, CarryMethod.BIDIRECTIONAL_NO_SPLIT):
@@ -66,6 +67,7 @@ def carry(
                 threshold_degrees=threshold_degrees,
                 min_error=min_error,
                 max_depth=max_depth,
+                max_growth=max_growth,
             )
             cloud, embedding = split.cloud, split.embedding
         # A Deformer of its own for each frame, since all results are kept.
