@@ -49,7 +49,8 @@ def steps_per_frame(body: SoftBody) -> int:
 def settle(stepper: LocomotionStepper) -> BodyState:
     """The body at rest on its ground: contact steps from rest, long ones, each begun without velocity.
 
-    One that gives way is not followed to the ground: it is returned once its centre of mass has gone 0.1 H.
+    One that gives way is not followed to the ground: it is returned once a node has gone 0.2 H in one step, or its centre of
+    mass 0.1 H in all.
     """
     body = stepper.body
     state = BodyState(body.mesh.nodes.copy(), np.zeros_like(body.mesh.nodes))
@@ -74,7 +75,8 @@ def settle(stepper: LocomotionStepper) -> BodyState:
         state = BodyState(step.end_positions(result.velocities), np.zeros_like(state.positions))
         memory = stepper.remember(result, memory.activations)
         gone = body.centre_of_mass(state.positions) - body.centre_of_mass(body.mesh.nodes)
-        if moved < 2e-4 * body.height or np.linalg.norm(gone) > 0.1 * body.height:
+        gives_way = moved > 0.2 * body.height or np.linalg.norm(gone) > 0.1 * body.height
+        if gives_way or moved < 2e-4 * body.height:
             break
     return state
 
