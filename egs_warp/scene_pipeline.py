@@ -12,17 +12,28 @@ from egs_warp.base_plane import guess_up
 from egs_warp.camera import Camera
 from egs_warp.camera_ring import ring_cameras
 from egs_warp.clearance import Clearing, ClearingOptions, clear_plane, reach_across
+from egs_warp.connectivity import enclosed
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
+from egs_warp.holes import Hole
 from egs_warp.object_input import shrunk
 from egs_warp.plane import Plane
 from egs_warp.plane_fit import PlaneFit
 from egs_warp.plane_search import find_planes, plane_under, refine_plane
-from egs_warp.segmentation import ObjectSpec, Segmentation, segment
+from egs_warp.rectified import PlaneWindow
+from egs_warp.segmentation import CELLS, ObjectSpec, Segmentation, segment
 from egs_warp.votes import blending_votes
 
 _PLANE_ELEVATIONS = (40.0, 58.0, 75.0)
 """Degrees: seen at a grazing angle, splats in front hide those behind, and the floor seems to lie higher."""
+_HOLE_HEIGHT = 0.08
+"""Of the object's size: under what it has below this height the floor is unseen, or seen so badly that it is smeared."""
+_HOLE_MARGIN = 0.05
+"""Of the hole's side: the floor beside the object bears its shadow."""
+_HOLE_TEXELS = 200
+_CLEAR_SUPPORT = 0.1
+"""Share of the visible surface: a plane as wide as this is no accident."""
+_LEVEL_DEGREES = 5.0
 _PLANE_SIDE = 400
 """Pixels of the pictures that the plane is fitted to."""
 
@@ -92,12 +103,15 @@ def prepare_scene(
     if options.inpaint:
         progress("inpaint")
         # torch may be missing, and with it the training that inpainting ends with.
-        from egs_warp.holes import footprint
         from egs_warp.inpainting import InpaintOptions, inpaint
 
         steps = {} if has_torch() else {"steps": 0}
-        result = inpaint(bare, footprint(thing, located.plane), options=InpaintOptions(**steps))
-        background, notes = result.cloud, (*notes, *result.notes)
+        try:
+            result = inpaint(bare, hole_under(cloud, located), options=InpaintOptions(margin=_HOLE_MARGIN, **steps))
+            background, notes = result.cloud, (*notes, *result.notes)
+        except UserError as error:
+            # A floor with a hole is worth more than no animation.
+            notes = (*notes, f"the floor under the object was not filled ({error})")
     return PreparedScene(thing, background, bare, located.plane, located, (*located.notes, *notes))
 
 
@@ -118,6 +132,22 @@ def take_apart(
         f"{int((np.abs(heights) < reach).sum())} of the object's Gaussians straddled the plane: {method.value}",
     )
     return thing, cloud.subset(found.background_mask), notes
+
+
+def hole_under(cloud: GaussianCloud, located: LocatedPlane) -> Hole:
+    """Where the floor is missing: the outline of the object's low part and of what was dropped from under it, filled."""
+    plane, found = located.plane, located.segmentation
+    means = cloud.means.numpy().astype(np.float64)
+    low = found.buried_mask | (found.object_mask & (plane.heights(means) < _HOLE_HEIGHT * found.size))
+    middle = 0.5 * (means[low].min(axis=0) + means[low].max(axis=0))
+    tangents = np.stack(plane.tangents(), axis=1)
+    flat = means[low] @ tangents
+    texel = 1.2 * float(np.ptp(flat, axis=0).max()) / _HOLE_TEXELS
+    window = PlaneWindow(plane, middle - plane.heights(middle) * plane.normal, texel, _HOLE_TEXELS, _HOLE_TEXELS)
+    columns, rows = np.meshgrid(np.arange(_HOLE_TEXELS) + 0.5, np.arange(_HOLE_TEXELS) + 0.5)
+    places = window.points(np.stack([columns.ravel(), rows.ravel()], axis=1))
+    inside = enclosed(places @ tangents, flat, found.size / CELLS)
+    return Hole(window, inside.reshape(_HOLE_TEXELS, _HOLE_TEXELS))
 
 
 def has_torch() -> bool:
@@ -185,33 +215,40 @@ def _up_of(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray,
 
 def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> Plane:
     means = cloud.means.numpy().astype(np.float64)
-    searched, tilt, least_share = cloud, 25.0, 0.3
+    everywhere = find_planes(cloud, up)
+    # The widest plane tells up better than a guess does, and what objects stand on is level.
+    if everywhere and everywhere[0].support > _CLEAR_SUPPORT:
+        up = everywhere[0].plane.normal
+    searched, least_share = cloud, 0.3
     if spec.box is not None:
-        middle, half = 0.5 * (spec.box.low + spec.box.high), 0.5 * (spec.box.high - spec.box.low)
-        near = np.all(np.abs(means - middle) < 1.5 * half, axis=1)
         if not spec.box.holds(means).any():
             raise UserError("object: the box holds nothing of the capture; give it in the capture's units")
-        searched = cloud.subset(near)
-        corners = np.stack(np.meshgrid(*zip(spec.box.low, spec.box.high, strict=True)), axis=-1).reshape(-1, 3)
-        along = corners @ up
-        lowest = middle + (along.min() + 0.25 * np.ptp(along) - middle @ up) * up
-        tilt, least_share = 15.0, 0.5
+        middle, half = 0.5 * (spec.box.low + spec.box.high), 0.5 * (spec.box.high - spec.box.low)
+        searched = cloud.subset(np.all(np.abs(means - middle) < 1.5 * half, axis=1))
+        reach = float(np.abs(up) @ half)
+        lowest = middle - 0.5 * reach * up
+        least_share = 0.5
     elif spec.masks:
-        votes = blending_votes(cloud, [view for view in spec.masks if view.mask.any()])
-        inside = votes.inside * (votes.share_inside() > 0.5) * (votes.share_seen() > 0.02)
-        if inside.sum() <= 0.0:
-            segment(cloud, Plane(up, 0.0), spec)
-            raise UserError("object: nothing of the capture shows inside the masks; check masks and cameras")
-        order = np.argsort(means @ up)
-        share = np.cumsum(inside[order]) / inside.sum()
-        lowest = means[order[int(np.searchsorted(share, 0.3))]]
+        lowest = _low_point(cloud, spec, means, up)
     else:
         assert spec.point is not None
         lowest = spec.point
-    planes = find_planes(searched, up, tilt_degrees=tilt)
+    planes = find_planes(searched, up, tilt_degrees=_LEVEL_DEGREES)
     plane = plane_under(planes, lowest, tolerance=0.0, least_share=least_share)
     if plane is None:
         raise UserError(
             "plane: none in sight under the object: nothing flat and level lies below it; check --up, or give --plane"
         )
     return plane
+
+
+def _low_point(cloud: GaussianCloud, spec: ObjectSpec, means: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """(3,) a place in the lower third of what the masks show; never below the object's foot."""
+    marked = [view for view in spec.masks if view.mask.any()]
+    votes = blending_votes(cloud, marked)
+    inside = votes.inside * (votes.share_inside() > 0.5) * (votes.share_seen() > 0.02)
+    if inside.sum() <= 0.0:
+        raise UserError("object: nothing of the capture shows inside the masks; check masks and cameras")
+    order = np.argsort(means @ up)
+    share = np.cumsum(inside[order]) / inside.sum()
+    return means[order[int(np.searchsorted(share, 0.3))]]

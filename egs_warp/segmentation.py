@@ -19,11 +19,13 @@ _MIN_OPACITY = 0.1
 """Fainter Gaussians make no connection; they go with what surrounds them."""
 _SEEN = 0.02
 """A Gaussian of which less than this share shows in the masked views has no say in whether it belongs to the object."""
-_CELLS = 64
+CELLS = 64
 """Across the object, for connectivity."""
 _SMALL = 0.01
 """Of the object's opacity mass: a connected part below this is a floater."""
-_OUTLINE = 0.08
+_ROUGHEST = 0.02
+"""Of the object's size: a floor is not taken to scatter more than this."""
+FOOTPRINT_HEIGHT = 0.08
 """Of the object's size: what it has below this height hides the floor."""
 _HALO = 0.1
 """Of the object's size: floaters this near to it are its halo."""
@@ -92,10 +94,10 @@ def segment(cloud: GaussianCloud, plane: Plane, spec: ObjectSpec) -> Segmentatio
     for _ in range(2):
         chosen, small = _body(scene, wanted, unknown, spec, foot, size)
         size = _diagonal(scene.means[chosen])
-        floor = floor_top(scene.means, scene.opacity, plane, chosen, size)
+        floor = _floor_top(scene, chosen, size)
         foot = max(_FOOT * size, 1.2 * floor)
-    outline = scene.under(chosen, max(3.0 * foot, _OUTLINE * size), size)
-    near = close_to(scene.means, scene.means[chosen], 2.0 * size / _CELLS)
+    outline = scene.under(chosen, max(3.0 * foot, FOOTPRINT_HEIGHT * size), size)
+    near = close_to(scene.means, scene.means[chosen], 2.0 * size / CELLS)
     above = scene.heights > foot
     # Where masks decide, they decide on the foot as well; else it is what stands under the object, off the floor.
     claimed = wanted & near & bool(spec.masks)
@@ -145,7 +147,7 @@ class _Scene:
 
     def under(self, chosen: np.ndarray, height: float, size: float) -> np.ndarray:
         """(n,) bool: within the outline, seen along the normal, of what ``chosen`` has below ``height``."""
-        return enclosed(self.flat, self.flat[chosen & (self.heights < height)], size / _CELLS)
+        return enclosed(self.flat, self.flat[chosen & (self.heights < height)], size / CELLS)
 
 
 def _body(
@@ -158,7 +160,7 @@ def _body(
     indices = np.flatnonzero(core & ~lying)
     if len(indices) == 0:
         raise UserError("object: nothing of it lies above the plane; check the masks, box or point, or give --plane")
-    parts = connected_parts(scene.cloud, indices, cell=size / _CELLS, plane=scene.plane, above=foot)
+    parts = connected_parts(scene.cloud, indices, cell=size / CELLS, plane=scene.plane, above=foot)
     mass = np.bincount(parts, weights=scene.opacity[indices])
     if spec.point is not None:
         away = np.linalg.norm(scene.means[indices] - spec.point, axis=1)
@@ -169,7 +171,7 @@ def _body(
                 f"{','.join(f'{v:g}' for v in spec.point)}; give a point on the object, in the capture's units"
             )
         # The heaviest of what is about as near: the nearest may be a stray.
-        near = np.unique(parts[away < away.min() + 4.0 * size / _CELLS])
+        near = np.unique(parts[away < away.min() + 4.0 * size / CELLS])
         best = int(near[np.argmax(mass[near])])
     else:
         best = int(np.argmax(np.bincount(parts, weights=scene.opacity[indices] * wanted[indices])))
@@ -180,7 +182,7 @@ def _body(
     # image in the floor does as well.
     shell = scene.means[chosen]
     mirrored = shell - 2.0 * (scene.heights[chosen, None] - foot) * scene.plane.normal
-    chosen |= enclosed(scene.means, np.concatenate([shell, mirrored]), 2.0 * size / _CELLS) & (scene.heights > foot)
+    chosen |= enclosed(scene.means, np.concatenate([shell, mirrored]), 2.0 * size / CELLS) & (scene.heights > foot)
     chosen |= lying & scene.under(chosen, 0.1 * size, size)
     return chosen, small
 
@@ -200,17 +202,17 @@ def _diagonal(points: np.ndarray) -> float:
     return float(np.linalg.norm(high - low))
 
 
-def floor_top(means: np.ndarray, opacity: np.ndarray, plane: Plane, chosen: np.ndarray, size: float) -> float:
+def _floor_top(scene: _Scene, chosen: np.ndarray, size: float) -> float:
     """Height up to which the floor's own Gaussians scatter, judged beside the object ``chosen`` (n,) bool; at least 0."""
-    flat, heights = means @ np.stack(plane.tangents(), axis=1), plane.heights(means)
-    middle = np.median(flat[chosen], axis=0)
-    beside = (np.abs(heights) < 0.05 * size) & ~chosen & (opacity > _MIN_OPACITY)
-    beside &= np.linalg.norm(flat - middle, axis=1) < size
-    beside &= ~close_to(flat, flat[chosen & (heights < 0.2 * size)], 0.03 * size)
+    middle = np.median(scene.flat[chosen], axis=0)
+    beside = scene.level & scene.solid & ~chosen & (np.abs(scene.heights) < 0.05 * size)
+    beside &= np.linalg.norm(scene.flat - middle, axis=1) < size
+    beside &= ~close_to(scene.flat, scene.flat[chosen & (scene.heights < 0.2 * size)], 0.03 * size)
     if beside.sum() < 20:
         return 0.0
-    level = float(np.median(heights[beside]))
-    return max(level + 3.0 * 1.4826 * float(np.median(np.abs(heights[beside] - level))), 0.0)
+    level = float(np.median(scene.heights[beside]))
+    spread = 1.4826 * float(np.median(np.abs(scene.heights[beside] - level)))
+    return float(np.clip(level + 3.0 * spread, 0.0, _ROUGHEST * size))
 
 
 def _voted(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> tuple[np.ndarray, np.ndarray]:
