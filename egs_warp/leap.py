@@ -16,6 +16,8 @@ DEEPEST_CROUCH = 0.3
 """Of the height of the centre of mass; a higher jump thrusts harder instead."""
 FOOTHOLD = 0.4
 """Of the footprint: how far from the capture point the feet may be put down for the sake of the target."""
+CLEARANCE = 0.15
+"""Of the height of a step: how far above it the feet are before they swing ahead."""
 CALM = 0.03
 """Speed of the centre of mass, in sqrt(g H), below which a body that has landed is at rest."""
 
@@ -86,20 +88,24 @@ class Leap(Jump):
 
     def _fly(self, state: BodyState, seen: Measurement, dt: float) -> list[Objective | SpinObjective]:
         touch_down, _, velocity = self._falling(seen, dt)
-        pose = self.pose.over_base(touch_down, self._foothold(seen, touch_down))
+        pose = self.pose.over_base(touch_down, self._foothold(state, seen, touch_down))
         # A foot that lags on the ground must not push any more.
         momentum = self.body.angular_momentum(state.positions, state.velocities)
         return self._write(state, velocity, pose, np.linalg.solve(self.body.inertia(state.positions), momentum), dt)
 
-    def _foothold(self, seen: Measurement, touch_down: np.ndarray) -> np.ndarray:
+    def _foothold(self, state: BodyState, seen: Measurement, touch_down: np.ndarray) -> np.ndarray:
         """(2,) where to put the feet: the target, if the body that comes in so can stop over it."""
+        if seen.velocity[2] > 0.0 and self.ground.local(state.positions)[:, 2].min() < CLEARANCE * self.target.rise:
+            # Feet that swing ahead before they are higher than the step would strike it.
+            return touch_down[:2] + seen.base - seen.com[:2]
         capture_time = np.sqrt(self.pose.standing_height / self.gravity)
         capture = touch_down[:2] + seen.velocity[:2] * capture_time + self.pose.base_offset
         low, high = self.pose.support_low, self.pose.support_high
         return np.clip(self._goal_base, capture + FOOTHOLD * low, capture + FOOTHOLD * high)
 
     def _advance_phase(self, seen: Measurement, time: float, dt: float) -> None:
-        super()._advance_phase(seen, time, dt)
+        # What a foot brushes on its way up is no landing.
+        super()._advance_phase(replace(seen, touching=seen.touching and seen.velocity[2] < 0.0), time, dt)
         if self.phase is JumpPhase.FLIGHT and not self.left_ground:
             self.pose, self.ground = self._landing_pose, self._landing
             self._goal_base = self._start_base

@@ -250,7 +250,7 @@ class LocomotionStepper:
             dt=step.dt,
             contacts=result.contacts,
             forces=result.forces,
-            end_gaps=gaps[result.contacts.points],
+            end_gaps=result.contacts.end_gaps(step.dt, result.velocities),
             min_gap=float(gaps.min()),
             activations=plan.activations,
             qp_count=plan.search.qp_count,

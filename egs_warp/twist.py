@@ -67,7 +67,7 @@ class Twist(Leap):
         # Arms in, arms out: the inertia with which the spin that there is makes the turn that is left.
         ratio = yaw * left / (self._standing_inertia * to_turn) if yaw * to_turn > 0.0 else np.inf
         width = float(np.sqrt(np.clip(ratio, 1.0 / WIDEST**2, WIDEST**2)))
-        pose = self.pose.over_base(touch_down, self._foothold(seen, touch_down), self._turned - self.turn)
+        pose = self.pose.over_base(touch_down, self._foothold(state, seen, touch_down), self._turned - self.turn)
         pose = pose @ (width * np.eye(3) + (1.0 - width) * np.outer(self.ground.axes[2], self.ground.axes[2]))
         # A foot that lags on the ground must not push any more.
         spin = np.linalg.solve(self.body.inertia(state.positions), momentum)
