@@ -29,6 +29,7 @@ def example(name: str) -> ModuleType:
     [
         ("twist", {"heading_degrees": 180.0, "distance": 0.0, "height": 0.2}),
         ("hop", {"distance": 0.7, "height": 0.3, "square": 1.0}),
+        ("walk", {"steps": 4.0, "step_length": 0.1, "distance": 0.4}),
     ],
 )
 def test_example_writes_its_files(tmp_path: Path, name: str, asked: dict[str, float]) -> None:

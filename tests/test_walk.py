@@ -1,0 +1,83 @@
+"""The walk of a coarse stool: its plan, and every step of it audited."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.body import BodyState, make_body
+from egs_warp.contact import ContactGeometry
+from egs_warp.embedding import embed_points
+from egs_warp.errors import UserError
+from egs_warp.locomotion import LocomotionStepper, StepReport
+from egs_warp.muscles import automatic_muscles
+from egs_warp.plane import Plane
+from egs_warp.sequence import Place
+from egs_warp.simulation import settle
+from egs_warp.stance import Ground
+from egs_warp.tetmesh import TetMesh
+from egs_warp.trajectory import audit, measure, record
+from egs_warp.walk import Walk, WalkPhase
+from tests.test_skeleton import UP, figure, stool
+
+FLOOR = Plane(UP, 0.0)
+DT = 1 / 60
+
+
+def standing(mesh: TetMesh, *, forward: np.ndarray, settled: bool = True) -> tuple[LocomotionStepper, Place, BodyState]:
+    """A stiff body of ``mesh`` on its lowest nodes."""
+    body = make_body(mesh, FLOOR, sag=0.01, device="cpu")
+    muscles = automatic_muscles(
+        mesh, UP, body_weight=body.weight, height=body.height, young_modulus=body.young_modulus, strength=20.0
+    )
+    soles = embed_points(mesh, mesh.nodes[mesh.nodes[:, 2] == 0.0], device="cpu")
+    geometry = ContactGeometry(mesh, (FLOOR,), 0.8, soles.tets.numpy(), soles.weights.numpy(), 0, 0.0)
+    stepper = LocomotionStepper(body, muscles, geometry, device="cpu")
+    start = settle(stepper) if settled else BodyState(mesh.nodes, np.zeros_like(mesh.nodes))
+    ground = Ground.on(FLOOR, forward, body.centre_of_mass(start.positions))
+    return (
+        stepper,
+        Place(body, ground, start.positions, stepper.detector.points_within(start.positions, 0.01), DT),
+        start,
+    )
+
+
+def test_a_walk_goes_along_its_feet_and_refuses_other_bodies() -> None:
+    """The way forward is turned to the nearest side of the feet; a body on two feet is told that a walk needs four."""
+    _, place, _ = standing(stool(), forward=np.array([0.9, 0.3, 0.0]), settled=False)
+    walk = Walk(place, 3, 0.08)
+    assert np.allclose(walk.ground.axes[0], [1.0, 0.0, 0.0], atol=1e-9)
+    for pair in walk.pairs:
+        centres = [place.standing[walk.feet[index].sole].mean(axis=0) for index in pair]
+        assert np.allclose(centres[0][:2], -centres[1][:2], atol=1e-9)
+    planned = walk.planned()
+    assert planned["steps"] == 3.0 and planned["stride"] == pytest.approx(0.16)
+    _, place, _ = standing(figure(), forward=np.array([1.0, 0.0, 0.0]), settled=False)
+    with pytest.raises(UserError, match="walk: the body has 2 separate feet; a walk needs four"):
+        Walk(place, 4, 0.1)
+
+
+@pytest.mark.slow
+def test_a_coarse_stool_takes_a_step() -> None:
+    """One step and the closing one: each foot lands once, none slips 2 % of the stride, the distance is met, the audit holds."""
+    stepper, place, state = standing(stool(), forward=np.array([1.0, 0.0, 0.0]))
+    body, start, walk = stepper.body, state, Walk(place, 1, 0.06)
+    reports: list[StepReport] = []
+    memory, air = stepper.initial_memory(), 0.0
+    for _ in range(260):
+        wishes = walk.objectives(state, reports[-1] if reports else None, DT)
+        state, memory, fresh = stepper.advance(state, memory, wishes, DT)
+        reports += fresh
+        for index in walk.swinging:
+            air = max(air, float(state.positions[walk.feet[index].sole, 2].min()))
+        if walk.phase is WalkPhase.REST:
+            break
+    trajectory = record(body, stepper.geometry, start, 0.0, reports, drag=0.0, segments=stepper.muscles.segment_count)
+    fell, reached, found = walk.footfalls(trajectory, 0, -1), measure(trajectory), audit(trajectory)
+    assert walk.phase is WalkPhase.REST and walk.notes() == []
+    assert fell.landings == 4 and fell.slip < 0.02 and fell.sole_shift < 0.05
+    assert air > 0.3 * walk.gait.lift
+    assert reached.distance * body.height == pytest.approx(0.06, rel=0.1)
+    assert reached.tilt_degrees < 3.0 and abs(reached.heading_degrees) < 3.0 and reached.airborne_frames == 0.0
+    assert found.momentum_residual < 1e-5 and found.angular_momentum_residual < 1e-4 and found.penetration < 0.01
+    assert found.cone_violation < 1e-4 and found.complementarity_gap < 1e-4 and found.inverted_elements == 0
