@@ -21,9 +21,6 @@ from egs_warp.io.cameras import read_cameras
 from egs_warp.render import render
 
 SH_BAND_0 = 0.28209479177387814
-_NEAREST = 0.2
-"""Nothing is trained nearer to a camera than this share of its distance to the middle: a veil before one camera fits that
-photo and spoils all others."""
 _HOLD_OUT_EVERY = 8
 """As published methods do: every eighth photo is judged on and not trained on."""
 
@@ -100,13 +97,8 @@ def train(
         seed=seed,
         device=device,
     )
-    focus = middle_of([view.camera for view in views])
     cut_out = all(view.alpha is not None for view in photos)
-    chosen = [
-        replace(view, camera=_without_veils(view.camera, focus))
-        for view, out in zip(photos if cut_out else views, held_out, strict=True)
-        if not out
-    ]
+    chosen = [view for view, out in zip(photos if cut_out else views, held_out, strict=True) if not out]
     options = FinetuneOptions(
         iterations=iterations,
         # Short runs cannot wait for the rates of 30,000 steps.
@@ -243,11 +235,6 @@ def middle_of(cameras: Sequence[Camera]) -> np.ndarray:
     axes = np.array([camera.rotation[2] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     return np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, centres), rcond=None)[0]
-
-
-def _without_veils(camera: Camera, focus: np.ndarray) -> Camera:
-    near = _NEAREST * float(np.linalg.norm(camera.centre - focus))
-    return replace(camera, near=min(max(camera.near, near), 0.5 * camera.far))
 
 
 def rough_cloud(
