@@ -20,8 +20,8 @@ import warp as wp
 _MIN_ROWS_PER_CHUNK = 2048
 """Below this many light rows a launch's own cost (about 20 us) is no longer small against its work."""
 
-_CHUNKS_PER_THREAD = 4
-"""Rows differ in cost, so there are more chunks than threads."""
+_LAST_CHUNKS_PER_THREAD = 24
+"""The smallest chunk is this part of a thread's share: what one thread may wait for the other at the end."""
 
 
 def available_threads() -> int:
@@ -114,14 +114,20 @@ def launch_again(kernel: Any, dim: int, *, inputs: Sequence[Any], outputs: Seque
 
 
 def _chunk_edges(row_count: int, threads: int, work: np.ndarray | None) -> list[int]:
-    """Where chunks of like effort begin and end."""
+    """Where chunks begin and end, whose effort shrinks towards the last: all threads then finish at about the same time."""
     if work is None:
-        chunk_count = max(1, min(_CHUNKS_PER_THREAD * threads, row_count // _MIN_ROWS_PER_CHUNK))
-        return [row_count * chunk // chunk_count for chunk in range(chunk_count + 1)]
-    done = np.concatenate([[0.0], np.cumsum(np.asarray(work, dtype=np.float64) + 1e-3)])
-    chunk_count = max(1, min(_CHUNKS_PER_THREAD * threads, row_count))
-    inner = np.searchsorted(done, np.linspace(0.0, done[-1], chunk_count + 1)[1:-1])
-    return np.unique(np.concatenate([[0], inner, [row_count]])).tolist()
+        least = _MIN_ROWS_PER_CHUNK / max(row_count, 1)
+        done = np.arange(row_count + 1, dtype=np.float64)
+    else:
+        least = 0.0
+        done = np.concatenate([[0.0], np.cumsum(np.asarray(work, dtype=np.float64) + 1e-3)])
+    least = max(least, 1.0 / (_LAST_CHUNKS_PER_THREAD * threads))
+    shares, taken = [], 0.0
+    while threads > 1 and taken + least < 1.0:
+        taken += max((1.0 - taken) / (2 * threads), least)
+        shares.append(taken)
+    inner = np.searchsorted(done, np.array(shares) * done[-1])
+    return np.unique(np.concatenate([[0], inner, [row_count]])).astype(int).tolist()
 
 
 @cache

@@ -97,7 +97,7 @@ _FORWARD = (
                     const float after = before * (1.0f - alpha);
                     const int hit = (alpha >= CUT) & (before > 0.0f);
                     const int stop = hit & (after <= STOP);
-                    const float weight = hit & !stop ? before * alpha : 0.0f;
+                    const float weight = (hit & !stop) ? before * alpha : 0.0f;
                     passing[at + k] = stop ? -before : (hit ? after : before);
                     closed += stop;
                     red[at + k] += weight * c[0];
@@ -170,7 +170,7 @@ _BACKWARD = (
                     const float left_over = rest[at + k] - weight * value;
                     rest[at + k] = left_over;
                     const float free = alpha * (before * value - left_over / (1.0f - alpha));
-                    const float slope = drawn & (raw <= LIMIT) ? free : 0.0f;
+                    const float slope = (drawn & (raw <= LIMIT)) ? free : 0.0f;
                     const float moment = slope * u;
                     sums[0][k] += slope;
                     sums[1][k] += moment;

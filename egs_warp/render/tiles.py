@@ -22,8 +22,6 @@ from egs_warp.render.projection import ProjectedGaussians
 TILE_SIDE = int(TILE)
 _LARGE_SORT = 10_000_000
 _KEY_BITS = 32
-_CHUNKS_PER_THREAD = 8
-"""Near Gaussians reach more tiles than far ones, so the chunks differ in cost."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,8 @@ def build_tile_lists(projected: ProjectedGaussians, view: Any, *, threads: int) 
 def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, threads: int) -> TileLists:
     """Counting sort in chunks of the depth order, side by side: no pair is compared."""
     device = projected.ellipse.device
-    gaussian_from_visible = np.flatnonzero(np.diff(projected.slot_end.numpy(), prepend=0)).astype(np.int32)
+    slot_counts = np.diff(projected.slot_end.numpy(), prepend=0)
+    gaussian_from_visible = np.flatnonzero(slot_counts).astype(np.int32)
     visible_count = len(gaussian_from_visible)
     keys = empty(2 * max(visible_count, 1), wp.float32, device)
     order = empty(2 * max(visible_count, 1), wp.int32, device)
@@ -66,8 +65,12 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, thr
     order.numpy()[:visible_count] = gaussian_from_visible
     wp.utils.radix_sort_pairs(keys, order, visible_count)
 
-    chunks = min(_CHUNKS_PER_THREAD * threads, max(1, visible_count // 256)) if threads > 1 else 1
-    chunk_start = wp.array(np.linspace(0, visible_count, chunks + 1).astype(np.int32), dtype=wp.int32, device=device)
+    # Near Gaussians reach more tiles than far ones: chunks have the same number of pairs, not of Gaussians.
+    chunks = min(8 + 4 * threads, max(1, visible_count // 256)) if threads > 1 else 1
+    pairs_done = np.cumsum(slot_counts[order.numpy()[:visible_count]]) if chunks > 1 else np.zeros(0)
+    inner = np.searchsorted(pairs_done, np.arange(1, chunks) * (projected.slot_count / chunks))
+    edges = np.concatenate([[0], inner, [visible_count]]).astype(np.int32)
+    chunk_start = wp.array(edges, dtype=wp.int32, device=device)
     tile_from_slot, gaussians, slots = (empty(max(projected.slot_count, 1), wp.int32, device) for _ in range(3))
     counts = zeros((chunks, tiles), wp.int32, device)
     walk = {"device": device, "threads": threads, "work": np.ones(chunks)}
