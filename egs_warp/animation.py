@@ -24,7 +24,7 @@ from egs_warp.io.atomic import writable_folder
 from egs_warp.locomotion import LocomotionStepper
 from egs_warp.muscles import MuscleSet, automatic_muscles
 from egs_warp.plane import Plane
-from egs_warp.render.ground import Floor
+from egs_warp.render.ground import Behind, CapturedScene, Floor
 from egs_warp.render.rasteriser import render
 from egs_warp.render.video import VideoWriter, contact_sheet, write_png
 from egs_warp.repertoire import also_reached, longest, parts_of
@@ -59,6 +59,8 @@ class AnimateOptions:
     metres_per_unit: float | None = None
     """None: such that the body is 1 m tall."""
     friction: float = 0.8
+    shadow: bool = True
+    """On the ground, under the object."""
 
     def __post_init__(self) -> None:
         for name, value in (("distance", self.distance), ("height", self.height)):
@@ -116,13 +118,14 @@ def make_creature(
     plane: Plane | None = None,
     metres_per_unit: float | None = None,
     friction: float = 0.8,
+    sag: float = DEFAULT_SAG,
     solids: tuple[Solid, ...] = (),
     gravity_up: np.ndarray | None = None,
 ) -> Creature:
     """Give a capture (scene units) a body that stands on ``plane``, or on its own base, square to ``up`` (3,).
 
     ``solids`` (scene units) are steps and walls beside the ground; ``gravity_up`` (3,) is against gravity if the ground is a slope.
-    A body that its own weight would bend out of shape is made stiffer until it stands.
+    The body is as stiff as makes it sag by ``sag`` of its height; one that its weight would bend out of shape is made stiffer.
     """
     if plane is None:
         if up is None:
@@ -134,7 +137,6 @@ def make_creature(
     cloud, plane, cage = cloud.scaled(scale), plane.scaled(scale), cage.scaled(scale)
     solids = tuple(solid.scaled(scale) for solid in solids)
     geometry = contact_geometry(cloud, cage.mesh, (plane,), solids=solids, friction=friction, device=device)
-    sag = DEFAULT_SAG
     while True:
         body = make_body(cage.mesh, plane, up=gravity_up, sag=sag, device=device)
         muscles = automatic_muscles(
@@ -169,6 +171,7 @@ def animate(
     up: np.ndarray | None = None,
     plane: Plane | None = None,
     background: GaussianCloud | None = None,
+    view_from: np.ndarray | None = None,
     solids: tuple[Solid, ...] = (),
     gravity_up: np.ndarray | None = None,
     forward: np.ndarray | None = None,
@@ -179,9 +182,10 @@ def animate(
 ) -> dict:
     """Bring ``cloud`` (scene units) to life and write video, contact sheet, report and trajectory into ``out``.
 
-    ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.script``). ``background`` is drawn
-    behind the object instead of the plain floor. ``solids`` and ``gravity_up``: see ``make_creature``; ``forward`` (3,): see
-    ``first_place``. Returns the report (docs/report.md). Raises ``UserError`` for bad input, before any file of an earlier run is touched.
+    ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.script``). ``background`` (scene
+    units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from the object to the camera.
+    ``solids`` and ``gravity_up``: see ``make_creature``; ``forward`` (3,): see ``first_place``. Returns the report
+    (docs/report.md). Raises ``UserError`` for bad input, before any file of an earlier run is touched.
     """
     options = options or AnimateOptions()
     flags = {"distance": options.distance, "height": options.height, "heading_degrees": options.heading_degrees}
@@ -213,7 +217,9 @@ def animate(
             progress=lambda _: (bar.update(), None)[1],
         )
     name = requests[0].name if len({request.name for request in requests}) == 1 else "motions"
-    drawing, split_count = _draw(creature, simulation, place.ground, folder, name, options, background, quiet)
+    drawing, split_count = _draw(
+        creature, simulation, place.ground, folder, name, options, background, view_from, quiet
+    )
     unconverged = sum(not report.converged for report in simulation.reports)
     report = build_report(
         motion=[
@@ -255,8 +261,11 @@ def animate(
     return report
 
 
-def first_place(creature: Creature, forward: np.ndarray | None = None) -> Place:
-    """Where the creature stands at the start; ``forward`` (3,) is the way of its motions, else the long axis of its footprint."""
+def first_place(creature: Creature, forward: np.ndarray | None = None, *, step: float | None = None) -> Place:
+    """Where the creature stands at the start; ``forward`` (3,) is the way of its motions, else the long axis of its footprint.
+
+    ``step``: seconds of a solver step, if not the usual (DESIGN 4).
+    """
     body, start = creature.body, creature.start
     up = -body.gravity / np.linalg.norm(body.gravity)
     if forward is None:
@@ -270,7 +279,7 @@ def first_place(creature: Creature, forward: np.ndarray | None = None) -> Place:
         Ground.on(creature.plane, forward, body.centre_of_mass(start.positions), up=up),
         start.positions,
         creature.stepper.detector.points_within(start.positions, 0.01 * body.height),
-        1.0 / (FRAME_RATE * steps_per_frame(body)),
+        step or 1.0 / (FRAME_RATE * steps_per_frame(body)),
         creature.solids,
     )
 
@@ -287,14 +296,14 @@ def _forward(creature: Creature) -> np.ndarray:
     return axis[0] * first + axis[1] * second
 
 
-def view_of(simulation: Simulation, ground: Ground, size: int) -> Camera:
-    """A fixed camera in front of the jump's side that holds the whole motion."""
+def view_of(simulation: Simulation, ground: Ground, size: int, view_from: np.ndarray | None = None) -> Camera:
+    """A fixed camera that holds the whole motion: in front of the jump's side, or in the direction ``view_from`` (3,)."""
     local = ground.local(simulation.trajectory.positions).reshape(-1, 3)
     low, high = local.min(axis=0), local.max(axis=0)
     low[2] = min(low[2], 0.0)
     middle = 0.5 * (low + high)
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-    direction = np.array([0.35, -1.0, 0.22])
+    direction = np.array([0.35, -1.0, 0.22]) if view_from is None else ground.axes @ np.asarray(view_from, float)
     direction /= np.linalg.norm(direction)
     world = lambda point: ground.origin + point @ ground.axes  # noqa: E731
     distance = float(np.linalg.norm(high - low))
@@ -317,22 +326,24 @@ def view_of(simulation: Simulation, ground: Ground, size: int) -> Camera:
 
 
 def _draw(
-    creature, simulation, ground, folder, motion, options, background, quiet
+    creature, simulation, ground, folder, motion, options, background, view_from, quiet
 ) -> tuple[dict[str, list[float]], int]:
     trajectory = simulation.trajectory
-    camera = view_of(simulation, ground, options.size)
+    camera = view_of(simulation, ground, options.size, view_from)
     device = creature.cloud.device
     height = creature.body.height
     path = np.einsum("n,fni->fi", trajectory.node_mass, trajectory.positions) / trajectory.node_mass.sum()
     com = path.mean(axis=0)
-    floor = Floor(
-        camera,
-        creature.plane,
-        centre=com - creature.plane.heights(com) * creature.plane.normal,
-        reach=2.2 * (height + float(np.linalg.norm(np.ptp(path, axis=0)))),
-        cell=0.25 * height,
+    where = {
+        "centre": com - creature.plane.heights(com) * creature.plane.normal,
+        "reach": 2.2 * (height + float(np.linalg.norm(np.ptp(path, axis=0)))),
+        "shadow": options.shadow,
+    }
+    behind: Behind = (
+        Floor(camera, creature.plane, cell=0.25 * height, **where)
+        if background is None
+        else CapturedScene(background.scaled(creature.metres_per_unit), camera, creature.plane, **where)
     )
-    behind = render(background.scaled(creature.metres_per_unit), camera) if background is not None else None
     # The whole motion is known, so what it will bend is split before the first frame, and nothing can pop.
     started = time.perf_counter()
     keys = simulation.frames[:: max(1, len(simulation.frames) // SPLIT_KEY_FRAMES)]
@@ -354,10 +365,7 @@ def _draw(
             marks = [time.perf_counter()]
             deformed = deformer.deform(trajectory.positions[step])
             marks.append(time.perf_counter())
-            means = deformed.cloud.means.numpy()
-            backdrop = (
-                behind.colour if behind is not None else floor.background(means, cloud.opacities(), height=height)
-            )
+            backdrop = behind.background(deformed.cloud.means.numpy(), cloud.opacities(), height=height)
             image = render(deformed.cloud, camera, background=backdrop).colour_srgb8()
             wp.synchronize_device(device)
             marks.append(time.perf_counter())

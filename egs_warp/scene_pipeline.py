@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 
@@ -16,8 +17,10 @@ from egs_warp.connectivity import enclosed
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.holes import Hole
+from egs_warp.io.ply import write_ply
 from egs_warp.object_input import shrunk
 from egs_warp.plane import Plane
+from egs_warp.plane_file import write_planes
 from egs_warp.plane_fit import PlaneFit
 from egs_warp.plane_search import find_planes, plane_under, refine_plane
 from egs_warp.rectified import PlaneWindow
@@ -62,6 +65,13 @@ class LocatedPlane:
     segmentation: Segmentation
     notes: tuple[str, ...]
 
+    def facts(self) -> dict[str, object]:
+        """What ``plane.json`` says beside the plane itself."""
+        fit = self.fit
+        return {"centre": self.centre.tolist(), "size": self.size} | (
+            {} if fit is None else {"noise": fit.noise, "inlier_share": fit.inlier_share, "pixels": fit.pixel_count}
+        )
+
 
 @dataclass(frozen=True)
 class PreparedScene:
@@ -77,6 +87,12 @@ class PreparedScene:
     located: LocatedPlane
     notes: tuple[str, ...]
     """What was found and done, for the user."""
+
+    def write(self, folder: Path) -> None:
+        """``object.ply``, ``background.ply`` and ``plane.json`` into ``folder``."""
+        write_ply(folder / "object.ply", self.object)
+        write_ply(folder / "background.ply", self.background)
+        write_planes(folder / "plane.json", [self.plane], facts=[self.located.facts()])
 
 
 def prepare_scene(
@@ -148,6 +164,26 @@ def hole_under(cloud: GaussianCloud, located: LocatedPlane) -> Hole:
     places = window.points(np.stack([columns.ravel(), rows.ravel()], axis=1))
     inside = enclosed(places @ tangents, flat, found.size / CELLS)
     return Hole(window, inside.reshape(_HOLE_TEXELS, _HOLE_TEXELS))
+
+
+def viewing_direction(scene: PreparedScene, cameras: Sequence[Camera]) -> np.ndarray:
+    """(3,) from the object to where a picture is best taken: where the capture's own cameras were, or else from half above.
+
+    Captures look best from where they were taken; of those cameras it is the one of median height.
+    """
+    normal, centre = scene.plane.normal, scene.located.centre
+    away = [camera.centre - centre for camera in cameras if scene.plane.heights(camera.centre) > 0.0]
+    if away:
+        sines = np.array([direction @ normal / np.linalg.norm(direction) for direction in away])
+        return away[int(np.argsort(sines)[len(sines) // 2])]
+    # Of eight sides, the one on which the least stands between the camera and the object.
+    means, opacity = scene.background.means.numpy().astype(np.float64), scene.background.opacities()
+    first, second = scene.plane.tangents()
+    level = means - centre - ((means - centre) @ normal)[:, None] * normal
+    standing = (scene.plane.heights(means) > 0.1 * scene.located.size) & (opacity > 0.3)
+    directions = [np.cos(a) * first + np.sin(a) * second for a in np.arange(8) * np.pi / 4.0 - 0.5 * np.pi + 0.35]
+    blocked = [int(np.count_nonzero(standing & (level @ d > 0.7 * np.linalg.norm(level, axis=1)))) for d in directions]
+    return directions[int(np.argmin(blocked))] + 0.5 * normal
 
 
 def has_torch() -> bool:

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from egs_warp.cli_input import check_device, parse_direction, parse_plane, parse_up
+from egs_warp.cli_input import check_device, parse_direction, parse_up
+from egs_warp.scene_input import add_object_flags, plane_of, read_scene, say
 
 
 def add_parser(commands) -> None:
@@ -23,8 +24,11 @@ def add_parser(commands) -> None:
     animate.add_argument("--out", required=True, type=Path, help="folder for video, sheet, report and trajectory")
     animate.add_argument("--up", help="axis that points up: x, y, z or with a minus, as --up=-y; else it is guessed")
     animate.add_argument(
-        "--plane", help="nx,ny,nz,d of the ground n.x + d = 0 in the capture's units; else it is found"
+        "--plane", help="nx,ny,nz,d of the ground n.x + d = 0 in the capture's units, or a plane.json; else it is found"
     )
+    add_object_flags(animate)
+    animate.add_argument("--no-inpaint", action="store_true", help="leave the floor under the object as captured")
+    animate.add_argument("--no-shadow", action="store_true", help="no shadow on the ground under the object")
     animate.add_argument("--forward", help="x,y,z or an axis: the way of motions; else along the feet")
     animate.add_argument("--gravity-up", help="x,y,z or an axis: against gravity, if the ground is a slope")
     animate.add_argument(
@@ -60,10 +64,13 @@ def _animate(chosen: argparse.Namespace) -> int:
         seed=chosen.seed,
         metres_per_unit=chosen.metres_per_unit,
         friction=chosen.friction,
+        shadow=not chosen.no_shadow,
     )
+    if chosen.object:
+        return _animate_scene(chosen, options)
     check_device(chosen.device)
     up = parse_up(chosen.up) if chosen.up else None
-    plane = parse_plane(chosen.plane) if chosen.plane else None
+    plane = plane_of(chosen.plane) if chosen.plane else None
     capture = read_capture(chosen.capture, device=chosen.device)
     notes = list(capture.notes)
     if capture.infinite_opacities:
@@ -88,4 +95,46 @@ def _animate(chosen: argparse.Namespace) -> int:
     )
     print(summary(report))
     print(f"wrote the video, sheet.png, report.json, trajectory.npz into {chosen.out}")
+    return 0
+
+
+def _animate_scene(chosen: argparse.Namespace, options) -> int:
+    """The object of a scene, cut out of it, over the rest of the scene."""
+    from egs_warp.animation import animate, summary
+    from egs_warp.io.atomic import writable_folder
+    from egs_warp.scene_pipeline import SceneOptions, prepare_scene, viewing_direction
+    from egs_warp.terrain import read_terrain
+
+    given = read_scene(chosen)
+    folder = writable_folder(chosen.out)
+    scene = prepare_scene(
+        given.cloud,
+        given.spec,
+        cameras=given.cameras,
+        up=given.up,
+        plane=given.plane,
+        options=SceneOptions(inpaint=not chosen.no_inpaint),
+        progress=lambda stage: say(f"{stage} ..."),
+    )
+    for note in scene.notes:
+        say(note)
+    report = animate(
+        scene.object,
+        folder,
+        motion=chosen.motion,
+        plane=scene.plane,
+        background=scene.background,
+        view_from=viewing_direction(scene, given.cameras),
+        forward=parse_direction("forward", chosen.forward) if chosen.forward else None,
+        gravity_up=parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up else None,
+        solids=read_terrain(chosen.terrain) if chosen.terrain else (),
+        options=options,
+        source=Path(chosen.capture).name,
+        notes=(*given.notes, *scene.notes),
+    )
+    scene.write(folder)
+    print(summary(report))
+    print(
+        f"wrote the video, sheet.png, report.json, trajectory.npz, object.ply, background.ply, plane.json into {folder}"
+    )
     return 0

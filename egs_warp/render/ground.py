@@ -1,74 +1,138 @@
-"""A plain floor behind the object: a pale plane with a grid, and the soft shadow that the Gaussians cast straight down on it."""
+"""What is behind the moving object: a plain floor with a grid, or a captured scene; and the object's soft shadow on it."""
 
 from __future__ import annotations
+
+from typing import Protocol
 
 import numpy as np
 
 from egs_warp.camera import Camera
+from egs_warp.gaussians import GaussianCloud
 from egs_warp.plane import Plane
+from egs_warp.render.rasteriser import render
 
 _SKY = np.array([1.0, 1.0, 1.0], np.float32)
 _FLOOR = np.array([0.86, 0.86, 0.87], np.float32)
 _LINE = np.array([0.74, 0.75, 0.78], np.float32)
+_SHADOW_TEXELS = 192
+_SHADOW_LAYERS = ((0.0, 0.08, 0.02), (0.08, 0.3, 0.06), (0.3, 2.0, 0.13))
+"""From and to this height over the plane, and the width of the blur, all in body heights."""
 
 
-class Floor:
-    """The floor as one camera sees it; ``background`` draws it with the shadow of one frame."""
+class Behind(Protocol):
+    """What an animation is drawn over."""
 
-    def __init__(self, camera: Camera, plane: Plane, *, centre: np.ndarray, reach: float, cell: float) -> None:
-        """``centre`` (3,) and ``reach`` (world units) bound the part that shows; ``cell`` is the grid's spacing."""
+    def background(self, means: np.ndarray, opacities: np.ndarray, *, height: float) -> np.ndarray:
+        """(H, W, 3) float32: what is seen behind Gaussians with ``means`` (n, 3), with their shadow; ``height`` is the
+        body's, world units."""
+        ...
+
+
+class ContactShadow:
+    """The soft shadow that Gaussians cast straight down on a plane, as one camera sees it."""
+
+    def __init__(self, camera: Camera, plane: Plane, *, centre: np.ndarray, reach: float) -> None:
+        """``centre`` (3,) and ``reach`` (world units) bound the part of the plane that can be in shadow."""
         self._plane, self._centre, self._reach = plane, centre, reach
         self._tangents = np.stack(plane.tangents())
         u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
         rays = rays @ camera.rotation
         slope = rays @ plane.normal
-        depth = -(plane.normal @ camera.centre + plane.offset) / np.where(np.abs(slope) > 1e-9, slope, np.inf)
-        hit = (depth > 0.0) & (slope < 0.0)
-        points = camera.centre + np.where(hit, depth, 0.0)[..., None] * rays
-        flat = (points - centre) @ self._tangents.T
-        self._uv = ((flat / reach + 1.0) * 0.5).astype(np.float32)
-        fade = np.clip(1.6 - 1.6 * np.linalg.norm(flat, axis=-1) / reach, 0.0, 1.0) * hit
-        pixel = np.maximum(depth / camera.fx / np.maximum(-slope / np.linalg.norm(rays, axis=-1), 0.05), 1e-9)
-        distance = np.abs((flat / cell + 0.5) % 1.0 - 0.5) * cell
-        line = np.clip(1.0 - distance / (1.2 * pixel[..., None]), 0.0, 1.0).max(axis=-1)
-        colour = _FLOOR + line[..., None] * (_LINE - _FLOOR)
-        self._fade = fade.astype(np.float32)[..., None]
-        self._bare = (_SKY + self._fade * (colour - _SKY)).astype(np.float32)
+        self.depth = -float(plane.heights(camera.centre)) / np.where(np.abs(slope) > 1e-9, slope, np.inf)
+        """(H, W) z-depth of the plane; meaningful where ``hit``."""
+        self.hit = (self.depth > 0.0) & (slope < 0.0)
+        """(H, W) bool: the pixel's ray meets the plane from above."""
+        points = camera.centre + np.where(self.hit, self.depth, 0.0)[..., None] * rays
+        self.flat = (points - centre) @ self._tangents.T
+        """(H, W, 2) place on the plane, world units from the centre."""
+        sine = np.maximum(-slope / np.linalg.norm(rays, axis=-1), 0.05)
+        self.pixel = np.maximum(self.depth / camera.fx / sine, 1e-9)
+        """(H, W) size of a pixel on the plane, world units."""
+        self._uv = ((self.flat / reach + 1.0) * 0.5 * _SHADOW_TEXELS - 0.5).astype(np.float32)
 
-    def background(
-        self, means: np.ndarray, opacities: np.ndarray, *, height: float, resolution: int = 192
-    ) -> np.ndarray:
-        """(H, W, 3) float32: the floor under Gaussians with ``means`` (n, 3); shadows of high ones are wider and paler.
+    def darkness(self, means: np.ndarray, opacities: np.ndarray, *, height: float) -> np.ndarray:
+        """(H, W) float32, 0 to about 0.5: how much light Gaussians with ``means`` (n, 3) take from the plane.
 
-        ``height`` is the body's, world units.
+        Shadows of high ones are wider and paler. ``height`` is the body's, world units.
         """
         import cv2
 
-        flat = ((means - self._centre) @ self._tangents.T / self._reach + 1.0) * 0.5 * resolution
+        flat = ((means - self._centre) @ self._tangents.T / self._reach + 1.0) * 0.5 * _SHADOW_TEXELS
         above = np.maximum(self._plane.heights(means), 0.0)
-        shade = np.zeros((resolution, resolution), np.float32)
-        for low, high, blur in ((0.0, 0.08, 0.02), (0.08, 0.3, 0.06), (0.3, 2.0, 0.13)):
+        shade = np.zeros((_SHADOW_TEXELS, _SHADOW_TEXELS), np.float32)
+        for low, high, blur in _SHADOW_LAYERS:
             chosen = (above >= low * height) & (above < high * height)
             if not chosen.any():
                 continue
             layer, _, _ = np.histogram2d(
                 flat[chosen, 1],
                 flat[chosen, 0],
-                bins=resolution,
-                range=((0, resolution), (0, resolution)),
+                bins=_SHADOW_TEXELS,
+                range=((0, _SHADOW_TEXELS), (0, _SHADOW_TEXELS)),
                 weights=opacities[chosen],
             )
             covered = 1.0 - np.exp(-layer.astype(np.float32))
-            sigma = max(blur * height / self._reach * 0.5 * resolution, 0.6)
+            sigma = max(blur * height / self._reach * 0.5 * _SHADOW_TEXELS, 0.6)
             # Far layers see more of the sky past the object, so they darken less.
             shade = np.maximum(shade, cv2.GaussianBlur(covered, (0, 0), sigma) * (0.5 - 1.4 * blur))
-        sampled = cv2.remap(
-            shade,
-            self._uv[..., 0] * resolution - 0.5,
-            self._uv[..., 1] * resolution - 0.5,
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=0,
+        return cv2.remap(
+            shade, self._uv[..., 0], self._uv[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0
         )
-        return self._bare * (1.0 - sampled[..., None] * self._fade)
+
+
+class Floor:
+    """A pale plane with a grid."""
+
+    def __init__(
+        self, camera: Camera, plane: Plane, *, centre: np.ndarray, reach: float, cell: float, shadow: bool = True
+    ) -> None:
+        """``centre`` (3,) and ``reach`` (world units) bound the part that shows; ``cell`` is the grid's spacing."""
+        self._shadow = ContactShadow(camera, plane, centre=centre, reach=reach)
+        self._strength = 1.0 if shadow else 0.0
+        flat = self._shadow.flat
+        fade = np.clip(1.6 - 1.6 * np.linalg.norm(flat, axis=-1) / reach, 0.0, 1.0) * self._shadow.hit
+        distance = np.abs((flat / cell + 0.5) % 1.0 - 0.5) * cell
+        line = np.clip(1.0 - distance / (1.2 * self._shadow.pixel[..., None]), 0.0, 1.0).max(axis=-1)
+        colour = _FLOOR + line[..., None] * (_LINE - _FLOOR)
+        self._fade = fade.astype(np.float32)[..., None]
+        self._bare = (_SKY + self._fade * (colour - _SKY)).astype(np.float32)
+
+    def background(self, means: np.ndarray, opacities: np.ndarray, *, height: float) -> np.ndarray:
+        """See ``Behind``."""
+        if self._strength == 0.0:
+            return self._bare
+        darkness = self._shadow.darkness(means, opacities, height=height)
+        return self._bare * (1.0 - darkness[..., None] * self._fade)
+
+
+class CapturedScene:
+    """The rest of a capture, rendered once; the shadow falls where the plane is what one sees."""
+
+    def __init__(
+        self,
+        scene: GaussianCloud,
+        camera: Camera,
+        plane: Plane,
+        *,
+        centre: np.ndarray,
+        reach: float,
+        shadow: bool = True,
+    ) -> None:
+        """``scene`` in the world's units; ``centre`` (3,) and ``reach`` bound the shadow."""
+        image = render(scene, camera)
+        self._image = np.clip(image.colour.numpy(), 0.0, 1.0)
+        self._shadow = ContactShadow(camera, plane, centre=centre, reach=reach)
+        # What is seen there, over how far the plane is: splats of a floor scatter by a few hundredths of that.
+        off = np.abs(image.depth.numpy() / np.where(self._shadow.hit, self._shadow.depth, np.inf) - 1.0)
+        on_plane = np.clip(2.0 - off / 0.03, 0.0, 1.0) * self._shadow.hit
+        fade = np.clip(1.6 - 1.6 * np.linalg.norm(self._shadow.flat, axis=-1) / reach, 0.0, 1.0)
+        strength = on_plane * fade * image.alpha.numpy() if shadow else np.zeros_like(fade)
+        self._fade = strength.astype(np.float32)[..., None]
+
+    def background(self, means: np.ndarray, opacities: np.ndarray, *, height: float) -> np.ndarray:
+        """See ``Behind``."""
+        if not self._fade.any():
+            return self._image
+        darkness = self._shadow.darkness(means, opacities, height=height)
+        return self._image * (1.0 - darkness[..., None] * self._fade)
