@@ -1,0 +1,102 @@
+"""Following key frames: what is measured of a posed block, what is asked of the next step, and what is said of missed keys."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from egs_warp.body import BodyState, make_body
+from egs_warp.follow import Follow, FollowPhase
+from egs_warp.keyframes import Key, Quantity
+from egs_warp.objectives import Objective, SpinObjective
+from egs_warp.plane import Plane
+from egs_warp.sequence import Place
+from egs_warp.stance import Ground
+from tests.meshes import block_mesh
+
+FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+DT = 1 / 60
+
+
+@pytest.fixture
+def place() -> Place:
+    mesh = block_mesh()
+    body = make_body(mesh, FLOOR, device="cpu")
+    ground = Ground.on(FLOOR, np.array([0.0, 1.0, 0.0]), body.centre_of_mass(mesh.nodes))
+    return Place(body, ground, mesh.nodes, mesh.nodes[mesh.nodes[:, 2] < 1e-9], DT)
+
+
+def key(time: float, part: str, quantity: Quantity, value: tuple[float, float, float]) -> Key:
+    return Key(time, part, quantity, value, where="k.json, key 1")
+
+
+@pytest.mark.parametrize("part", ["body", "base", "head"])
+def test_each_quantity_is_measured_in_its_unit_along_forward_left_up(place: Place, part: str) -> None:
+    """A rigid motion: forward is +y, left is -x; lengths over H, spin over m H^2."""
+    body, height = place.body, place.body.height
+    follow = Follow(place, [key(1.0, part, Quantity.POSITION, (0.1, 0.0, 0.0))])
+    turn = Rotation.from_rotvec(np.radians(30.0) * np.array([0.0, 0.0, 1.0]))
+    nodes = follow.parts[part].nodes
+    centre = follow.parts[part].centre(place.standing)
+    positions = centre + turn.apply(place.standing - centre) + height * np.array([-0.2, 0.1, 0.3])
+    omega = np.array([0.0, 2.0, 0.0])
+    velocities = height * np.array([-0.5, 0.7, 0.0]) + np.cross(omega, positions - follow.parts[part].centre(positions))
+    state = BodyState(positions, velocities)
+    assert np.allclose(follow._measured(part, Quantity.POSITION, state), [0.1, 0.2, 0.3])
+    assert np.allclose(follow._measured(part, Quantity.ORIENTATION, state), [0.0, 0.0, 30.0])
+    assert np.allclose(follow._measured(part, Quantity.VELOCITY, state), [0.7, 0.5, 0.0])
+    arms = positions[nodes] - follow.parts[part].centre(positions)
+    spin = (body.node_mass[nodes, None] * np.cross(arms, np.cross(omega, arms))).sum(axis=0) / (body.mass * height**2)
+    assert np.allclose(follow._measured(part, Quantity.ANGULAR_MOMENTUM, state), [spin[1], -spin[0], spin[2]])
+
+
+def test_a_position_key_asks_for_the_speed_of_its_curve(place: Place) -> None:
+    """On the curve the head is asked for the curve's own speed; behind it for more."""
+    follow = Follow(place, [key(1.0, "head", Quantity.POSITION, (0.2, 0.0, 0.0))])
+    (channel,) = follow.channels
+    still = BodyState(place.standing, 0 * place.standing)
+    follow.objectives(still, None, DT)
+    asked = []
+    for lag in (0.0, 0.05):
+        now = channel.at(0.5 + DT)[0][0] - DT * channel.at(0.5 + DT)[1][0]
+        positions = place.standing + place.body.height * (now - lag) * place.ground.axes[0]
+        objectives = follow.objectives(BodyState(positions, 0 * positions, 0.5), None, DT)
+        (head,) = [o for o in objectives if isinstance(o, Objective) and o.name == "head velocity"]
+        moving = np.tile(place.ground.axes[0], (len(positions), 1))
+        assert np.allclose(head.rows @ moving.ravel(), [1.0, 0.0, 0.0])
+        asked.append(head.target)
+    speed = place.body.height * channel.at(0.5 + DT)[1][0]
+    assert np.allclose(asked[0], [speed, 0.0, 0.0]) and asked[1][0] > 1.5 * speed
+
+
+def test_keys_of_the_whole_body_replace_its_own_balance_or_spin(place: Place) -> None:
+    state = BodyState(place.standing, 0 * place.standing)
+    moving = Follow(place, [key(1.0, "body", Quantity.VELOCITY, (0.3, 0.0, 0.0))]).objectives(state, None, DT)
+    assert [o.name for o in moving if isinstance(o, Objective)] == ["pose", "body velocity"]
+    assert sum(isinstance(o, SpinObjective) for o in moving) == 1
+    spinning = Follow(place, [key(DT, "body", Quantity.ANGULAR_MOMENTUM, (0.0, 0.0, 0.02))]).objectives(state, None, DT)
+    (spin,) = [o for o in spinning if isinstance(o, SpinObjective)]
+    assert np.allclose(spin.target, [0.0, 0.0, 0.02 * place.body.mass * place.body.height**2])
+    turning = Follow(place, [key(DT, "body", Quantity.ORIENTATION, (0.0, 0.0, 3.0))]).objectives(state, None, DT)
+    (turn,) = [o for o in turning if isinstance(o, SpinObjective)]
+    rate = np.linalg.solve(place.body.inertia(state.positions), turn.target)
+    assert rate[2] > 0.0 and np.abs(rate[:2]).max() < 1e-6 * rate[2]
+
+
+def test_missed_keys_are_told_and_reached_ones_are_not(place: Place) -> None:
+    keys = [
+        key(0.1, "head", Quantity.POSITION, (0.1, 0.0, 0.0)),
+        Key(0.2, "head", Quantity.POSITION, (0.2, 0.0, 0.0), where="k.json, key 2"),
+        Key(0.3, "head", Quantity.POSITION, (0.0, 0.0, 0.0), where="k.json, key 3"),
+    ]
+    follow = Follow(place, keys)
+    for time, forward in ((0.0, 0.0), (0.1, 0.1), (0.2, 0.12)):
+        positions = place.standing + forward * place.body.height * place.ground.axes[0]
+        follow.objectives(BodyState(positions, 0 * positions, time), None, DT)
+    assert follow.phase is FollowPhase.FOLLOW
+    assert follow.planned() == {"keys": 3.0, "duration": 0.3, "worst_miss": pytest.approx(0.08)}
+    assert follow.notes()[0].startswith("k.json, key 2: head position at 0.2 s: reached (0.12, ")
+    assert follow.notes()[1] == "k.json, key 3: head position at 0.3 s was not reached in time"
+    follow.objectives(BodyState(place.standing, 0 * place.standing, 0.4), None, DT)
+    assert follow.phase is FollowPhase.REST and len(follow.notes()) == 1
