@@ -81,6 +81,7 @@ def emit_tiles_kernel(
     # In:
     width: wp.int32,
     height: wp.int32,
+    pair_count: wp.int32,
     nearest_bits: wp.int32,
     dropped_bits: wp.int32,
     kept_bits: wp.int32,
@@ -90,10 +91,9 @@ def emit_tiles_kernel(
     colour_depth: wp.array[wp.vec4],
     # Out:
     key_out: wp.array[wp.uint32],
-    gaussian_from_slot_out: wp.array[wp.int32],
-    slot_out: wp.array[wp.int32],
+    slot_and_gaussian_out: wp.array[wp.int32],
 ):
-    """Sort key (tile, then the leading bits of the depth) and Gaussian of every slot."""
+    """Sort key (tile, then the leading bits of the depth) of every slot, its number, and from 2 ``pair_count`` its Gaussian."""
     g = wp.tid()
     slot = wp.int32(0)
     if g > 0:
@@ -110,8 +110,8 @@ def emit_tiles_kernel(
         span = tile_columns(e, f, row, width, height)
         for column in range(span[0], span[1] + 1):
             key_out[slot] = (wp.uint32(row * columns + column) << wp.uint32(kept_bits)) | depth_key
-            gaussian_from_slot_out[slot] = g
-            slot_out[slot] = slot
+            slot_and_gaussian_out[slot] = slot
+            slot_and_gaussian_out[2 * pair_count + slot] = g
             slot += 1
 
 
@@ -121,8 +121,7 @@ def finish_lists_kernel(
     intersection_count: wp.int32,
     kept_bits: wp.int32,
     key: wp.array[wp.uint32],
-    sorted_slot: wp.array[wp.int32],
-    gaussian_from_slot: wp.array[wp.int32],
+    slot_and_gaussian: wp.array[wp.int32],
     colour_depth: wp.array[wp.vec4],
     # Out:
     tile_start_out: wp.array[wp.int32],
@@ -141,18 +140,19 @@ def finish_lists_kernel(
     if i < intersection_count:
         own = key[i]
         here = wp.int32(own >> wp.uint32(kept_bits))
-        slot = sorted_slot[i]
-        g = gaussian_from_slot[slot]
+        slot = slot_and_gaussian[i]
+        gaussians = 2 * intersection_count
+        g = slot_and_gaussian[gaussians + slot]
         # Pairs of equal keys stand in the order of their slots, which is that of equal depths.
         place = i
         j = i - 1
         while j >= 0 and key[j] == own:
-            if colour_depth[gaussian_from_slot[sorted_slot[j]]][3] > colour_depth[g][3]:
+            if colour_depth[slot_and_gaussian[gaussians + slot_and_gaussian[j]]][3] > colour_depth[g][3]:
                 place -= 1
             j -= 1
         j = i + 1
         while j < intersection_count and key[j] == own:
-            if colour_depth[gaussian_from_slot[sorted_slot[j]]][3] < colour_depth[g][3]:
+            if colour_depth[slot_and_gaussian[gaussians + slot_and_gaussian[j]]][3] < colour_depth[g][3]:
                 place += 1
             j += 1
         gaussian_from_intersection_out[place] = g

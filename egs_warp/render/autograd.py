@@ -30,12 +30,13 @@ class TorchImage:
     """(H, W) float32."""
     depth: torch.Tensor
     """(H, W) float32, expected z-depth divided by alpha."""
-    slot_end: torch.Tensor
+    slot_end: wp.array
     """(n,) int64: number of tiles reached by the Gaussians up to and including this one."""
 
     def visible(self) -> torch.Tensor:
         """(n,) bool: Gaussians that reach a tile."""
-        return torch.diff(self.slot_end, prepend=self.slot_end.new_zeros(1)) > 0
+        slot_end = wp.to_torch(self.slot_end)
+        return torch.diff(slot_end, prepend=slot_end.new_zeros(1)) > 0
 
 
 def render_torch(
@@ -76,25 +77,31 @@ def render_torch(
             )
     if (rotation is None) != (translation is None):
         raise UserError("render: give the pose's rotation and translation together, or neither")
-    options = _Options(camera, background, antialiased, threads or available_threads())
-    colour, alpha, depth, slot_end = _Render.apply(
-        *(means, rotations, log_scales, opacity_logits, sh, rotation, translation, screen, options)
+    task = _Task(camera, background, antialiased, threads or available_threads())
+    colour, alpha, depth = _Render.apply(
+        *(means, rotations, log_scales, opacity_logits, sh, rotation, translation, screen, task)
     )
-    return TorchImage(colour, alpha, depth, slot_end)
+    assert task.slot_end is not None
+    return TorchImage(colour, alpha, depth, task.slot_end)
 
 
-@dataclass(frozen=True)
-class _Options:
+@dataclass
+class _Task:
+    """What goes into and comes out of ``_Render`` besides tensors."""
+
     camera: Camera
     background: Any
     antialiased: bool
     threads: int
+    slot_end: wp.array | None = None
 
 
 @dataclass(frozen=True)
 class _Forward:
     """What the backward pass needs of the forward pass."""
 
+    tensors: tuple[torch.Tensor, ...]
+    """Owners of the cloud's memory."""
     cloud: GaussianCloud
     view: Any
     projected: ProjectedGaussians
@@ -108,11 +115,29 @@ def _torch_stream(device: torch.device) -> AbstractContextManager[Any]:
     return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
 
 
+def _cloud_of(tensors: tuple[torch.Tensor, ...]) -> GaussianCloud:
+    """The contiguous ``tensors`` as a capture without a copy; ``wp.from_torch`` would take twice as long."""
+    device = wp.device_from_torch(tensors[0].device)
+
+    def wrapped(tensor: torch.Tensor, dtype: Any, shape: tuple[int, ...]) -> wp.array:
+        return wp.array(ptr=tensor.data_ptr(), dtype=dtype, shape=shape, device=device)
+
+    means, rotations, log_scales, opacity_logits, sh = tensors
+    count = means.shape[0]
+    return GaussianCloud(
+        means=wrapped(means, wp.vec3, (count,)),
+        rotations=wrapped(rotations, wp.vec4, (count,)),
+        log_scales=wrapped(log_scales, wp.vec3, (count,)),
+        opacity_logits=wrapped(opacity_logits, wp.float32, (count,)),
+        sh=wrapped(sh, wp.vec3, (count, sh.shape[1])),
+    )
+
+
 class _Render(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[torch.Tensor, ...]:
-        means, rotations, log_scales, opacity_logits, sh, rotation, translation, _screen, options = arguments
-        camera = options.camera
+        *attributes, rotation, translation, _screen, task = arguments
+        camera = task.camera
         if rotation is not None:
             camera = replace(
                 camera,
@@ -120,28 +145,22 @@ class _Render(torch.autograd.Function):
                 translation=translation.detach().double().cpu().numpy(),
             )
         wp.init()
-        with _torch_stream(means.device):
-            cloud = GaussianCloud(
-                means=wp.from_torch(means.detach().contiguous(), dtype=wp.vec3),
-                rotations=wp.from_torch(rotations.detach().contiguous(), dtype=wp.vec4),
-                log_scales=wp.from_torch(log_scales.detach().contiguous(), dtype=wp.vec3),
-                opacity_logits=wp.from_torch(opacity_logits.detach().contiguous(), dtype=wp.float32),
-                sh=wp.from_torch(sh.detach().contiguous(), dtype=wp.vec3),
-            )
+        tensors = tuple(tensor.detach().contiguous() for tensor in attributes)
+        with _torch_stream(tensors[0].device):
+            cloud = _cloud_of(tensors)
             view = view_from_camera(camera)
-            threads = options.threads
+            threads = task.threads
             with refusing_what_does_not_fit(cloud, camera):
-                projected = project(cloud, view, antialiased=options.antialiased, threads=threads)
+                projected = project(cloud, view, antialiased=task.antialiased, threads=threads)
                 lists = build_tile_lists(projected, view, threads=threads)
-                behind = background_of(options.background, camera, cloud.device)
+                behind = background_of(task.background, camera, cloud.device)
                 image = composite(projected, lists, view, background=behind, threads=threads)
-            ctx.forward_pass = _Forward(cloud, view, projected, lists, image)
-            ctx.options = options
+            ctx.forward_pass = _Forward(tensors, cloud, view, projected, lists, image)
+            ctx.task = task
             ctx.want_pose = rotation is not None and (ctx.needs_input_grad[5] or ctx.needs_input_grad[6])
             ctx.set_materialize_grads(False)
-            slot_end = wp.to_torch(projected.slot_end)
-            ctx.mark_non_differentiable(slot_end)
-            return wp.to_torch(image.colour), wp.to_torch(image.alpha), wp.to_torch(image.depth), slot_end
+            task.slot_end = projected.slot_end
+            return wp.to_torch(image.colour), wp.to_torch(image.alpha), wp.to_torch(image.depth)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -153,16 +172,16 @@ class _Render(torch.autograd.Function):
                 None if gradient is None else wp.from_torch(gradient.detach().contiguous(), dtype=dtype)
                 for gradient, dtype in zip(pixel_gradients[:3], (wp.vec3, wp.float32, wp.float32), strict=True)
             )
-            with refusing_what_does_not_fit(done.cloud, ctx.options.camera):
+            with refusing_what_does_not_fit(done.cloud, ctx.task.camera):
                 gradients = backward(
                     *(done.cloud, done.view, done.projected, done.lists, done.image),
                     colour_gradient=by_colour,
                     alpha_gradient=by_alpha,
                     depth_gradient=by_depth,
-                    antialiased=ctx.options.antialiased,
+                    antialiased=ctx.task.antialiased,
                     want_pose=ctx.want_pose,
                     want_screen=ctx.needs_input_grad[7],
-                    threads=ctx.options.threads,
+                    threads=ctx.task.threads,
                 )
             names = ("means", "rotations", "log_scales", "opacity_logits", "sh", "pose_rotation", "pose_translation")
             arrays = [getattr(gradients, name) for name in (*names, "screen")]

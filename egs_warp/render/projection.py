@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from dataclasses import dataclass
 from typing import Any
 
@@ -82,11 +83,27 @@ def project(cloud: GaussianCloud, view: Any, *, antialiased: bool, threads: int)
         threads=threads,
     )
     wp.utils.array_scan(tile_count, tile_count, inclusive=True)
-    last: Any = tile_count[count - 1 :]
-    slot_count = int(last.numpy()[0])
+    slot_count = _last(tile_count)
     if not 0 <= slot_count < 2**30:
         raise _too_many(cloud, view, tile_count.numpy())
     return ProjectedGaussians(ellipse, falloff, colour_depth, tile_count, slot_count)
+
+
+_read_back = threading.local()
+"""One number in page-locked memory for each thread: what comes from a GPU arrives there twice as fast."""
+
+
+def _last(values: wp.array) -> int:
+    """The last of ``values`` (n,) int64; on a GPU this waits until it is there."""
+    device: Any = values.device
+    if device.is_cpu:
+        return int(values.numpy()[-1])
+    if not hasattr(_read_back, "array"):
+        _read_back.array = wp.empty(1, dtype=wp.int64, device="cpu", pinned=True)
+        _read_back.values = _read_back.array.numpy()
+    wp.copy(_read_back.array, values, src_offset=len(values) - 1, count=1)
+    wp.synchronize_stream(device.stream)
+    return int(_read_back.values[0])
 
 
 def _too_many(cloud: GaussianCloud, view: Any, slot_end: np.ndarray) -> UserError:

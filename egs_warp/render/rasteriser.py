@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -77,9 +78,15 @@ def refusing_what_does_not_fit(cloud: GaussianCloud, camera: Camera) -> Iterator
         ) from error
 
 
+def _is_finite_number(value: Any) -> bool:
+    return isinstance(value, float | int) and math.isfinite(value)
+
+
 def background_of(background: Any, camera: Camera, device: Any) -> Background:
     """From a colour or an image (H, W, 3). Raises ``UserError`` for anything else."""
     shape = (camera.height, camera.width)
+    if isinstance(background, tuple) and len(background) == 3 and all(map(_is_finite_number, background)):
+        return Background(wp.vec3(*background))
     if isinstance(background, wp.array) and background.dtype == wp.vec3 and background.shape == shape:
         image: Any = background.to(device).contiguous()
         return Background(wp.vec3(), image.flatten())

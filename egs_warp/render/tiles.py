@@ -95,14 +95,12 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int) -> T
     """Radix sort of all (tile, Gaussian) pairs by tile and the leading bits of depth; 32 bits sort twice as fast as 64."""
     device = projected.ellipse.device
     count, pairs = projected.slot_end.shape[0], projected.slot_count
-    gaussians = empty(max(pairs, 1), wp.int32, device)
-    slots = empty(max(pairs, 1), wp.int32, device)
     if pairs == 0:
-        return TileLists(zeros(tiles + 1, wp.int32, device), gaussians, slots, None)
-    tile_start = empty(tiles + 1, wp.int32, device)
+        none = [empty(1, wp.int32, device) for _ in range(2)]
+        return TileLists(zeros(tiles + 1, wp.int32, device), *none, None)
     keys = empty(2 * pairs, wp.uint32, device)
-    sorted_slots = empty(2 * pairs, wp.int32, device)
-    gaussian_from_slot = empty(pairs, wp.int32, device)
+    # Slots, room to sort them, and the Gaussian of each slot.
+    scratch = empty(3 * pairs, wp.int32, device)
     nearest, farthest = (int(np.float32(z).view(np.int32)) for z in (view.near, view.far))
     depth_bits = max((farthest - nearest).bit_length(), 1)
     tile_bits = max(tiles - 1, 1).bit_length()
@@ -111,20 +109,23 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int) -> T
         emit_tiles_kernel,
         count,
         inputs=[
-            *(view.width, view.height, nearest, depth_bits - kept_bits, kept_bits),
+            *(view.width, view.height, pairs, nearest, depth_bits - kept_bits, kept_bits),
             *(projected.slot_end, projected.ellipse, projected.falloff, projected.colour_depth),
         ],
-        outputs=[keys, gaussian_from_slot, sorted_slots],
+        outputs=[keys, scratch],
         device=device,
     )
+    # What comes out is allocated while the GPU is busy.
+    tile_start = empty(tiles + 1, wp.int32, device)
+    gaussians, slots = (empty(pairs, wp.int32, device) for _ in range(2))
     if pairs > _LARGE_SORT:
         # The sort takes scratch memory inside Warp, which does not report a failure: see first whether there is any.
         empty((pairs, 2), wp.int32, device)
-    wp.utils.radix_sort_pairs(keys, sorted_slots, pairs, end_bit=kept_bits + tile_bits)
+    wp.utils.radix_sort_pairs(keys, scratch, pairs, end_bit=kept_bits + tile_bits)
     launch_again(
         finish_lists_kernel,
         pairs + 1,
-        inputs=[pairs, kept_bits, keys, sorted_slots, gaussian_from_slot, projected.colour_depth],
+        inputs=[pairs, kept_bits, keys, scratch, projected.colour_depth],
         outputs=[tile_start, gaussians, slots],
         device=device,
     )
