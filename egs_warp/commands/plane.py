@@ -1,0 +1,49 @@
+"""``egs-warp plane``: what the object rests on."""
+
+from __future__ import annotations
+
+import argparse
+
+from egs_warp.scene_input import add_scene_flags, read_scene, say
+
+
+def add_parser(commands) -> None:
+    """Add the command to the subparsers ``commands``."""
+    plane = commands.add_parser("plane", help="find the plane that an object of a scene rests on")
+    add_scene_flags(plane)
+    plane.add_argument("--plane-mask", help="mask.png or folder: the plane is fitted to what these masks show")
+    plane.add_argument("--count", type=int, default=1, help="list this many planes, widest first, after that one (1)")
+    plane.set_defaults(run=_plane)
+
+
+def _plane(chosen: argparse.Namespace) -> int:
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING
+    from egs_warp.errors import UserError
+    from egs_warp.io.atomic import writable_folder
+    from egs_warp.render.video import write_png
+    from egs_warp.scene_pictures import picture_cameras, plane_picture
+    from egs_warp.scene_planes import planes_of_scene, write_ring
+
+    if not (chosen.object or chosen.plane_mask):
+        raise UserError("plane: give --object, or --plane-mask with --cameras")
+    if chosen.count < 1:
+        raise UserError(f"--count {chosen.count}: give a whole number of at least 1")
+    given = read_scene(chosen)
+    folder = writable_folder(chosen.out)
+    found = planes_of_scene(given, plane_mask=chosen.plane_mask, view=chosen.view, count=chosen.count)
+    for note in (*given.notes, *found.notes):
+        say(note)
+    cameras = picture_cameras(found.planes[0], found.centre, found.size, given.cameras)
+    found.write(folder / "plane.json")
+    picture = plane_picture(given.cloud, found.planes, cameras, centre=found.centre, size=found.size)
+    write_png(folder / "plane.png", picture)
+    wrote = "plane.json, plane.png"
+    if not given.posed:
+        write_ring(folder, given.cloud, found.planes[0], found.centre, found.size)
+        wrote += ", cameras.json and images/ for a segmenter"
+    first = found.planes[0]
+    print("plane: " + ",".join(f"{x:.6g}" for x in (*first.normal, first.offset)))
+    print(f"wrote {wrote} into {folder}")
+    return 0

@@ -1,0 +1,56 @@
+"""``egs-warp segment``: an object and the rest of a scene, apart."""
+
+from __future__ import annotations
+
+import argparse
+
+from egs_warp.scene_input import add_scene_flags, read_scene, say
+
+METHODS = {"finetune": "FINETUNE", "split": "SPLIT", "remove": "REMOVE", "none": "NONE"}
+
+
+def add_parser(commands) -> None:
+    """Add the command to the subparsers ``commands``."""
+    segment = commands.add_parser("segment", help="take an object out of a scene")
+    add_scene_flags(segment)
+    segment.add_argument(
+        "--straddling",
+        choices=METHODS,
+        help="Gaussians across the plane: finetune them clear of it (default, needs PyTorch), split, remove, none",
+    )
+    segment.set_defaults(run=_segment)
+
+
+def _segment(chosen: argparse.Namespace) -> int:
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING
+    from egs_warp.clearance import Clearing
+    from egs_warp.errors import UserError
+    from egs_warp.io.atomic import writable_folder
+    from egs_warp.render.video import write_png
+    from egs_warp.scene_pictures import picture_cameras, segmentation_picture
+    from egs_warp.scene_pipeline import SceneOptions, prepare_scene
+
+    if not chosen.object:
+        raise UserError("segment: give --object: a mask, a point, a box or a pixel")
+    given = read_scene(chosen)
+    folder = writable_folder(chosen.out)
+    scene = prepare_scene(
+        given.cloud,
+        given.spec,
+        cameras=given.cameras,
+        up=given.up,
+        plane=given.plane,
+        options=SceneOptions(
+            clearing=Clearing[METHODS[chosen.straddling]] if chosen.straddling else None, inpaint=False
+        ),
+    )
+    for note in (*given.notes, *scene.notes):
+        say(note)
+    scene.write(folder)
+    cameras = picture_cameras(scene.plane, scene.located.centre, scene.located.size, given.cameras)
+    write_png(folder / "segment.png", segmentation_picture(given.cloud, scene.object, scene.background, cameras))
+    print(f"object: {scene.object.count} Gaussians, background: {scene.background.count}")
+    print(f"wrote object.ply, background.ply, plane.json, segment.png into {folder}")
+    return 0

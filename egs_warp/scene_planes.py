@@ -1,0 +1,91 @@
+"""The planes of a scene, as the command asks for them: under the object, in a mask, and the other wide ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from egs_warp.camera_ring import ring_cameras, write_cameras
+from egs_warp.errors import UserError
+from egs_warp.gaussians import GaussianCloud
+from egs_warp.io.atomic import writable_folder
+from egs_warp.object_input import read_object
+from egs_warp.plane import Plane
+from egs_warp.plane_file import write_planes
+from egs_warp.plane_fit import PlaneView, camera_rays, fit_plane
+from egs_warp.plane_search import find_planes
+from egs_warp.render.rasteriser import render
+from egs_warp.render.video import write_png
+from egs_warp.scene_input import SceneInput
+from egs_warp.scene_pipeline import locate_plane
+
+
+@dataclass(frozen=True)
+class ScenePlanes:
+    """What was found; scene units."""
+
+    planes: list[Plane]
+    """The one that was asked for, then others."""
+    facts: list[Mapping[str, object]]
+    centre: np.ndarray
+    """(3,) of the object, or of what the masks show."""
+    size: float
+    notes: tuple[str, ...]
+
+    def write(self, path: Path) -> None:
+        """``plane.json``."""
+        write_planes(path, self.planes, facts=self.facts)
+
+
+def planes_of_scene(given: SceneInput, *, plane_mask: str | None, view: str | None, count: int) -> ScenePlanes:
+    """The plane under the object of ``given``, or in ``plane_mask``; and up to ``count`` - 1 other wide level ones.
+
+    Raises ``UserError`` where there is none in sight.
+    """
+    if plane_mask is None:
+        assert given.spec is not None
+        located = locate_plane(given.cloud, given.spec, cameras=given.cameras, up=given.up, plane=given.plane)
+        plane, centre, size, notes = located.plane, located.centre, located.size, located.notes
+        facts: dict[str, object] = located.facts()
+    else:
+        masks = read_object(plane_mask, given.cloud, given.posed, view=view).masks
+        if not masks:
+            raise UserError(f"--plane-mask {plane_mask}: give a mask.png or a folder of masks")
+        views = [
+            PlaneView(mask.camera, np.where(image.alpha.numpy() > 0.5, image.depth.numpy(), 0.0), mask.mask)
+            for mask in masks
+            for image in [render(given.cloud, mask.camera)]
+        ]
+        fit = fit_plane(views)
+        points = np.concatenate(
+            [
+                one.camera.centre + one.depth[held][:, None] * camera_rays(one.camera)[held]
+                for one in views
+                for held in [one.mask & (one.depth > 0.0)]
+            ]
+        )
+        plane, centre = fit.plane, np.median(points, axis=0)
+        size = 2.0 * float(np.median(np.linalg.norm(points - centre, axis=1)))
+        notes = ()
+        facts = {"noise": fit.noise, "inlier_share": fit.inlier_share, "pixels": fit.pixel_count}
+    others = [one for one in find_planes(given.cloud, plane.normal, count=count + 1) if _differ(one.plane, plane, size)]
+    planes = [plane, *(one.plane for one in others[: count - 1])]
+    return ScenePlanes(planes, [facts, *({"support": one.support} for one in others[: count - 1])], centre, size, notes)
+
+
+def _differ(a: Plane, b: Plane, size: float) -> bool:
+    apart = abs(float(a.offset / (a.normal @ b.normal) - b.offset))
+    return bool(a.normal @ b.normal < np.cos(np.radians(5.0)) or apart > 0.05 * size)
+
+
+def write_ring(folder: Path, cloud: GaussianCloud, plane: Plane, centre: np.ndarray, size: float) -> None:
+    """``cameras.json`` and ``images/`` of a ring about the object, for a segmenter to make masks of."""
+    cameras = ring_cameras(plane, centre, 0.6 * size, count=12, size=512)
+    names = [f"ring{number:02d}.png" for number in range(len(cameras))]
+    images = writable_folder(folder / "images")
+    for name, camera in zip(names, cameras, strict=True):
+        write_png(images / name, render(cloud, camera).colour_srgb8())
+    write_cameras(folder / "cameras.json", cameras, names)
