@@ -95,6 +95,9 @@ def emit_tiles_kernel(
 ):
     """Sort key (tile, then the leading bits of the depth) of every slot, its number, and from 2 ``pair_count`` its Gaussian."""
     g = wp.tid()
+    # Written side by side by neighbouring threads, which the loop below cannot do.
+    for i in range(g, pair_count, slot_end.shape[0]):
+        slot_and_gaussian_out[i] = i
     slot = wp.int32(0)
     if g > 0:
         slot = wp.int32(slot_end[g - 1])
@@ -110,7 +113,6 @@ def emit_tiles_kernel(
         span = tile_columns(e, f, row, width, height)
         for column in range(span[0], span[1] + 1):
             key_out[slot] = (wp.uint32(row * columns + column) << wp.uint32(kept_bits)) | depth_key
-            slot_and_gaussian_out[slot] = slot
             slot_and_gaussian_out[2 * pair_count + slot] = g
             slot += 1
 
