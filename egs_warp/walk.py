@@ -72,7 +72,7 @@ class Walk:
         It walks along the side of its feet that is nearest to the forward of ``place``.
         """
         body = place.body
-        heights = (place.standing - place.ground.origin) @ place.ground.axes[2]
+        heights = (place.standing - place.ground.origin) @ place.ground.surface_normal
         feet = find_feet(body.mesh, heights, body.height)
         order = feet_around(feet, place.standing, place.ground.axes[2])
         corners = np.array([place.standing[feet[index].sole].mean(axis=0) for index in order])
@@ -81,6 +81,9 @@ class Walk:
         place = place.facing(max(ways, key=lambda way: float(way @ place.ground.axes[0])))
         self.body, self.ground, self.feet = body, place.ground, feet
         self.control = control or WalkControl()
+        normal = place.ground.axes @ place.ground.surface_normal
+        self._slope = -normal[:2] / normal[2]
+        """Metres that the ground rises for each metre forward and to the left."""
         self.pairs = (order[0], order[2]), (order[1], order[3])
         self.gravity = float(np.linalg.norm(body.gravity))
         self.gait = Gait.of(steps, step_length, height=body.height, gravity=self.gravity)
@@ -157,7 +160,7 @@ class Walk:
             if landed or elapsed >= 2.0 * gait.swing_time:
                 self._late += not landed
                 for index in self.swinging:
-                    self._places[index, :2] = local[self.feet[index].sole, :2].mean(axis=0)
+                    self._places[index] = self._on_ground(index, local[self.feet[index].sole, :2].mean(axis=0))
                 last = self.swing == gait.swings - 1
                 self.phase, self._entered = WalkPhase.GATHER if last else WalkPhase.STAND, time
         elif (self.phase is WalkPhase.STAND and elapsed >= gait.double_time) or (
@@ -200,7 +203,8 @@ class Walk:
         off = com[:2] + velocity[:2] / rate - (place + speed / rate)
         pressure = nearest_in_hull(self._support(local), place + self.control.balance * off)
         level = velocity[:2] + dt * rate**2 * (com[:2] - pressure)
-        up = 6.0 / self._time_unit * (self._start_com[2] + self._rise(elapsed) - com[2])
+        height = self._start_com[2] + self._rise(elapsed) + self._slope @ (com[:2] - self._start_com[:2])
+        up = self._slope @ velocity[:2] + 6.0 / self._time_unit * (height - com[2])
         return np.array([*level, up])
 
     def _support(self, local: np.ndarray) -> np.ndarray:
@@ -208,12 +212,17 @@ class Walk:
         soles = [local[foot.sole, :2] for index, foot in enumerate(self.feet) if index not in self.swinging]
         return np.concatenate([s.mean(axis=0) + self.control.margin * (s - s.mean(axis=0)) for s in soles])
 
+    def _on_ground(self, index: int, place: np.ndarray) -> np.ndarray:
+        """(3,) where foot ``index`` stands at ``place`` (2,)."""
+        start = self._soles[index]
+        return np.array([*place, start[2] + self._slope @ (place - start[:2])])
+
     def _foot_targets(self, elapsed: float) -> np.ndarray:
         """(4, 3) where the feet should be ``elapsed`` seconds into the phase."""
         targets, gait = self._places.copy(), self.gait
         for index in self.swinging:
             progress = elapsed / gait.swing_time
-            goal = self._soles[index] + [gait.landing(self.swing), 0.0, 0.0]
+            goal = self._on_ground(index, self._soles[index, :2] + gait.landing(self.swing) * FORWARD)
             targets[index] += gait.carried(progress) * (goal - self._places[index])
             # One that has found no ground in time reaches down for it.
             targets[index, 2] += gait.lifted(progress) - 0.02 * self.body.height * max(progress - 1.0, 0.0)
