@@ -9,10 +9,6 @@ from egs_warp.motions import JumpTarget
 from egs_warp.sequence import Part, Place
 from egs_warp.stance import Weights, sole_shares
 
-LEAN = 0.16
-"""Of the distance: how far the weight is put ahead before take-off. With it over the middle of the feet a push forward would
-turn the body backward."""
-
 
 class Hop(Leap):
     """A jump whose feet aim at a point of the ground."""
@@ -23,11 +19,9 @@ class Hop(Leap):
         way = square - feet
         place = place.facing(way)
         forward, _, rise = place.ground.axes @ way
-        ahead = float((place.ground.axes[0] @ (place.touching - feet).T).max())
         super().__init__(
             place,
             JumpTarget(float(forward), height + max(float(rise), 0.0), float(rise)),
-            lean=min(LEAN * float(forward), 0.5 * ahead),
             weights=weights,
         )
         self._feet = sole_shares(place.body, place.ground, place.standing)

@@ -12,12 +12,17 @@ from egs_warp.objectives import Objective, SpinObjective
 from egs_warp.sequence import Place
 from egs_warp.stance import Ground, Measurement, PoseFamily, Weights
 
+LEAN = 0.16
+"""Of the distance: how far the weight is put ahead before take-off. With it over the middle of the feet a push forward would
+turn the body backward."""
 DEEPEST_CROUCH = 0.3
 """Of the height of the centre of mass; a higher jump thrusts harder instead."""
 FOOTHOLD = 0.4
 """Of the footprint: how far from the capture point the feet may be put down for the sake of the target."""
 CLEARANCE = 0.15
 """Of the height of a step: how far above it the feet are before they swing ahead."""
+AIRBORNE_POSE = 0.1
+"""Weight of the pose in the air, where nothing else can be steered and the feet have to get to their place."""
 CALM = 0.03
 """Speed of the centre of mass, in sqrt(g H), below which a body that has landed is at rest."""
 
@@ -42,7 +47,7 @@ class Leap(Jump):
             touching=place.touching,
             step=place.step,
             weights=weights,
-            lean=lean,
+            lean=self._lean(place, target) if lean is None else lean,
         )
         self.turn = turn
         ground = place.ground
@@ -61,6 +66,12 @@ class Leap(Jump):
         stroke = crouch + self.plan.extension
         self.plan = replace(self.plan, crouch_depth=crouch, thrust_time=2.0 * stroke / self.plan.speed_up)
         self._calm_since: float | None = None
+        self._pose_weight = self.weights.pose
+
+    @staticmethod
+    def _lean(place: Place, target: JumpTarget) -> float:
+        ahead = place.ground.axes[0] @ (place.touching - place.body.centre_of_mass(place.standing)).T
+        return min(LEAN * target.distance, 0.5 * float(ahead.max()))
 
     @property
     def left_ground(self) -> bool:
@@ -106,7 +117,9 @@ class Leap(Jump):
     def _advance_phase(self, seen: Measurement, time: float, dt: float) -> None:
         # What a foot brushes on its way up is no landing.
         super()._advance_phase(replace(seen, touching=seen.touching and seen.velocity[2] < 0.0), time, dt)
-        if self.phase is JumpPhase.FLIGHT and not self.left_ground:
+        in_air = self.phase is JumpPhase.FLIGHT
+        self.weights = replace(self.weights, pose=AIRBORNE_POSE if in_air else self._pose_weight)
+        if in_air and not self.left_ground:
             self.pose, self.ground = self._landing_pose, self._landing
             self._goal_base = self._start_base
         if self.phase is JumpPhase.LAND:
