@@ -13,6 +13,7 @@ from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.plane import Plane
 from egs_warp.rectified import PlaneWindow, rectify
+from egs_warp.votes import MaskedView, check_size
 
 _TEXELS = 256
 """Across the window in which a hole is drawn."""
@@ -92,20 +93,14 @@ def footprint(thing: GaussianCloud, plane: Plane) -> Hole:
     return Hole(window, ndimage.binary_fill_holes(covered))
 
 
-def unseen(plane: Plane, views: Sequence[tuple[Camera, np.ndarray]]) -> Hole:
-    """The floor that stands behind the object in every view that has it in sight, from masks (H, W) of the object.
+def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
+    """The floor that stands behind the object in every view that has it in sight.
 
     Raises ``UserError`` for masks that do not fit their cameras, are empty, or between them hide no common floor.
     """
-    for number, (camera, mask) in enumerate(views):
-        if mask.shape != (camera.height, camera.width):
-            raise UserError(
-                f"inpaint: mask {number} has {mask.shape[1]} x {mask.shape[0]} pixels, its camera"
-                f" {camera.width} x {camera.height}; give masks of the cameras' size"
-            )
-        if not mask.any():
-            raise UserError(f"inpaint: mask {number} is empty; paint the object white")
-    shadows = [_on_plane(plane, camera, mask) for camera, mask in views]
+    for view in views:
+        check_size(view)
+    shadows = [_on_plane(plane, view.camera, view.mask) for view in views]
     if any(len(shadow) == 0 for shadow in shadows):
         raise UserError("inpaint: the floor is not in sight inside a mask; the hole is off the plane, check the plane")
     # The common floor lies inside every shadow's bounds; the smallest shadow has the finest window.
@@ -116,7 +111,8 @@ def unseen(plane: Plane, views: Sequence[tuple[Camera, np.ndarray]]) -> Hole:
     columns, rows = np.meshgrid(np.arange(_TEXELS) + 0.5, np.arange(_TEXELS) + 0.5)
     places = window.points(np.stack([columns.ravel(), rows.ravel()], axis=1))
     hidden, looked = np.ones(len(places), bool), np.zeros(len(places), bool)
-    for camera, mask in views:
+    for view in views:
+        camera, mask = view.camera, view.mask
         seen = places @ camera.rotation.T + camera.translation
         ahead = seen[:, 2] > camera.near
         depth = np.where(ahead, seen[:, 2], 1.0)

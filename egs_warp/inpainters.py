@@ -49,11 +49,10 @@ class OpenCvInpainter:
         """As ``Inpainter.fill``."""
         flag = cv2.INPAINT_TELEA if self.method is OpenCvMethod.TELEA else cv2.INPAINT_NS
         missing = (hole | ~known).astype(np.uint8)
-        # One channel at a time it works in float32, without rounding to 8 bits.
-        channels = [
-            cv2.inpaint(np.ascontiguousarray(image[..., k], np.float32), missing, self.radius, flag) for k in range(3)
-        ]
-        return _pasted(image, hole, np.stack(channels, axis=-1))
+        # One channel at a time it takes 16 bits; of float32 pictures its fast marching rounds to whole numbers.
+        coded = np.rint(65535.0 * np.clip(image, 0.0, 1.0)).astype(np.uint16)
+        channels = [cv2.inpaint(np.ascontiguousarray(coded[..., k]), missing, self.radius, flag) for k in range(3)]
+        return _pasted(image, hole, np.stack(channels, axis=-1).astype(np.float32) / np.float32(65535.0))
 
 
 @dataclass(frozen=True)

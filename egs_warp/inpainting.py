@@ -120,6 +120,7 @@ def inpaint(
     new = flat_gaussians(
         window,
         grown,
+        known,
         painted,
         rim_heights(before, grown, known),
         spacing=spacing,

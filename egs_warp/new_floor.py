@@ -79,13 +79,14 @@ def soap_film(values: np.ndarray, hole: np.ndarray) -> np.ndarray:
 def flat_gaussians(
     window: PlaneWindow,
     hole: np.ndarray,
+    known: np.ndarray,
     painted: np.ndarray,
     heights: np.ndarray,
     *,
     spacing: int,
     device: str | None = None,
 ) -> GaussianCloud:
-    """Gaussians of SH degree 0 every ``spacing`` texels over ``hole`` (rows, columns) and its rim, in the colours of
+    """Gaussians of SH degree 0 every ``spacing`` texels over ``hole`` (rows, columns) and its ``known`` rim, in the colours of
     ``painted`` (rows, columns, 3), at ``heights`` (rows, columns) above the plane; those of the rim a little lower,
     where they only show through gaps."""
     size = (np.array(hole.shape) // spacing) * spacing
@@ -95,7 +96,8 @@ def flat_gaussians(
         return whole.reshape(size[0] // spacing, spacing, size[1] // spacing, spacing, -1).mean(axis=(1, 3))
 
     inner = blocks(hole)[..., 0] > 0.5
-    rows, columns = np.nonzero(ndimage.binary_dilation(inner, iterations=_SKIRT))
+    coloured = blocks(hole | known)[..., 0] == 1.0
+    rows, columns = np.nonzero(ndimage.binary_dilation(inner, iterations=_SKIRT) & coloured)
     count = len(rows)
     first, second = window.plane.tangents()
     step = spacing * window.texel

@@ -24,9 +24,9 @@ _RIM = 3
 """Pixels around the hole that a copy must also explain."""
 _COST_UNIT = 2000.0
 """Capacities are whole numbers: colour differences are counted in units of 1 / 2000."""
-_PRIOR = 0.6
+_PRIOR = 1.0
 """Weight of how well an offset explains what is known around a pixel, against what its seams cost."""
-_SEAM = 0.01
+_SEAM = 0.03
 """Price of a seam that does not show, as a colour difference: it keeps copies in large pieces."""
 _SWEEPS = 3
 """Rounds of expansion over all offsets, at most."""

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import warp as wp
-from scipy import ndimage
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import splu
 
 from egs_warp.errors import UserError
 from egs_warp.kernels.patch_synthesis import RADIUS, search_kernel, vote_kernel
@@ -19,13 +20,15 @@ from egs_warp.launching import launch_rows
 from egs_warp.offset_labels import labelled_sources
 from egs_warp.render.arrays import zeros
 
-_COARSEST_HALF_WIDTH = 10.0
+_COARSEST_HALF_WIDTH = 16.0
 """Half width, in pixels, of the hole at the coarsest level, where offsets are chosen."""
 _STRIDES = (8, 4, 2, 1, 8, 4, 2, 1)
 """Of the neighbours that are asked in one search."""
-_TOLERANCE = 2.0
+_TOLERANCE = 0.5
 """Patches this many times worse than the median one count 1 / e."""
-_STRICT_TOLERANCE = 0.4
+_SCREEN = 0.01
+"""Pull of the voted colours against the gradients of the sources: within about 1 / sqrt of it, in pixels, they hold."""
+_STRICT_TOLERANCE = 0.25
 """The same for the last vote of each level, so that the result is as sharp as its sources."""
 
 
@@ -59,7 +62,8 @@ class PatchSynthesis:
                 f"inpaint: no piece of {2 * RADIUS + 1} x {2 * RADIUS + 1} texels is known around the hole;"
                 " make the hole smaller or show more of the floor"
             )
-        return np.where(hole[..., None], np.clip(work.picture, 0.0, 1.0), image).astype(np.float32)
+        melded = meld(work.picture, hole, known | hole, work.sources())
+        return np.where(hole[..., None], np.clip(melded, 0.0, 1.0), image).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -116,6 +120,44 @@ def _with_whole_patches(sources: np.ndarray, level: _Level) -> np.ndarray:
     nearest = ndimage.distance_transform_edt(~level.is_source, return_distances=False, return_indices=True)
     inside = np.clip(sources, 0, np.array(level.hole.shape) - 1)
     return np.stack([nearest[k][inside[..., 0], inside[..., 1]] for k in (0, 1)], axis=-1).astype(np.int32)
+
+
+def meld(picture: np.ndarray, hole: np.ndarray, known: np.ndarray, sources: np.ndarray) -> np.ndarray:
+    """(H, W, 3): ``picture`` (H, W, 3) in the hole with the gradients of its ``sources`` (H, W, 2), so that pieces from
+    differently lit places join without a seam: a screened Poisson equation (Bhat et al. 2008)."""
+    at = np.argwhere(hole)
+    index = np.full(hole.shape, -1)
+    index[hole] = np.arange(len(at))
+    source = sources[hole]
+    matrix_rows, matrix_columns, matrix_values = [np.arange(len(at))], [np.arange(len(at))], [np.full(len(at), _SCREEN)]
+    right = _SCREEN * picture[hole].astype(np.float64)
+    limit = np.array(hole.shape) - 1
+    for step in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+        there = np.clip(at + step, 0, limit)
+        inside = (there == at + step).all(axis=1) & known[there[:, 0], there[:, 1]]
+        ahead = np.clip(source + step, 0, limit)
+        rise = picture[ahead[:, 0], ahead[:, 1]].astype(np.float64) - picture[source[:, 0], source[:, 1]]
+        other = index[there[:, 0], there[:, 1]]
+        free = inside & (other >= 0)
+        # Between two pixels of the hole both sources have a say.
+        from_other = sources[there[:, 0], there[:, 1]]
+        behind = np.clip(from_other - step, 0, limit)
+        of_other = picture[from_other[:, 0], from_other[:, 1]].astype(np.float64) - picture[behind[:, 0], behind[:, 1]]
+        rise = np.where(free[:, None], 0.5 * (rise + of_other), rise)
+        right -= np.where(inside[:, None], rise, 0.0)
+        fixed = inside & (other < 0)
+        right[fixed] += picture[there[fixed, 0], there[fixed, 1]]
+        row = np.flatnonzero(inside)
+        matrix_rows += [row, np.flatnonzero(free)]
+        matrix_columns += [row, other[free]]
+        matrix_values += [np.ones(len(row)), np.full(int(free.sum()), -1.0)]
+    matrix = sparse.coo_array(
+        (np.concatenate(matrix_values), (np.concatenate(matrix_rows), np.concatenate(matrix_columns))),
+        shape=(len(at), len(at)),
+    )
+    melded = picture.copy()
+    melded[hole] = splu(sparse.csc_array(matrix)).solve(right)
+    return melded
 
 
 class _Work:

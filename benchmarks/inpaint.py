@@ -1,0 +1,371 @@
+"""Inpainting of the floor under an object, judged against the floor that is known to be there.
+
+Cases: the three built-in scenes (floor under the object taken out, dark haze put in its place, as a capture has it) and
+holes cut into uncovered floor of real captures. Unseen cameras compare the hole's pixels with the untouched floor.
+Rows: this package; ``cv2.inpaint`` in every picture (the better of its two methods); training without the plane: as many
+Gaussians, scattered where the object stood, against the same one inpainted picture.
+
+Aims: ``beats_cv2_by_3db``, ``beats_no_prior_by_3db`` (mean PSNR over the cases), ``seconds_on_gpu`` (every case at most
+20 s), ``hole_size_independent`` (seconds vary at most 1.5 times over a fourfold area of the hole).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import warp as wp
+
+from egs_warp.camera import Camera
+from egs_warp.finetune import FinetuneOptions, TrainingView, finetune, psnr
+from egs_warp.gaussians import GaussianCloud
+from egs_warp.holes import Hole, disc, footprint
+from egs_warp.inpainting import InpaintOptions, InpaintResult, inpaint
+from egs_warp.inpainting_picture import depth_colours
+from egs_warp.io import read_capture
+from egs_warp.plane import Plane
+from egs_warp.plane_fit import plane_depth
+from egs_warp.render import contact_sheet, render, write_png
+from egs_warp.scenes import scene
+from egs_warp.scenes.rooms import joined
+
+AIMS = ("beats_cv2_by_3db", "beats_no_prior_by_3db", "seconds_on_gpu", "hole_size_independent")
+OURS, CV2, NO_PRIOR = "ours", "cv2 in the picture", "no plane prior"
+REAL = {
+    # File, plane, centre of the hole, its radius; scene units.
+    "koala planks": ("koala.ply", (0.003, -1.0, -0.018, -0.023), (0.35, 0.0, -1.15), 0.2),
+    "playbot moss": ("playbot", (0.0, -1.0, 0.0, -0.019), (0.6, 0.0, 0.6), 0.14),
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A floor with a hole, and the truth."""
+
+    name: str
+    truth: GaussianCloud
+    damaged: GaussianCloud
+    """What segmentation leaves: no floor in the hole, haze instead."""
+    hole: Hole
+    is_real: bool
+
+
+def built_in(name: str, device: str) -> Case:
+    """The floor under a built-in object."""
+    made = scene(name, device=device)
+    hole = footprint(made.object, made.plane)
+    return Case(name, made.background, damaged(made.background, hole), hole, False)
+
+
+def real(name: str, device: str) -> Case | None:
+    """A hole in uncovered floor; None where the capture is not on this machine."""
+    file, coefficients, centre, radius = REAL[name]
+    path = Path(os.environ.get("EGS_WARP_DATA", Path(__file__).parents[2] / "shared" / "data")) / "scenes" / file
+    if not path.exists():
+        return None
+    hole = disc(Plane.from_coefficients(*coefficients), np.array(centre), radius)
+    truth = read_capture(path, device=device).cloud
+    return Case(name, truth, damaged(truth, hole), hole, True)
+
+
+def damaged(truth: GaussianCloud, hole: Hole) -> GaussianCloud:
+    """Without what lies in the hole; with a little dark haze about the plane there, which no camera of a capture could
+    have denied."""
+    _, side = hole.bounds()
+    means = truth.means.numpy()
+    away = np.abs(hole.plane.heights(means))
+    kept = truth.subset(~(hole.window.sample(hole.mask, means) & (away < 0.5 * side)))
+    random = np.random.default_rng(0)
+    at = np.argwhere(hole.mask)
+    count = 40
+    pixels = at[random.integers(len(at), size=count)][:, ::-1] + 0.5
+    haze = GaussianCloud.from_numpy(
+        hole.window.points(pixels) + random.normal(0.0, 0.06 * side, (count, 1)) * hole.plane.normal,
+        random.normal(size=(count, 4)),
+        np.log(0.06 * side) + random.normal(0.0, 0.3, (count, 3)),
+        random.normal(0.0, 1.0, count),
+        np.concatenate([np.full((count, 1, 3), -1.2), np.zeros((count, truth.sh.shape[1] - 1, 3))], axis=1),
+        device=str(truth.device),
+    )
+    return joined(kept, haze)
+
+
+def cameras_around(hole: Hole, size: int) -> list[Camera]:
+    """Eight on two rings; the first is the one that the picture is inpainted for."""
+    middle, side = hole.bounds()
+    first, second = hole.plane.tangents()
+    cameras = []
+    for number in range(8):
+        azimuth, elevation = 2.0 * np.pi * (number + 0.3) / 8, np.radians((28.0, 50.0)[number % 2])
+        level = np.cos(azimuth) * first + np.sin(azimuth) * second
+        eye = middle + 4.5 * side * (np.cos(elevation) * level + np.sin(elevation) * hole.plane.normal)
+        cameras.append(
+            Camera.look_at(
+                eye, middle, hole.plane.normal, width=size, height=size, vertical_fov_degrees=24.0, near=0.05 * side
+            )
+        )
+    return cameras
+
+
+def hole_pixels(result: InpaintResult, camera: Camera) -> np.ndarray:
+    """(H, W) bool: pixels whose ray meets the plane inside the hole."""
+    depth = plane_depth(result.window.plane, camera)
+    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
+    seen = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
+    points = camera.centre + depth[..., None] * (seen @ camera.rotation)
+    return (result.window.sample(result.hole, points.reshape(-1, 3)).reshape(depth.shape)) & (depth > 0.0)
+
+
+def picture(cloud: GaussianCloud, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Colour (H, W, 3) and depth (H, W)."""
+    image = render(cloud, camera)
+    return np.clip(image.colour.numpy(), 0.0, 1.0), image.depth.numpy()
+
+
+def similarity(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(H, W) structural similarity of two pictures: Gaussian window of 11 x 11, sigma 1.5, mean over channels."""
+
+    def blur(values: np.ndarray) -> np.ndarray:
+        return cv2.GaussianBlur(values.astype(np.float64), (11, 11), 1.5)
+
+    mean_a, mean_b = blur(a), blur(b)
+    covariance = blur(a * b) - mean_a * mean_b
+    variances = blur(a * a) - mean_a**2 + blur(b * b) - mean_b**2
+    c1, c2 = 0.01**2, 0.03**2
+    return (
+        (2 * mean_a * mean_b + c1) * (2 * covariance + c2) / ((mean_a**2 + mean_b**2 + c1) * (variances + c2))
+    ).mean(axis=2)
+
+
+def by_opencv(image: np.ndarray, mask: np.ndarray) -> list[np.ndarray]:
+    """Both methods of OpenCV on one picture."""
+    wide = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
+    coded = np.rint(255 * image).astype(np.uint8)
+    return [
+        cv2.inpaint(coded, wide, 5, flag).astype(np.float32) / 255.0 for flag in (cv2.INPAINT_TELEA, cv2.INPAINT_NS)
+    ]
+
+
+def without_plane(
+    case: Case, result: InpaintResult, camera: Camera, target: np.ndarray, steps: int, seed: int
+) -> GaussianCloud:
+    """As many Gaussians as ours, scattered over the room that the object took, trained against one picture."""
+    _, side = case.hole.bounds()
+    kept = result.cloud.subset(~result.is_new)
+    count = int(result.is_new.sum())
+    random = np.random.default_rng(seed)
+    at = np.argwhere(result.hole)
+    pixels = at[random.integers(len(at), size=count)][:, ::-1] + random.uniform(0, 1, (count, 2))
+    rise = random.uniform(-0.25, 0.5, (count, 1)) * side
+    sh = np.zeros((count, kept.sh.shape[1], 3))
+    sh[:, 0] = np.median(result.painted[result.hole], axis=0) / 0.2820948 - 0.5 / 0.2820948
+    scattered = GaussianCloud.from_numpy(
+        result.window.points(pixels) + rise * case.hole.plane.normal,
+        random.normal(size=(count, 4)),
+        np.full((count, 3), np.log(1.5 * side / count ** (1 / 2))),
+        np.full(count, np.log(0.1 / 0.9)),
+        sh,
+        device=str(kept.device),
+    )
+    whole = joined(kept, scattered)
+    trainable = np.arange(whole.count) >= kept.count
+    mask = cv2.dilate(hole_pixels(result, camera).astype(np.float32), np.ones((9, 9), np.uint8))
+    return finetune(
+        whole,
+        [TrainingView(camera, target, weight=mask)],
+        options=FinetuneOptions(iterations=steps, seed=seed),
+        trainable=trainable,
+    ).cloud
+
+
+def judge_case(case: Case, options: argparse.Namespace) -> tuple[list[dict[str, Any]], np.ndarray]:
+    """Rows of the three methods, and a strip of pictures: colour above depth."""
+    runs = [inpaint(case.damaged, case.hole, options=InpaintOptions(seed=options.seed)) for _ in range(options.repeat)]
+    # The first run also compiles kernels.
+    seconds = [sum(run.seconds.values()) for run in (runs[1:] or runs)]
+    result = runs[-1]
+    cameras = cameras_around(case.hole, options.size)
+    empty = result.cloud.subset(~result.is_new)
+    target, _ = picture(result.cloud, cameras[0])
+    started = time.perf_counter()
+    unguided = without_plane(case, result, cameras[0], target, options.baseline_steps, options.seed)
+    unguided_seconds = time.perf_counter() - started
+    scores: dict[str, list[tuple[float, ...]]] = {OURS: [], CV2: [], NO_PRIOR: []}
+    cv2_seconds = []
+    strip = np.zeros(0)
+    for number, camera in enumerate(cameras):
+        truth, true_depth = picture(case.truth, camera)
+        # What stands before the floor is the same in every picture.
+        ahead = true_depth - plane_depth(case.hole.plane, camera)
+        mask = hole_pixels(result, camera) & (np.abs(ahead) < 0.25 * case.hole.bounds()[1])
+        hollow, hollow_depth = picture(empty, camera)
+        started = time.perf_counter()
+        smooth = max(by_opencv(hollow, mask), key=lambda image: psnr(image[mask], truth[mask]))
+        cv2_seconds.append(time.perf_counter() - started)
+        ours, unprior = picture(result.cloud, camera), picture(unguided, camera)
+        if number == 1:
+            strip = shown(
+                [hollow, smooth, unprior[0], ours[0], truth],
+                [hollow_depth, None, unprior[1], ours[1], true_depth],
+                case.name,
+            )
+        if number == 0 or mask.sum() < 100:
+            continue
+        for method, (image, depth) in {OURS: ours, CV2: (smooth, None), NO_PRIOR: unprior}.items():
+            off = np.nan if depth is None else np.abs(depth[mask] - true_depth[mask]).mean() / case.hole.bounds()[1]
+            scores[method].append(
+                (psnr(image[mask], truth[mask]), float(similarity(truth, image)[mask].mean()), float(off))
+            )
+    rows = []
+    spent = {OURS: float(np.median(seconds)), CV2: float(np.median(cv2_seconds)), NO_PRIOR: unguided_seconds}
+    for method, values in scores.items():
+        mean = np.mean(values, axis=0)
+        rows.append(
+            {
+                "case": case.name,
+                "real": case.is_real,
+                "method": method,
+                "psnr": float(mean[0]),
+                "ssim": float(mean[1]),
+                "depth_error_of_hole_side": None if np.isnan(mean[2]) else float(mean[2]),
+                "seconds": spent[method],
+                "stages": result.seconds if method == OURS else None,
+                "gaussians": int(result.is_new.sum()) if method != CV2 else 0,
+                "hole_texels": int(result.hole.sum()),
+            }
+        )
+        depth = "" if np.isnan(mean[2]) else f"depth {100 * mean[2]:6.2f} % of side"
+        print(
+            f"{case.name:13} {method:19} {mean[0]:6.2f} dB  SSIM {mean[1]:.3f}  {spent[method]:7.2f} s  {depth}",
+            flush=True,
+        )
+    return rows, strip
+
+
+def shown(colours: list[np.ndarray], depths: list[np.ndarray | None], name: str) -> np.ndarray:
+    """Colour above depth, each with its label."""
+    reference = depths[-1]
+    assert reference is not None
+    near, far = np.quantile(reference[reference > 0], [0.02, 0.98])
+    blank = np.zeros_like(reference)
+    labels = [f"{name}: hole", CV2, NO_PRIOR, OURS, "truth"]
+    tiles = [np.rint(255 * colour).astype(np.uint8) for colour in colours] + [
+        depth_colours(blank if depth is None else depth, float(near), float(far)) for depth in depths
+    ]
+    return contact_sheet(tiles, 5, labels + ["depth", "no depth", "depth", "depth", "depth"])
+
+
+def size_rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """Seconds for a round hole in the table cloth and for one of four times its area, interleaved."""
+    made = scene("figurine", device=options.device)
+    holes = {radius: disc(made.plane, np.array([0.1, 0.2, 0.0]), radius) for radius in (0.16, 0.32)}
+    clouds = {radius: damaged(made.background, hole) for radius, hole in holes.items()}
+    seconds: dict[float, list[float]] = {radius: [] for radius in holes}
+    for _ in range(max(2, options.repeat)):
+        for radius, hole in holes.items():
+            run = inpaint(clouds[radius], hole, options=InpaintOptions(seed=options.seed))
+            seconds[radius].append(sum(run.seconds.values()))
+    rows = [
+        {"case": "size", "method": OURS, "area": holes[radius].area, "seconds": float(np.median(spent))}
+        for radius, spent in seconds.items()
+    ]
+    for row in rows:
+        print(f"hole of {row['area']:.3f} square units: {row['seconds']:.2f} s", flush=True)
+    return rows
+
+
+def judge(rows: list[dict[str, Any]], *, on_gpu: bool) -> tuple[dict[str, bool | None], dict[str, str]]:
+    """The aims, from the rows."""
+
+    def mean(method: str) -> float:
+        return float(np.mean([row["psnr"] for row in rows if row["case"] != "size" and row["method"] == method]))
+
+    sizes = [row["seconds"] for row in rows if row["case"] == "size"]
+    ours = [row["seconds"] for row in rows if row["case"] != "size" and row["method"] == OURS]
+    aims: dict[str, bool | None] = {
+        "beats_cv2_by_3db": mean(OURS) >= mean(CV2) + 3.0,
+        "beats_no_prior_by_3db": mean(OURS) >= mean(NO_PRIOR) + 3.0,
+        "seconds_on_gpu": max(ours) <= 20.0 if on_gpu else None,
+        "hole_size_independent": max(sizes) <= 1.5 * min(sizes),
+    }
+    why = {} if on_gpu else {"seconds_on_gpu": "no GPU here; the same script's JSON from one judges it"}
+    return aims, why
+
+
+def main() -> None:
+    """Run, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    wp.init()
+    parser.add_argument("--quick", action="store_true", help="256 x 256, 150 steps without the plane, one run each")
+    parser.add_argument("--device", default="cuda:0" if wp.is_cuda_available() else "cpu")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--plot", type=Path)
+    parser.add_argument("--cases", nargs="+", default=["pawn", "stool", "figurine", *REAL])
+    parser.add_argument("--size", type=int, help="pixels, both sides (400)")
+    parser.add_argument("--baseline-steps", type=int, help="of training without the plane (5000)")
+    parser.add_argument("--join", type=Path, help="JSON of an earlier run with other cases, judged together with this")
+    parser.add_argument("--repeat", type=int, help="timed runs (4, the first not counted)")
+    options = parser.parse_args()
+    options.size = options.size or (256 if options.quick else 400)
+    options.baseline_steps = options.baseline_steps or (150 if options.quick else 5000)
+    options.repeat = options.repeat or (1 if options.quick else 4)
+    rows: list[dict[str, Any]] = []
+    strips: list[np.ndarray] = []
+    missing = []
+    for name in options.cases:
+        make: Callable[[str, str], Case | None] = real if name in REAL else built_in
+        case = make(name, options.device)
+        if case is None:
+            missing.append(name)
+            continue
+        part, strip = judge_case(case, options)
+        rows += part
+        strips.append(strip)
+    if options.join:
+        rows += [row for row in json.loads(options.join.read_text())["rows"] if row["case"] != "size"]
+    rows += size_rows(options)
+    aims, why_null = judge(rows, on_gpu=options.device.startswith("cuda"))
+    if missing:
+        print(f"not on this machine: {', '.join(missing)}")
+    for method in (OURS, CV2, NO_PRIOR):
+        chosen = [row for row in rows if row["method"] == method and row["case"] != "size"]
+        print(
+            f"mean {method:20} {np.mean([r['psnr'] for r in chosen]):.2f} dB"
+            f"  SSIM {np.mean([r['ssim'] for r in chosen]):.3f}"
+        )
+    print(json.dumps({"aims": aims, "why_null": why_null}, indent=1))
+    result = {
+        "rows": rows,
+        "environment": {
+            "device": str(wp.get_device(options.device)),
+            "name": wp.get_device(options.device).name,
+            "python": platform.python_version(),
+            "warp": wp.config.version,
+            "opencv": cv2.__version__,
+            "threads": os.cpu_count(),
+            "seed": options.seed,
+            "size": options.size,
+            "baseline_steps": options.baseline_steps,
+            "missing": missing,
+        },
+        "aims": aims,
+        "why_null": why_null,
+    }
+    if options.json:
+        options.json.write_text(json.dumps(result, indent=1))
+    if options.plot:
+        write_png(options.plot, np.concatenate(strips, axis=0))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,92 @@
+"""``egs-warp inpaint``: new floor where the object stood."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from egs_warp.cli_input import check_device, parse_plane
+from egs_warp.errors import UserError
+
+
+def add_parser(commands) -> None:
+    """Add the command to the subparsers ``commands``."""
+    inpaint = commands.add_parser("inpaint", help="close the hole in the floor that an object leaves")
+    inpaint.add_argument("background", help="capture without the object, as segment writes it; any format")
+    inpaint.add_argument("--plane", required=True, help="plane.json, as plane writes it, or nx,ny,nz,d")
+    inpaint.add_argument("--object", help="capture of the object: the floor under its foot is the hole")
+    inpaint.add_argument("--mask", help="PNG of the object, or a folder of them: the floor that none of them sees")
+    inpaint.add_argument("--cameras", help="cameras of the masks: cameras.json, transforms.json, a COLMAP model")
+    inpaint.add_argument("--view", help="name or number of the camera of a single mask")
+    inpaint.add_argument("--hole", help="x,y,z,radius of a round hole, scene units")
+    inpaint.add_argument("--out", required=True, type=Path, help="filled capture to write, .ply")
+    inpaint.add_argument("--picture", type=Path, help="before, after and depth as PNG (--out with .png)")
+    inpaint.add_argument("--inpainter", default="patch", help="patch (default), telea, ns, or LaMa's TorchScript file")
+    inpaint.add_argument("--steps", type=int, help="of training against the inpainted picture (100); 0: no PyTorch")
+    inpaint.add_argument("--margin", type=float, help="by how much the hole is made larger, of its side (0.04)")
+    inpaint.add_argument("--seed", type=int, default=0, help="of the patch search (0)")
+    inpaint.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
+    inpaint.set_defaults(run=_inpaint)
+
+
+def _inpaint(chosen: argparse.Namespace) -> int:
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING
+    from egs_warp.inpainters import inpainter_by_name
+    from egs_warp.inpainting import InpaintOptions, inpaint
+    from egs_warp.inpainting_picture import before_and_after
+    from egs_warp.io import read_capture, write_ply
+    from egs_warp.render import write_png
+
+    given = {"steps": chosen.steps, "margin": chosen.margin, "seed": chosen.seed}
+    options = InpaintOptions(**{name: value for name, value in given.items() if value is not None})
+    if chosen.out.suffix.lower() != ".ply":
+        raise UserError(f"--out {chosen.out}: give the name of a .ply file")
+    if sum([chosen.object is not None, chosen.mask is not None, chosen.hole is not None]) != 1:
+        raise UserError("inpaint: say where the hole is by one of --object, --mask with --cameras, or --hole")
+    check_device(chosen.device)
+    inpainter = inpainter_by_name(chosen.inpainter, seed=chosen.seed, device=chosen.device)
+    plane = _plane(chosen.plane)
+    background = read_capture(chosen.background, device=chosen.device)
+    hole = _hole(chosen, plane, background.cloud)
+    result = inpaint(background.cloud, hole, inpainter=inpainter, options=options)
+    write_ply(chosen.out, result.cloud)
+    picture = chosen.picture or chosen.out.with_suffix(".png")
+    write_png(picture, before_and_after(result))
+    for note in (*background.notes, *result.notes):
+        print(f"note: {note}")
+    print(f"wrote {chosen.out} and {picture} in {sum(result.seconds.values()):.1f} s")
+    return 0
+
+
+def _plane(text: str) -> Any:
+    if not text.lower().endswith(".json"):
+        return parse_plane(text)
+    from egs_warp.plane_file import read_planes
+
+    return read_planes(text)[0]
+
+
+def _hole(chosen: argparse.Namespace, plane: Any, background: Any) -> Any:
+    from egs_warp.holes import disc, footprint, unseen
+    from egs_warp.io import read_cameras, read_capture
+    from egs_warp.object_input import read_object
+
+    if chosen.object is not None:
+        return footprint(read_capture(chosen.object, device=chosen.device).cloud, plane)
+    if chosen.hole is not None:
+        try:
+            x, y, z, radius = (float(part) for part in chosen.hole.split(","))
+        except ValueError as error:
+            raise UserError(f"--hole {chosen.hole}: give four numbers x,y,z,radius") from error
+        return disc(plane, np.array([x, y, z]), radius)
+    if not Path(chosen.mask).exists():
+        raise UserError(f"--mask {chosen.mask}: no such file or folder; give a PNG or a folder of them")
+    if chosen.cameras is None:
+        raise UserError("--mask: give the cameras that the masks were painted for by --cameras")
+    spec = read_object(chosen.mask, background, read_cameras(chosen.cameras), view=chosen.view)
+    return unseen(plane, spec.masks)
