@@ -81,7 +81,7 @@ class OsqpProgram:
         """See ``QuadraticProgram``."""
         free = self._A @ self._free_minimum
         if (free >= lower).all() and (free <= upper).all():
-            # As in flight; OSQP would print a line about having nothing to polish.
+            # As in flight: there is nothing to iterate on.
             return _solution(QpStatus.SOLVED, self._P, self._q, self._free_minimum, np.zeros(len(free)), len(free))
         if self._solver is None:
             self._solver = osqp.OSQP(algebra="builtin")
@@ -95,8 +95,8 @@ class OsqpProgram:
                 eps_abs=self._accuracy,
                 eps_rel=self._accuracy,
                 max_iter=4000,
-                scaling=0,
-                polishing=True,
+                scaling=4,
+                polishing=False,  # it fails on redundant rows and took half of the time
                 warm_starting=True,
                 adaptive_rho=True,
                 adaptive_rho_interval=50,
