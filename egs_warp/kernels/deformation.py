@@ -8,7 +8,8 @@ from egs_warp.precision import Mat33, Vec3, Vec4, real
 wp.set_module_options({"enable_backward": False})
 
 MAX_SWEEPS = wp.constant(8)
-ORTHOGONAL = wp.constant(wp.float32(3.0e-7))
+ORTHOGONAL = wp.constant(wp.float32(1.0e-6))
+REGULAR = wp.constant(wp.float32(1.0e-3))
 LEAST_SCALE = wp.constant(wp.float32(1.0e-12))
 
 
@@ -35,6 +36,11 @@ def quaternion_of(m: wp.mat33) -> wp.vec4:
     return wp.normalize(q)
 
 
+@wp.func
+def column(m: wp.mat33, k: wp.int32) -> wp.vec3:
+    return wp.vec3(m[0, k], m[1, k], m[2, k])
+
+
 @wp.struct
 class Columns:
     """A 3x3 matrix by columns, and the rotation that has been applied to it from the right."""
@@ -53,7 +59,7 @@ def rotation_between(a: wp.vec3, b: wp.vec3) -> wp.vec2:
     aa = wp.dot(a, a)
     bb = wp.dot(b, b)
     ab = wp.dot(a, b)
-    if wp.abs(ab) <= ORTHOGONAL * wp.sqrt(aa) * wp.sqrt(bb):
+    if ab * ab <= ORTHOGONAL * ORTHOGONAL * aa * bb:
         return wp.vec2(1.0, 0.0)
     cot = (bb - aa) / (2.0 * ab)
     tangent = wp.where(cot >= 0.0, 1.0, -1.0) / (wp.abs(cot) + wp.sqrt(1.0 + cot * cot))
@@ -164,11 +170,6 @@ def rotation_part(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.mat33:
 
 
 @wp.func
-def column(m: wp.mat33, k: wp.int32) -> wp.vec3:
-    return wp.vec3(m[0, k], m[1, k], m[2, k])
-
-
-@wp.func
 def matched_order(frame: wp.mat33, carried: wp.mat33) -> wp.vec3i:
     """Which column of ``frame`` belongs to each column of ``carried``: the permutation of greatest total alignment."""
     d = wp.transpose(carried) * frame
@@ -194,6 +195,40 @@ def matched_order(frame: wp.mat33, carried: wp.mat33) -> wp.vec3i:
     if total > most:
         best = wp.vec3i(2, 0, 1)
     return best
+
+
+@wp.func
+def rotation_of(m: wp.mat33) -> wp.mat33:
+    """``rotation_part`` of a matrix with det > 0, by Newton's iteration X <- (g X + X^-T / g) / 2 (Higham 1986) where that is safe:
+    half the work."""
+    a = column(m, 0)
+    b = column(m, 1)
+    c = column(m, 2)
+    size = wp.dot(a, a) + wp.dot(b, b) + wp.dot(c, c)
+    if wp.dot(wp.cross(a, b), c) < REGULAR * size * wp.sqrt(size):
+        return rotation_part(a, b, c)
+    step = wp.int32(0)
+    while step < MAX_SWEEPS:
+        ca = wp.cross(b, c)
+        cb = wp.cross(c, a)
+        cc = wp.cross(a, b)
+        det = wp.dot(a, ca)
+        size = wp.dot(a, a) + wp.dot(b, b) + wp.dot(c, c)
+        scale = wp.sqrt(wp.sqrt((wp.dot(ca, ca) + wp.dot(cb, cb) + wp.dot(cc, cc)) / size) / det)
+        straight = 0.5 * scale
+        turned = 0.5 / (scale * det)
+        na = straight * a + turned * ca
+        nb = straight * b + turned * cb
+        nc = straight * c + turned * cc
+        moved = wp.length_sq(na - a) + wp.length_sq(nb - b) + wp.length_sq(nc - c)
+        a = na
+        b = nb
+        c = nc
+        step += 1
+        # The error squares itself with every step: the next one would move by 1e-8.
+        if moved < 1.0e-8:
+            step = MAX_SWEEPS
+    return wp.matrix_from_cols(a, b, c)
 
 
 @wp.func
@@ -607,7 +642,7 @@ def carried_gaussian(
         result.turn = load_row(carried, TET_ROWS * wp.where(code < 0, -1 - code, code) + 4)
         turned = turn_of(result.turn) * axes
     else:
-        turned = rotation_part(column(stretched, 0), column(stretched, 1), column(stretched, 2))
+        turned = rotation_of(stretched)
         result.turn = quaternion_of(turned * wp.transpose(axes))
     shape = carried_shape(stretched, scales, turned)
     result.rotation = shape.rotation
