@@ -12,6 +12,11 @@ from egs_warp.locomotion import StepReport
 from egs_warp.objectives import Objective, SpinObjective
 from egs_warp.stance import Ground, Measurement, PoseFamily, Weights
 
+RISE = 0.92
+"""A thrust ends when the centre of mass would reach this share of the asked height in free flight: one step more is too much."""
+FULL_RISE = 0.99
+"""What a thrust aims at, clear of ``RISE``, so that a speed that is nearly followed ends it."""
+
 
 class JumpPhase(Enum):
     """Phases of a jump in their order."""
@@ -181,7 +186,7 @@ class Jump:
             JumpPhase.SETTLE: elapsed >= 0.3 * self._time_unit,
             JumpPhase.CROUCH: elapsed >= plan.crouch_time,
             JumpPhase.THRUST: self._risen(seen, dt),
-            JumpPhase.FLIGHT: self._flew and seen.touching,
+            JumpPhase.FLIGHT: self._flew and seen.touching and seen.velocity[2] < 0.0,
             JumpPhase.LAND: elapsed >= 5.0 * self._time_unit,
             JumpPhase.REST: False,
         }
@@ -197,7 +202,7 @@ class Jump:
 
     def _sufficient_speed(self, seen: Measurement, dt: float) -> float:
         """Speed up, m/s, at the end of this step from which free flight reaches the asked height."""
-        rise = self._start_com[2] + 0.95 * self.target.height - seen.com[2]
+        rise = self._start_com[2] + FULL_RISE * self.target.height - seen.com[2]
         step_gain = self.gravity * dt  # v dt + (v - g dt/2)^2 / 2g = rise, solved for v
         return float(max(-0.5 * step_gain + np.sqrt(max(2.0 * self.gravity * rise, 0.0)), 0.0))
 
@@ -205,7 +210,7 @@ class Jump:
         """Whether the centre of mass, in free flight from here, would reach the asked height."""
         speed = max(seen.velocity[2] - 0.5 * self.gravity * dt, 0.0)
         apex = seen.com[2] + speed**2 / (2.0 * self.gravity)
-        return bool(apex >= self._start_com[2] + 0.88 * self.target.height)
+        return bool(apex >= self._start_com[2] + RISE * self.target.height)
 
     def _stance_reference(self, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
         """Position and velocity (3,) of the centre of mass, ground coordinates, ``elapsed`` seconds into the phase."""
@@ -239,9 +244,11 @@ class Jump:
         return np.array([ahead, position[1], self._start_com[2]])
 
     def _fly(self, state: BodyState, seen: Measurement, dt: float) -> list[Objective | SpinObjective]:
-        touch_down, left, velocity = self._falling(seen, dt)
+        touch_down, _, velocity = self._falling(seen, dt)
         pose = self.pose.over_base(touch_down, self._goal_base)
-        spin = self.pose.turn_towards(state, pose) / left
+        # Nothing turns a body in the air; a foot that lags on the ground must not push for the sake of it.
+        momentum = self.body.angular_momentum(state.positions, state.velocities)
+        spin = np.linalg.solve(self.body.inertia(state.positions), momentum)
         return self._write(state, velocity, pose, spin, dt)
 
     def _falling(self, seen: Measurement, dt: float) -> tuple[np.ndarray, float, np.ndarray]:

@@ -1,0 +1,259 @@
+"""Robustness: bodies x motions x friction x sag x solver step, each run judged by its targets and by every bound of the audit.
+
+python benchmarks/sweep.py [--quick] [--workers 2] [--json PATH] [--plot PATH]
+
+A run succeeds if the motion reaches what was asked (distance and height within 15 %, a twist's heading within 10 degrees and
+its drift within 0.1 body heights, a walk's distance within 10 %), the body ends upright (tilt under 10 degrees) and the audit
+holds. Each failure has its reason. Captures take part where they are found (``EGS_WARP_DATA``, else ../shared/data).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import time
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from itertools import product
+from pathlib import Path
+
+FRICTIONS = (0.3, 0.6, 1.0)
+SAGS = (0.01, 0.03, 0.08)
+STEPS = (1 / 30, 1 / 60, 1 / 120)
+CAPTURES = {"robot": ("robot.spz", (0.0, 1.0, 0.0)), "monkey": ("monkey.ply", (0.0, 1.0, 0.0))}
+BOUNDS = {
+    "momentum_residual": 1e-5,
+    "angular_momentum_residual": 1e-4,
+    "cone_violation": 1e-4,
+    "complementarity_gap": 1e-4,
+    "penetration": 0.01,
+    "inverted_elements": 0,
+    "newton_unconverged": 0,
+}
+"""Largest values that the audit of a success may have."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run."""
+
+    body: str
+    motion: str
+    friction: float
+    sag: float
+    step: float
+    """Seconds."""
+
+
+def data_folder() -> Path:
+    """Where the captures are looked for."""
+    return Path(os.environ.get("EGS_WARP_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "objects"
+
+
+def cases(quick: bool) -> list[Case]:
+    """All runs; ``quick`` gives three."""
+    if quick:
+        return [Case("pawn", "jump", friction, 0.05, 1 / 60) for friction in FRICTIONS]
+    captures = [name for name, (file, _) in CAPTURES.items() if (data_folder() / file).exists()]
+    bodies = ["pawn", "figurine", "stool", *captures]
+    runs = [Case(body, "jump", *rest) for body in bodies[:2] for rest in product(FRICTIONS, SAGS, STEPS)]
+    runs += [
+        Case(body, "jump", friction, sag, 1 / 60) for body in bodies[2:] for friction, sag in product(FRICTIONS, SAGS)
+    ]
+    runs += [
+        Case(body, "twist 180", f, sag, 1 / 60) for body in ("pawn", "figurine") for f, sag in product(FRICTIONS, SAGS)
+    ]
+    runs += [Case("stool", "walk", friction, sag, 1 / 60) for friction in FRICTIONS[1:] for sag in (0.03, 0.05)]
+    return runs
+
+
+def run(case: Case) -> dict:
+    """Simulate one case and judge it."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    import numpy as np
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING
+    from egs_warp.animation import first_place, make_creature
+    from egs_warp.errors import UserError
+    from egs_warp.io import read_capture
+    from egs_warp.repertoire import longest, parts_of
+    from egs_warp.scenes import figurine, pawn, stool
+    from egs_warp.script import parse_script
+    from egs_warp.sequence import MotionSequence
+    from egs_warp.simulation import simulate
+    from egs_warp.trajectory import audit, measure
+
+    started = time.perf_counter()
+    if case.body in CAPTURES:
+        file, up = CAPTURES[case.body]
+        subject = {"cloud": read_capture(data_folder() / file).cloud, "up": np.array(up)}
+    else:
+        built_in = {"pawn": pawn, "figurine": figurine, "stool": stool}[case.body]()
+        subject = {"cloud": built_in.cloud, "plane": built_in.plane}
+    try:
+        creature = make_creature(**subject, friction=case.friction, sag=case.sag)
+        requests = parse_script(case.motion, defaults={})
+        place = first_place(creature, step=case.step)
+        sequence = MotionSequence(place, parts_of(requests, creature.body.height))
+        simulation = simulate(
+            creature.stepper,
+            creature.geometry,
+            creature.start,
+            sequence,
+            frames=round(longest(requests) * min(1.0, 1 / (60 * case.step))),
+            step=case.step,
+            finished=lambda: sequence.finished,
+        )
+    except (UserError, ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
+        seconds = time.perf_counter() - started
+        return {**asdict(case), "success": False, "reason": f"stopped: {error}", "seconds": seconds}
+    checked = asdict(audit(simulation.trajectory, newton_unconverged=sum(not r.converged for r in simulation.reports)))
+    reached = asdict(measure(simulation.trajectory))
+    asked = {"distance": 0.0, "height": 0.2, **sequence.done[0].asked}
+    reason = judge(requests[0].name, asked, reached, checked)
+    if reason and friction_spent(simulation.trajectory) > 0.5:
+        reason += "; friction was spent for over half of the time on the ground"
+    return {
+        **asdict(case),
+        "success": reason is None,
+        "reason": reason,
+        "asked": asked,
+        "reached": {name: float(value) for name, value in reached.items()},
+        "audit": {name: float(value) for name, value in checked.items()},
+        "young_modulus": float(creature.body.young_modulus),
+        "notes": [note for done in sequence.done for note in done.motion.notes()],
+        "seconds": time.perf_counter() - started,
+    }
+
+
+def judge(motion: str, asked: dict[str, float], reached: dict[str, float], checked: dict[str, float]) -> str | None:
+    """Why a run failed; None for a success."""
+    for name, bound in BOUNDS.items():
+        if not checked[name] <= bound:
+            return f"audit: {name} {checked[name]:.2g}"
+    if reached["tilt_degrees"] >= 10.0:
+        return f"fell or leans: tilt {reached['tilt_degrees']:.0f} degrees"
+    if motion == "walk":
+        wrong = abs(reached["distance"] - asked["distance"]) > 0.1 * asked["distance"]
+        return f"walked {reached['distance']:.3f}, asked {asked['distance']:.3f}" if wrong else None
+    if reached["airborne_frames"] < 8:
+        return f"hardly left the ground: {reached['airborne_frames']:.0f} frames"
+    if abs(reached["height"] - asked["height"]) > 0.15 * asked["height"]:
+        return f"rose {reached['height']:.3f}, asked {asked['height']:.3f}"
+    if motion == "twist":
+        short = abs((reached["heading_degrees"] - asked["heading_degrees"] + 180.0) % 360.0 - 180.0)
+        if short > 10.0:
+            return f"turned {short:.0f} degrees too little or too much"
+        return f"drifted {reached['distance']:.3f}" if reached["distance"] > 0.1 else None
+    if abs(reached["distance"] - asked["distance"]) > 0.15 * asked["distance"]:
+        return f"went {reached['distance']:.3f}, asked {asked['distance']:.3f}"
+    return None
+
+
+def friction_spent(trajectory) -> float:
+    """Share of the steps with contact in which the whole friction force is within 1 % of its limit."""
+    import numpy as np
+
+    normal = np.einsum("ci,ci->c", trajectory.contact_force, trajectory.contact_normal)
+    tangential = np.linalg.norm(trajectory.contact_force - normal[:, None] * trajectory.contact_normal, axis=1)
+    steps = len(trajectory.time) - 1
+    used = np.bincount(trajectory.contact_step, tangential, steps)
+    limit = np.bincount(trajectory.contact_step, trajectory.friction * normal, steps)
+    pressed = limit > 1e-6 * limit.max(initial=0.0)
+    return float(np.mean(used[pressed] > 0.99 * limit[pressed])) if pressed.any() else 0.0
+
+
+def main() -> None:
+    """Run the sweep."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="three runs")
+    parser.add_argument("--workers", type=int, default=os.cpu_count())
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--plot", type=Path)
+    arguments = parser.parse_args()
+    runs, rows = cases(arguments.quick), []
+    # Kernels compile once, here, not in every worker.
+    run(Case("pawn", "jump", 0.6, 0.05, 1.0))
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(arguments.workers, mp_context=context) as pool:
+        for future in as_completed([pool.submit(run, case) for case in runs]):
+            rows.append(future.result())
+            row = rows[-1]
+            what = f"{row['body']} {row['motion']} mu {row['friction']} sag {row['sag']} step 1/{1 / row['step']:.0f}"
+            print(
+                f"{len(rows):>4}/{len(runs)} {what}: {row['reason'] or 'success'} ({row['seconds']:.0f} s)", flush=True
+            )
+            result = summary(rows)
+            if arguments.json:
+                arguments.json.write_text(json.dumps(result, indent=2) + "\n")
+    print(table(result))
+    if arguments.plot:
+        plot(rows, arguments.plot)
+
+
+def summary(rows: list[dict]) -> dict:
+    """Rates of success by every factor, worst audits of the successes, and the aims."""
+    good = [row for row in rows if row["success"]]
+    rates = {
+        factor: {
+            str(value): [sum(row["success"] for row in rows if row[factor] == value), count]
+            for value, count in sorted(Counter(row[factor] for row in rows).items())
+        }
+        for factor in ("body", "motion", "friction", "sag", "step")
+    }
+    rate = len(good) / len(rows)
+    enough = len(rows) >= 100
+    return {
+        "rows": rows,
+        "success_rate": rate,
+        "successes_of_runs": rates,
+        "worst_audit_of_successes": {name: max((row["audit"][name] for row in good), default=None) for name in BOUNDS},
+        "failures": [
+            {key: row[key] for key in (*Case.__dataclass_fields__, "reason")} for row in rows if not row["success"]
+        ],
+        "aims": {
+            "ninety_percent_succeed": rate >= 0.9 if enough else None,
+            "every_success_meets_the_audit": bool(good),
+        },
+        "why_null": {} if enough else {"ninety_percent_succeed": f"{len(rows)} runs, not 100"},
+    }
+
+
+def table(result: dict) -> str:
+    """As text."""
+    lines = [f"{result['success_rate']:.0%} of {len(result['rows'])} runs succeed"]
+    for factor, values in result["successes_of_runs"].items():
+        lines.append(
+            f"  {factor:<9}" + "  ".join(f"{value}: {good}/{count}" for value, (good, count) in values.items())
+        )
+    lines.append("worst audit of a success:")
+    lines += [
+        f"  {name:<28}{value:.2g}" for name, value in result["worst_audit_of_successes"].items() if value is not None
+    ]
+    return "\n".join(lines)
+
+
+def plot(rows: list[dict], path: Path) -> None:
+    """Tilt against distance, successes and failures."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7, 4))
+    for success, colour in ((True, "tab:green"), (False, "tab:red")):
+        chosen = [row for row in rows if row["success"] is success and "reached" in row]
+        x, y = ([row["reached"][name] for row in chosen] for name in ("distance", "tilt_degrees"))
+        axes.scatter(x, y, s=14, color=colour, label=f"{'success' if success else 'failure'} ({len(chosen)})")
+    axes.set(xlabel="distance reached / H", ylabel="tilt at the end, degrees", title=f"{len(rows)} runs")
+    axes.legend()
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+
+
+if __name__ == "__main__":
+    main()
