@@ -10,8 +10,8 @@ import numpy as np
 from egs_warp.feet import Foot, foot_of_node
 from egs_warp.trajectory import Trajectory
 
-_STANDS = 0.01
-"""Share of the weight above which a foot stands."""
+_STANDS = 0.05
+"""Share of the weight above which a foot supports the body; below it, it is being set down or lifted."""
 
 
 @dataclass(frozen=True)

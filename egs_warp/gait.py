@@ -62,7 +62,7 @@ class Gait:
 
     def lifted(self, progress: float) -> float:
         """Metres a foot is above the ground when ``progress`` (0 to 1) of its swing is over; it leaves and lands at rest."""
-        return self.lift * float(_smooth(progress / 0.3) * (1.0 - _smooth((progress - 0.65) / 0.35)))
+        return self.lift * float(_smooth(progress / 0.2) * (1.0 - _smooth((progress - 0.65) / 0.35)))
 
     @staticmethod
     def carried(progress: float) -> float:
