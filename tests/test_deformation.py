@@ -146,6 +146,11 @@ def test_no_spike_and_no_nan_whatever_the_cage_does(seed: int, noise: float, fla
     grown = np.exp(result.cloud.log_scales.numpy().max(axis=1) - cloud.log_scales.numpy().max(axis=1))
     # Columns are held to 1.5 times the stretch; three of them can conspire to sqrt(3) times that.
     assert (grown <= 1.5 * np.sqrt(3.0) * around + 1e-3).all()
+    weights = embedding.points.weights.numpy().reshape(count, 7, 4)[:, 0]
+    far = (weights.min(axis=1) < -1.0) | (weights.max(axis=1) > 2.0)
+    if reach == 30.0:
+        assert far.mean() > 0.9
+    np.testing.assert_allclose(result.cloud.log_scales.numpy()[far], cloud.log_scales.numpy()[far], atol=1e-3)
 
 
 def test_the_mean_goes_where_the_mass_goes(device: str) -> None:
@@ -196,3 +201,37 @@ def test_a_wrong_number_of_nodes_is_refused() -> None:
     mesh, cloud = box(), random_cloud(5)
     with pytest.raises(UserError, match=r"^deformation: 7 node positions for a cage of 64 nodes$"):
         deform(cloud, embed_gaussians(cloud, mesh), np.zeros((7, 3)))
+
+
+def test_far_outside_nothing_bends_or_stretches(device: str) -> None:
+    """Eq. (14), (16): a Gaussian that floats far from the cage goes with the nearest tetrahedron as a rigid body."""
+    mesh = box()
+    cloud = random_cloud(50, degree=0, device=device)
+    far = GaussianCloud.from_numpy(
+        cloud.means.numpy() + [8.0, 0.0, 0.0],
+        cloud.rotations.numpy(),
+        cloud.log_scales.numpy(),
+        cloud.opacity_logits.numpy(),
+        cloud.sh.numpy(),
+        device=device,
+    )
+    positions = mesh.nodes * [1.0, 3.0, 0.2] + 0.05 * np.random.default_rng(0).normal(size=mesh.nodes.shape)
+    deformer = Deformer(far, embed_gaussians(far, mesh))
+    result = deformer.deform(positions).cloud
+    np.testing.assert_allclose(np.exp(result.log_scales.numpy() - far.log_scales.numpy()), 1.0, atol=1e-4)
+    assert np.linalg.norm(result.means.numpy() - far.means.numpy(), axis=1).max() < 12.0
+    assert deformer.measure_bend([positions]).fit_error.max() == 0.0
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("count", [1, 31, 1000])
+def test_one_pass_on_cuda_equals_two_on_the_cpu(count: int) -> None:
+    """Eq. (14), (15): shape and degree 3 colour in one kernel, for counts that leave the last warp part empty."""
+    mesh, cloud = box((6, 6, 6)), random_cloud(count)
+    positions = bent(mesh.nodes, 1.0)
+    expected = deform(cloud, embed_gaussians(cloud, mesh), positions)
+    there = random_cloud(count, device="cuda:0")
+    result = deform(there, embed_gaussians(there, mesh), positions)
+    np.testing.assert_allclose(result.cloud.means.numpy(), expected.cloud.means.numpy(), atol=2e-6)
+    np.testing.assert_allclose(covariances(result.cloud), covariances(expected.cloud), atol=1e-6)
+    np.testing.assert_allclose(result.cloud.sh.numpy(), expected.cloud.sh.numpy(), atol=1e-4)

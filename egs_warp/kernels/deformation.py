@@ -386,6 +386,9 @@ def image(map: Affine, point: wp.vec3) -> wp.vec3:
 BRIDGES = wp.constant(wp.float32(2.0))
 """Share that marks an arm whose end has nothing to do with the tetrahedron of the mean: look where the end has gone."""
 
+RIGID = wp.constant(wp.float32(3.0))
+"""Share of the first arm that marks a Gaussian far outside the cage, which is not stretched but only turned and moved."""
+
 
 @wp.kernel
 def plan_arms_kernel(
@@ -446,7 +449,11 @@ def plan_arms_kernel(
                 share = BRIDGES
         end_tets_out[k, row] = tet
         shares_out[k, row] = share
-    # One's complement marks a Gaussian that reaches into more than one tetrahedron.
+    w = weights[7 * row]
+    if wp.min(w) < real(-1.0) or wp.max(w) > real(2.0):
+        straddles = wp.bool(True)
+        shares_out[0, row] = RIGID
+    # One's complement marks a Gaussian that is not simply carried by one tetrahedron.
     mean_tets_out[row] = wp.where(straddles, -1 - mean_tet, mean_tet)
 
 
@@ -513,13 +520,17 @@ def carried_arms(
     code = mean_tets[gaussian]
     tet = wp.where(code < 0, -1 - code, code)
     around = affine_of(carried, tet)
+    straddles = code < 0
+    if straddles and shares[0, gaussian] == RIGID:
+        around.gradient = turn_of(load_row(carried, TET_ROWS * tet + 4))
+        straddles = wp.bool(False)
     result = CarriedArms()
     result.mean = image(around, mean)
     result.through = around.gradient * axes
     result.plus = result.through
     result.minus = result.through
     # Most Gaussians are small and lie in one tetrahedron, whose gradient is then the answer.
-    if code < 0:
+    if straddles:
         r0 = column(axes, 0)
         r1 = column(axes, 1)
         r2 = column(axes, 2)
@@ -625,9 +636,10 @@ def carried_gaussian(
     result.mean = both.mean
     stretched = both.through
     code = mean_tets[row]
-    # Alone in one tetrahedron, or where F is turned inside out: the rotation of that tetrahedron, found once for all.
+    # Alone in one tetrahedron, far outside, or where F is turned inside out: the rotation of that tetrahedron, found once
+    # for all.
     own = wp.bool(True)
-    if code < 0:
+    if code < 0 and shares[0, row] < RIGID:
         bulge = wp.vec3(0.0)
         for k in range(3):
             reach = wp.max(arms[row, k] + arms[row, 3 + k], 3.0 * scales[k])
@@ -732,6 +744,8 @@ def measure_bend_kernel(
     the displacement that F leaves out at one standard deviation along both axes.
     """
     row = first_row + wp.tid()
+    if mean_tets[row] < 0 and shares[0, row] == RIGID:
+        return
     scales = exponential(log_scales[row])
     axes = turn_of(rotations[row])
     both = carried_arms(row, means[row], axes, max_stretch, carried, mean_tets, end_tets, shares, arms)
