@@ -17,6 +17,9 @@ from egs_warp.render.rasteriser import render
 _TRIALS = 1500
 _SAMPLE = 4000
 _MIN_OPACITY = 0.3
+_BAND = 0.03
+"""Of the radius looked at: what lies nearer to the plane is taken for part of it. With 0.06 the single views of a real
+table disagreed by 0.8 degree, with 0.03 by 0.3."""
 
 
 @dataclass(frozen=True)
@@ -136,15 +139,12 @@ def refine_plane(
     centre: np.ndarray,
     radius: float,
     object_mask: np.ndarray | None = None,
-    band: float | None = None,
 ) -> PlaneFit:
     """``plane`` fitted anew to the depth of ``cloud`` rendered by ``cameras``, Eq. (18), (19).
 
-    The masks are the pixels whose rendered point lies within ``band`` (default 6 % of ``radius``) of the plane and
-    within ``radius`` of ``centre`` (3,) along it, less those of ``object_mask`` (n,) bool Gaussians. Cameras below the
-    plane, and those that see nothing of it, do not count.
+    The masks are those of ``plane_views``. Raises ``UserError`` where no camera sees the plane.
     """
-    views = plane_views(cloud, plane, cameras, centre=centre, radius=radius, object_mask=object_mask, band=band)
+    views = plane_views(cloud, plane, cameras, centre=centre, radius=radius, object_mask=object_mask)
     if not views:
         raise UserError(
             "plane: none in sight: no camera sees it around the object; give other cameras, or leave them out"
@@ -163,8 +163,13 @@ def plane_views(
     band: float | None = None,
     max_views: int = 8,
 ) -> list[PlaneView]:
-    """Pictures of the surroundings of ``centre`` in which the plane is masked; see ``refine_plane``."""
-    band = band or 0.06 * radius
+    """Pictures of the surroundings of ``centre`` (3,) in which the plane is masked.
+
+    The masks are the pixels whose rendered point lies within ``band`` (default 3 % of ``radius``) of the plane and
+    within ``radius`` of ``centre`` along it, less those of ``object_mask`` (n,) bool Gaussians. Cameras below the plane,
+    and those that see nothing of it, do not count; of more than ``max_views``, some are picked evenly.
+    """
+    band = band or _BAND * radius
     above = [camera for camera in cameras if plane.heights(camera.centre) > 0.1 * radius]
     chosen = above[:: max(1, -(-len(above) // max_views))]
     # The object is left out of the picture only where it is known: its foot would bend the plane up.
@@ -173,12 +178,10 @@ def plane_views(
     for camera in chosen:
         image = render(bare, camera)
         depth = image.depth.numpy().astype(np.float64)
-        solid = image.alpha.numpy() > 0.9
         points = camera.centre + depth[..., None] * camera_rays(camera)
-        height = plane.heights(points)
         across = points - centre
         across = np.linalg.norm(across - (across @ plane.normal)[..., None] * plane.normal, axis=-1)
-        mask = solid & (np.abs(height) < band) & (across < radius)
+        mask = (image.alpha.numpy() > 0.9) & (np.abs(plane.heights(points)) < band) & (across < radius)
         if mask.sum() >= 50:
             views.append(PlaneView(camera, depth, mask))
     return views

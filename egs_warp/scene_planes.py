@@ -22,6 +22,9 @@ from egs_warp.render.video import write_png
 from egs_warp.scene_input import SceneInput
 from egs_warp.scene_pipeline import locate_plane
 
+_MIN_SUPPORT = 0.02
+"""Of the visible surface: less is no plane but an accident."""
+
 
 @dataclass(frozen=True)
 class ScenePlanes:
@@ -71,7 +74,8 @@ def planes_of_scene(given: SceneInput, *, plane_mask: str | None, view: str | No
         size = 2.0 * float(np.median(np.linalg.norm(points - centre, axis=1)))
         notes = ()
         facts = {"noise": fit.noise, "inlier_share": fit.inlier_share, "pixels": fit.pixel_count}
-    others = [one for one in find_planes(given.cloud, plane.normal, count=count + 1) if _differ(one.plane, plane, size)]
+    level = find_planes(given.cloud, plane.normal, count=count + 3, tilt_degrees=5.0) if count > 1 else []
+    others = [one for one in level if one.support > _MIN_SUPPORT and _differ(one.plane, plane, size)]
     planes = [plane, *(one.plane for one in others[: count - 1])]
     return ScenePlanes(planes, [facts, *({"support": one.support} for one in others[: count - 1])], centre, size, notes)
 
