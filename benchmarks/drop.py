@@ -22,6 +22,9 @@ from egs_warp.tetmesh import TetMesh
 TIME_STEP = 1.0 / 120.0
 """Seconds."""
 
+NEAREST = 12
+"""Nodes that a place between them looks at."""
+
 
 @dataclass(frozen=True)
 class Drop:
@@ -41,7 +44,7 @@ class Drop:
         Between the nodes, and around them where a coarse cage does not reach, the motion is the affine one that fits the nearest nodes
         best, their weights falling smoothly to nothing (moving least squares).
         """
-        count = min(24, len(self.rest))
+        count = min(NEAREST, len(self.rest))
         distance, near = cKDTree(self.rest).query(points, k=count)
         weights = (1.0 - distance / (1.001 * distance[:, -1:])) ** 2
         weights /= weights.sum(axis=1, keepdims=True)
