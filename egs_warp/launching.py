@@ -59,9 +59,16 @@ def launch_rows(
     chunks = iter(list(pairwise(edges)))
 
     def launch_chunks() -> None:
-        # Whoever is free takes the next chunk.
+        launch: Any = None
+        # Whoever is free takes the next chunk, and packs the arguments only once.
         for first, last in chunks:
-            wp.launch(kernel, dim=last - first, inputs=[first, *inputs], outputs=list(outputs), device=device)
+            if launch is None:
+                arguments = {"inputs": [first, *inputs], "outputs": list(outputs), "device": device}
+                launch = wp.launch(kernel, dim=last - first, record_cmd=True, **arguments)
+            else:
+                launch.set_dim(last - first)
+                launch.set_param_at_index_from_ctype(0, first)
+            launch.launch()
 
     helpers = [_pool().submit(launch_chunks) for _ in range(min(threads, len(edges) - 1) - 1)]
     try:
@@ -115,19 +122,18 @@ def launch_again(kernel: Any, dim: int, *, inputs: Sequence[Any], outputs: Seque
 
 def _chunk_edges(row_count: int, threads: int, work: np.ndarray | None) -> list[int]:
     """Where chunks begin and end, whose effort shrinks towards the last: all threads then finish at about the same time."""
-    if work is None:
-        least = _MIN_ROWS_PER_CHUNK / max(row_count, 1)
-        done = np.arange(row_count + 1, dtype=np.float64)
-    else:
-        least = 0.0
-        done = np.concatenate([[0.0], np.cumsum(np.asarray(work, dtype=np.float64) + 1e-3)])
+    least = 0.0 if work is not None else _MIN_ROWS_PER_CHUNK / max(row_count, 1)
     least = max(least, 1.0 / (_LAST_CHUNKS_PER_THREAD * threads))
     shares, taken = [], 0.0
     while threads > 1 and taken + least < 1.0:
         taken += max((1.0 - taken) / (2 * threads), least)
         shares.append(taken)
-    inner = np.searchsorted(done, np.array(shares) * done[-1])
-    return np.unique(np.concatenate([[0], inner, [row_count]])).astype(int).tolist()
+    if work is None:
+        inner = np.array(shares) * row_count
+    else:
+        done = np.concatenate([[0.0], np.cumsum(np.asarray(work, dtype=np.float64) + 1e-3)])
+        inner = np.searchsorted(done, np.array(shares) * done[-1])
+    return np.unique(np.concatenate([[0], inner, [row_count]]).astype(int)).tolist()
 
 
 @cache
