@@ -26,6 +26,8 @@ from egs_warp.sequence import Place
 from egs_warp.trajectory import Trajectory
 
 FORWARD = np.array([1.0, 0.0])
+REACH = 0.5
+"""Longest step over the shortest leg's length."""
 LOADED = 0.01
 """Share of the weight that a foot must carry to count as landed."""
 
@@ -67,7 +69,7 @@ class Walk:
     """Shifts its weight, swings and stands until the last swing has closed the feet, and gathers itself."""
 
     def __init__(self, place: Place, steps: int, step_length: float, *, control: WalkControl | None = None) -> None:
-        """``step_length`` in metres. Raises ``UserError`` unless the body has four separate feet.
+        """``step_length`` in metres, shortened to what the legs reach. Raises ``UserError`` unless the body has four separate feet.
 
         It walks along the side of its feet that is nearest to the forward of ``place``.
         """
@@ -86,7 +88,9 @@ class Walk:
         """Metres that the ground rises for each metre forward and to the left."""
         self.pairs = (order[0], order[2]), (order[1], order[3])
         self.gravity = float(np.linalg.norm(body.gravity))
-        self.gait = Gait.of(steps, step_length, height=body.height, gravity=self.gravity)
+        self._asked_length = step_length
+        reachable = min(step_length, REACH * min(foot.length for foot in feet))
+        self.gait = Gait.of(steps, reachable, height=body.height, gravity=self.gravity)
         self._time_unit = float(np.sqrt(body.height / self.gravity))
         self._standing = self.ground.local(place.standing)
         self._soles = np.array([self._standing[foot.sole].mean(axis=0) for foot in feet])
@@ -119,7 +123,13 @@ class Walk:
 
     def notes(self) -> list[str]:
         """What kept the walk from its target, for the user."""
-        return [f"{self._late} swings took too long: a foot found no ground"] if self._late else []
+        found = []
+        if self.gait.step_length < self._asked_length:
+            asked, reached = self._asked_length / self.body.height, self.gait.step_length / self.body.height
+            found.append(f"steps of {asked:.2f} body heights were asked; the legs are long enough for {reached:.2f}")
+        if self._late:
+            found.append(f"{self._late} swings took too long: a foot found no ground")
+        return found
 
     def footfalls(self, trajectory: Trajectory, first: int, last: int) -> Footfalls:
         """What the feet did between two states of a trajectory."""

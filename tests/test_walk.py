@@ -53,7 +53,10 @@ def test_a_walk_goes_along_its_feet_and_refuses_other_bodies() -> None:
         centres = [place.standing[walk.feet[index].sole].mean(axis=0) for index in pair]
         assert np.allclose(centres[0][:2], -centres[1][:2], atol=1e-9)
     planned = walk.planned()
-    assert planned["steps"] == 3.0 and planned["stride"] == pytest.approx(0.16)
+    assert planned["steps"] == 3.0 and planned["stride"] == pytest.approx(0.16) and walk.notes() == []
+    strides_out = Walk(place, 3, 0.8)
+    assert strides_out.gait.step_length == pytest.approx(0.5 * min(foot.length for foot in strides_out.feet))
+    assert strides_out.notes()[0].startswith("steps of 1.00 body heights were asked; the legs are long enough for 0.3")
     _, place, _ = standing(figure(), forward=np.array([1.0, 0.0, 0.0]), settled=False)
     with pytest.raises(UserError, match="walk: the body has 2 separate feet; a walk needs four"):
         Walk(place, 4, 0.1)
