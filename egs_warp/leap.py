@@ -21,7 +21,9 @@ FOOTHOLD = 0.4
 """Of the footprint: how far from the capture point the feet may be put down for the sake of the target."""
 CLEARANCE = 0.15
 """Of the height of a step: how far above it the feet are before they swing ahead."""
-AIRBORNE_POSE = 0.1
+THRUST_LEAD = 0.7
+"""Part of the time of a thrust in which the speed forward is to be reached."""
+AIRBORNE_POSE = 0.4
 """Weight of the pose in the air, where nothing else can be steered and the feet have to get to their place."""
 CALM = 0.03
 """Speed of the centre of mass, in sqrt(g H), below which a body that has landed is at rest."""
@@ -86,7 +88,8 @@ class Leap(Jump):
         left = max((plan.speed_up - seen.velocity[2]) / plan.speed_up * plan.thrust_time, dt)
         goal = np.array([self._landing_com(position)[0], self._start_com[1]])
         needed = (goal - seen.com[:2] - 0.5 * left * seen.velocity[:2]) / (plan.flight_time + 0.5 * left)
-        change = (needed - seen.velocity[:2]) * dt / left
+        # What the ground gives lags behind what is asked: the speed forward is asked for ahead of the speed up.
+        change = (needed - seen.velocity[:2]) * dt / max(THRUST_LEAD * left, dt)
         return self._balanced(seen, np.array([*(seen.velocity[:2] + change), velocity[2]]), dt)
 
     def _falling(self, seen: Measurement, dt: float) -> tuple[np.ndarray, float, np.ndarray]:
