@@ -72,20 +72,23 @@ def train(
     device: str | None = None,
     threads: int | None = None,
     progress: Callable[[int, float], None] | None = None,
+    stage: Callable[[str], None] | None = None,
 ) -> TrainResult:
     """Make a capture from the photos that ``posed`` (COLMAP, ``transforms.json`` or ``cameras.json``) points to.
 
     Photos larger than ``max_side`` pixels are reduced. Every eighth photo is held out and judged on. Photos with alpha
     or masks (``read_views``) are trained before a random colour each step, so that nothing can pass for the backdrop.
     They are judged before ``background``; without one, it is white for those and the mean colour along the photos'
-    borders for others, so that no Gaussians are spent on a plain backdrop. Raises ``UserError`` for missing photos and
-    impossible options.
+    borders for others, so that no Gaussians are spent on a plain backdrop. ``progress`` is called with each step's
+    number and loss, ``stage`` with what begins. Raises ``UserError`` for missing photos and impossible options.
     """
     if iterations < 1 or max_gaussians < 100 or not 0 <= sh_degree <= 3:
         raise UserError(
             f"train: {iterations} iterations, {max_gaussians} Gaussians and SH degree {sh_degree};"
             " give at least 1, at least 100, and 0 to 3"
         )
+    say = stage or (lambda _text: None)
+    say(f"reading {posed}")
     photos = read_views(posed, max_side=max_side)
     background = background or backdrop_colour(photos)
     views = tuple(laid_over(view, background) for view in photos)
@@ -109,7 +112,9 @@ def train(
         seed=seed,
         threads=threads,
     )
+    say(f"training on {len(chosen)} photos (the first run compiles kernels: up to a minute)")
     result = finetune(start, chosen, options=options, progress=progress)
+    say("judging every photo")
     scores = tuple(
         _score(result.cloud, view, background, held_out=out, threads=threads)
         for view, out in zip(views, held_out, strict=True)

@@ -64,7 +64,6 @@ def _train(chosen: argparse.Namespace) -> int:
     iterations, gaussians, side = _DEFAULTS["cuda" if chosen.device.startswith("cuda") else "cpu"]
     iterations = chosen.iterations or iterations
     progress = _Progress(iterations)
-    progress.say(f"reading {chosen.posed}")
     began = time.perf_counter()
     result = train(
         chosen.posed,
@@ -76,6 +75,7 @@ def _train(chosen: argparse.Namespace) -> int:
         seed=chosen.seed,
         device=chosen.device,
         progress=progress.step,
+        stage=progress.say,
     )
     progress.say(f"writing {chosen.out}")
     stem = chosen.out.name.split(".")[0]
