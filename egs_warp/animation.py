@@ -281,6 +281,7 @@ def first_place(creature: Creature, forward: np.ndarray | None = None, *, step: 
         creature.stepper.detector.points_within(start.positions, 0.01 * body.height),
         step or 1.0 / (FRAME_RATE * steps_per_frame(body)),
         creature.solids,
+        creature.geometry.friction,
     )
 
 

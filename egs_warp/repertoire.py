@@ -18,7 +18,7 @@ from egs_warp.trajectory import Trajectory
 from egs_warp.turn import Turn
 from egs_warp.walk import Walk
 
-FRAMES: Mapping[str, int] = {"jump": 120, "hop": 150, "twist": 120, "walk": 170}
+FRAMES: Mapping[str, int] = {"jump": 120, "hop": 150, "twist": 480, "walk": 170}
 """Frames at 60 Hz within which a motion of each kind comes to rest; one that takes longer is cut off."""
 STEP_FRAMES = 36
 """Frames of each step of a walk, on top."""

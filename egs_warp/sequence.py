@@ -31,6 +31,8 @@ class Place:
     """Seconds of a solver step."""
     solids: tuple[Solid, ...] = ()
     """What there is to stand on, the ground among it."""
+    friction: float = 0.8
+    """Coulomb coefficient."""
 
     def now(self, positions: np.ndarray) -> Place:
         """The same stance turned about up and moved to where the feet of ``positions`` (N, 3) are."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from enum import Enum
 
 import numpy as np
@@ -165,22 +166,40 @@ def test_a_twist_asks_friction_for_the_spin_that_is_left(place: Place, turn: flo
     assert twist._turned == pytest.approx(turn)
 
 
+def land(jump: Leap, state: BodyState) -> None:
+    """Put a jump where it has landed and come to rest but for the last step."""
+    jump.phase, jump._entered = JumpPhase.LAND, -100.0
+    jump.pose, jump.ground = jump._landing_pose, jump._landing
+
+
 def test_a_turn_that_falls_short_is_made_up_where_it_began(place: Place) -> None:
-    """50 degrees short and 0.1 aside: the next jump turns by the rest and goes back; 5 degrees short is let be."""
-    turn = Turn(place, JumpTarget(0.0, 0.2), np.radians(120.0))
-    first = turn.jumps[0]
-    first.phase, first._entered = JumpPhase.LAND, 0.0
-    first.pose, first.ground = first._landing_pose, first._landing
-    short = moved(place, np.radians(70.0), np.array([0.1, 0.0, 0.0]))
+    """25 degrees short and 0.1 aside: the next jump turns by the rest and goes back; 5 degrees short is let be."""
+    turn = Turn(place, JumpTarget(0.0, 0.2), np.radians(60.0))
+    short = moved(place, np.radians(35.0), np.array([0.1, 0.0, 0.0]))
     state = BodyState(short, 0 * short, 10.0)
+    land(turn.jumps[0], state)
     turn.objectives(state, None, DT)
-    assert len(turn.jumps) == 2 and turn.phase is JumpPhase.CROUCH  # it has settled already
+    assert len(turn.jumps) == 2
     second = turn.jumps[1]
-    assert np.degrees(second.turn) == pytest.approx(50.0) and second.target.distance == pytest.approx(0.1)
+    assert np.degrees(second.turn) == pytest.approx(25.0) and second.target.distance == pytest.approx(0.1)
     assert np.allclose(second.ground.axes[0], [-1.0, 0.0, 0.0])
-    assert turn.notes() == ["turned in 2 jumps: the first was 50 degrees short"] and turn.planned()["jumps"] == 2.0
-    second.phase, second._entered = JumpPhase.LAND, 0.0
-    second.pose, second.ground = second._landing_pose, second._landing
-    there = moved(place, np.radians(115.0), np.zeros(3))
+    assert turn.notes() == ["turned in 2 jumps"] and turn.planned()["jumps"] == 2.0
+    there = moved(place, np.radians(55.0), np.zeros(3))
+    land(second, BodyState(there, 0 * there, 20.0))
     turn.objectives(BodyState(there, 0 * there, 20.0), None, DT)
     assert len(turn.jumps) == 2 and turn.phase is JumpPhase.REST
+
+
+def test_a_slippery_floor_takes_more_jumps(place: Place) -> None:
+    """The largest turn is proportional to friction; a turn beyond it is shared out evenly."""
+    target = JumpTarget(0.0, 0.2)
+    rough, smooth = (Turn(replace(place, friction=mu), target, np.pi) for mu in (0.8, 0.2))
+    assert smooth.most_in_a_jump == pytest.approx(rough.most_in_a_jump / 4.0)
+    count = np.ceil(np.pi / smooth.most_in_a_jump)
+    assert count >= 2.0 and smooth.jumps[0].turn == pytest.approx(np.pi / count)
+    landed = moved(place, smooth.jumps[0].turn, np.zeros(3))
+    state = BodyState(landed, 0 * landed, 10.0)
+    land(smooth.jumps[0], state)
+    smooth.objectives(state, None, DT)
+    assert smooth.jumps[1].turn == pytest.approx(np.pi / count)
+    assert smooth.notes()[0] == f"friction gives a turn of {np.degrees(smooth.most_in_a_jump):.0f} degrees a jump"
