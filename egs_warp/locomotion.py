@@ -41,7 +41,9 @@ class LocomotionSettings:
     qp_solver: QpSolver = QpSolver.OSQP
     strategy: Strategy = Strategy.TWO_STAGE
     activation_weight: float = 2e-4
+    """For a step of sqrt(H / g) / 19. Shorter ones change speeds by less, so they weigh activations less: by the square of their share."""
     activation_change_weight: float = 3e-4
+    """Likewise, by their share."""
     drag: float = 0.0
     """alpha, 1/s."""
 
@@ -198,6 +200,7 @@ class LocomotionStepper:
         actuation = columns.toarray() * self.muscles.bounds
         linear = linear_response(step, actuation, contacts, prediction.velocities, layout)
         clock.lap("linearise")
+        share = step.dt / (np.sqrt(body.height / np.linalg.norm(body.gravity)) / 19.0)
         program = contact_program(
             step,
             linear,
@@ -207,7 +210,11 @@ class LocomotionStepper:
             memory.activations / self.muscles.bounds,
             friction=self.geometry.friction,
             push_out_cap=settings.push_out_cap * self.speed_scale,
-            scales=CostScales(self.speed_scale, settings.activation_weight, settings.activation_change_weight),
+            scales=CostScales(
+                self.speed_scale,
+                settings.activation_weight * share**2,
+                settings.activation_change_weight * share,
+            ),
         )
         states = states_from_prediction(
             prediction.normal_forces[: contacts.count],
