@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -12,6 +12,7 @@ from egs_warp.embedding import GaussianEmbedding
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.kernels import deformation as kernels
+from egs_warp.kernels import deformation_cuda as kernels_cuda
 from egs_warp.kernels.spherical_harmonics import rotate_sh_kernel
 from egs_warp.launching import launch_rows
 from egs_warp.precision import Vec3
@@ -49,7 +50,8 @@ class Deformer:
     """Carries one cloud, frame after frame, into the same output arrays."""
 
     def __init__(self, cloud: GaussianCloud, embedding: GaussianEmbedding, *, max_stretch: float = MAX_STRETCH) -> None:
-        self.rest = cloud
+        # Kernels read whole rows at once.
+        self.rest = cloud = replace(cloud, rotations=cloud.rotations.contiguous(), sh=cloud.sh.contiguous())
         self.embedding = embedding
         self.max_stretch = max_stretch
         self._degree = cloud.sh_degree
@@ -92,6 +94,9 @@ class Deformer:
         deformed, cloud, rest = self._deformed, self._deformed.cloud, self.rest
         inputs = self._carrying_inputs(positions)
         outputs = [cloud.means, cloud.rotations, cloud.log_scales, deformed.turns]
+        if rest.device.is_cuda and self._degree == 3:
+            kernels_cuda.deform_with_colour(rest.count, [*inputs, rest.sh], [*outputs, cloud.sh], rest.device)
+            return deformed
         launch_rows(kernels.deform_kernel, rest.count, inputs=inputs, outputs=outputs, device=rest.device)
         if self._degree:
             launch_rows(
