@@ -18,8 +18,8 @@ from egs_warp.render import render
 from tests.test_finetune import ball, ring
 
 pytest.importorskip("torch")
-from egs_warp.finetune import psnr
-from egs_warp.training import backdrop_colour, laid_over, middle_of, read_views, train
+from egs_warp.finetune import TrainingView, psnr
+from egs_warp.training import backdrop_colour, laid_over, middle_of, read_views, rough_cloud, train
 
 
 def posed_folder(folder: Path, *, count: int = 9, size: int = 32, alpha: bool = False) -> Path:
@@ -152,3 +152,41 @@ def test_the_middle_is_where_the_cameras_look() -> None:
     shift = np.array([3.0, -2.0, 5.0])
     cameras = [replace(camera, translation=camera.translation - camera.rotation @ shift) for camera in ring(7)]
     np.testing.assert_allclose(middle_of(cameras), shift, atol=1e-9)
+
+
+def test_the_first_cloud_fills_the_silhouettes_and_nothing_else() -> None:
+    """Masks of a small sphere: all points are inside of nine masks in ten, and spread over the whole of it."""
+    centre, radius = np.array([0.1, -0.05, 0.0]), 0.2
+    views = []
+    for camera in ring(12, 64):
+        rows, columns = np.mgrid[:64, :64] + 0.5
+        rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones((64, 64))], -1)
+        rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)) @ camera.rotation
+        to_centre = centre - camera.centre
+        off = np.linalg.norm(to_centre - (rays @ to_centre)[..., None] * rays, axis=-1)
+        image = np.broadcast_to([0.8, 0.3, 0.1], (64, 64, 3)).astype(np.float32)
+        views.append(TrainingView(camera, image, alpha=(off < radius).astype(np.float32)))
+    cloud = rough_cloud(views, count=500, sh_degree=1, device="cpu")
+    means = cloud.means.numpy()
+    assert len(means) == 500
+    for view in views[::3]:
+        p = means @ view.camera.rotation.T + view.camera.translation
+        column = view.camera.fx * p[:, 0] / p[:, 2] + view.camera.cx
+        row = view.camera.fy * p[:, 1] / p[:, 2] + view.camera.cy
+        assert view.alpha is not None
+        assert view.alpha[row.astype(int), column.astype(int)].mean() > 0.85
+    distance = np.linalg.norm(means - centre, axis=1)
+    assert 0.6 * radius < np.median(distance) < radius
+    assert np.abs(means.mean(axis=0) - centre).max() < 0.2 * radius
+    # Each Gaussian has about the room that 500 of them leave one another.
+    spacing = (4 / 3 * np.pi * radius**3 / 500) ** (1 / 3)
+    assert 0.3 * spacing < np.exp(cloud.log_scales.numpy()).mean() < 1.2 * spacing
+    np.testing.assert_allclose(cloud.sh.numpy()[:, 0] * 0.28209479 + 0.5, np.tile([0.8, 0.3, 0.1], (500, 1)), atol=1e-5)
+
+
+def test_cameras_that_see_nothing_in_common_are_refused() -> None:
+    camera = ring(1)[0]
+    away = replace(camera, rotation=camera.rotation, near=1e9)
+    view = TrainingView(away, np.zeros((camera.height, camera.width, 3), np.float32))
+    with pytest.raises(UserError, match="train: the cameras do not look at a place in common; check the poses"):
+        rough_cloud([view], count=100, sh_degree=0, device="cpu")
