@@ -69,7 +69,7 @@ def built_in(name: str, device: str) -> Case:
 def real(name: str, device: str) -> Case | None:
     """A hole in uncovered floor; None where the capture is not on this machine."""
     file, coefficients, centre, radius = REAL[name]
-    path = Path(os.environ.get("EGS_WARP_DATA", Path(__file__).parents[2] / "shared" / "data")) / "scenes" / file
+    path = Path(os.environ.get("EGS_WARP_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "scenes" / file
     if not path.exists():
         return None
     hole = disc(Plane.from_coefficients(*coefficients), np.array(centre), radius)

@@ -21,6 +21,10 @@ _CONTACT = 0.05
 """Of the object's height: what of it lies lower hides the floor from every side."""
 
 
+_BRIDGED = 0.1
+"""Of the footprint's span: gaps twice as wide are bridged."""
+
+
 @dataclass(frozen=True)
 class Hole:
     """A region of a plane, drawn on a window of it."""
@@ -89,8 +93,13 @@ def footprint(thing: GaussianCloud, plane: Plane) -> Hole:
     first, second = plane.tangents()
     span = max(np.ptp(means[low] @ first), np.ptp(means[low] @ second)) + 2.0 * margin
     window = _window(plane, middle, float(span))
-    covered = rectify(thing.subset(low), window, thickness=np.inf).alpha > 0.5
-    return Hole(window, ndimage.binary_fill_holes(covered))
+    covered = np.pad(rectify(thing.subset(low), window, thickness=np.inf).alpha > 0.5, _TEXELS // 2)
+    # Feet stay apart, but a sole is whole, though its Gaussians, which nobody has seen, are a sieve.
+    reach = _BRIDGED * _TEXELS
+    wide = ndimage.distance_transform_edt(~covered) <= reach
+    closed = (ndimage.distance_transform_edt(wide) > reach) | covered
+    inner = (slice(_TEXELS // 2, -(_TEXELS // 2)),) * 2
+    return Hole(window, ndimage.binary_fill_holes(closed)[inner])
 
 
 def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:

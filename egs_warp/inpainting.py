@@ -42,6 +42,12 @@ _MOST_SPACING = 3
 """Texels."""
 _RIM = 12
 """Texels around the hole that take part in the training."""
+_GAP_REACH = 0.25
+"""Of the hole's side: gaps in the floor are followed this far from the hole."""
+_GAP_EDGE = 4.0
+"""Texels around such a gap that are not trusted either."""
+_SHRED = 0.15
+"""Of the hole's area: floor that the hole encloses is given up if it is smaller."""
 _LEASH = 4.0
 """Weight of the squared distance of a Gaussian's colour from what was painted there."""
 
@@ -167,13 +173,19 @@ def _in_hole(background: GaussianCloud, window: PlaneWindow, mask: np.ndarray, s
 
 
 def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The hole with the gaps that touch it, and where the floor is known; both (rows, columns) bool."""
+    """The hole with the gaps in the floor that touch it and the shreds between them, and where the floor is known; both
+    (rows, columns) bool."""
     # Pinholes between splats are no gaps.
     solid = ndimage.binary_closing(np.pad(alpha > _KNOWN, 4, mode="edge"), iterations=2)[4:-4, 4:-4]
-    near = ndimage.binary_dilation(mask, iterations=max(2, int(0.1 * np.sqrt(mask.sum()))))
+    near = ndimage.distance_transform_edt(~mask) < _GAP_REACH * _TEXELS_ACROSS
     gaps, _ = ndimage.label((~solid | mask) & near)
-    touching = np.isin(gaps, np.unique(gaps[mask]))
-    hole = mask | touching
+    touching = np.isin(gaps, np.unique(gaps[mask])) & ~mask
+    # Where the floor thins out, it is stained.
+    hole = mask | (ndimage.distance_transform_edt(~touching) < _GAP_EDGE if touching.any() else touching)
+    parts, count = ndimage.label(~hole)
+    sizes = np.bincount(parts.ravel(), minlength=count + 1)
+    shreds = (sizes < _SHRED * hole.sum()) & (np.arange(count + 1) > 0)
+    hole |= shreds[parts]
     return hole, solid & ~hole
 
 

@@ -24,7 +24,7 @@ _RIM = 3
 """Pixels around the hole that a copy must also explain."""
 _COST_UNIT = 2000.0
 """Capacities are whole numbers: colour differences are counted in units of 1 / 2000."""
-_PRIOR = 1.0
+_PRIOR = 0.5
 """Weight of how well an offset explains what is known around a pixel, against what its seams cost."""
 _SEAM = 0.03
 """Price of a seam that does not show, as a colour difference: it keeps copies in large pieces."""

@@ -46,7 +46,8 @@ class PatchSynthesis:
     def fill(self, image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> np.ndarray:
         """As ``Inpainter.fill``. Raises ``UserError`` where no whole patch is known outside the hole."""
         work = None
-        for depth, level in enumerate(reversed(_pyramid(image, hole, known))):
+        wide = _with_half_turn(image, hole, known)
+        for depth, level in enumerate(reversed(_pyramid(*wide))):
             if not level.is_source.any():
                 continue
             # The picture of each level is first copied by the offsets of the one before: enlarging that one's would
@@ -62,7 +63,8 @@ class PatchSynthesis:
                 f"inpaint: no piece of {2 * RADIUS + 1} x {2 * RADIUS + 1} texels is known around the hole;"
                 " make the hole smaller or show more of the floor"
             )
-        melded = meld(work.picture, hole, known | hole, work.sources())
+        _, wide_hole, wide_known = wide
+        melded = meld(work.picture, wide_hole, wide_known | wide_hole, work.sources())[:, : hole.shape[1]]
         return np.where(hole[..., None], np.clip(melded, 0.0, 1.0), image).astype(np.float32)
 
 
@@ -100,6 +102,19 @@ def _pyramid(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[_Le
         coarse = np.where(coarse_known[..., None], colour / np.maximum(share, 1e-3)[..., None], 0.0)
         levels.append(_Level.of(coarse.astype(np.float32), coarse_hole, coarse_known))
     return levels
+
+
+def _with_half_turn(
+    image: np.ndarray, hole: np.ndarray, known: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The picture and, to copy from, the same turned by 180 degrees beside it: the like of an edge or a corner is often
+    found only the other way round. A strip between the two keeps patches apart."""
+
+    def beside(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        strip = np.zeros((first.shape[0], 2 * RADIUS, *first.shape[2:]), first.dtype)
+        return np.concatenate([first, strip, second[::-1, ::-1]], axis=1)
+
+    return beside(image, image), beside(hole, np.zeros_like(hole)), beside(known, known & ~hole)
 
 
 def _start(level: _Level, shift_limit: float) -> np.ndarray:

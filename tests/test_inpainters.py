@@ -12,7 +12,6 @@ from egs_warp.errors import UserError
 from egs_warp.inpainters import OpenCvInpainter, OpenCvMethod, TorchScriptInpainter, inpainter_by_name
 from egs_warp.patch_synthesis import PatchSynthesis
 
-
 # LaMa is published as TorchScript, which torch calls deprecated.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 
