@@ -10,6 +10,12 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 demo: $(VENV)/demo.stamp
 	$(BIN)/python examples/jump.py --out out/jump --frames $(FRAMES)
 
+examples: setup
+	for motion in jump twist hop walk; do \
+		$(BIN)/python examples/$$motion.py --out out/$$motion --frames $(FRAMES) || exit 1; \
+	done
+	$(BIN)/python examples/finetune.py --out out/finetune --steps $(FRAMES)
+
 test: setup
 	$(BIN)/python -m pytest
 
