@@ -50,8 +50,10 @@ def enclosed(points: np.ndarray, shell: np.ndarray, cell: float) -> np.ndarray:
     shape = np.ceil((shell.max(axis=0) + 3.0 * cell - corner) / cell).astype(int) + 1
     grid = np.zeros(shape, bool)
     grid[tuple(np.floor((shell - corner) / cell).astype(int).T)] = True
-    closed = ndimage.binary_closing(grid, np.ones((3,) * grid.ndim), iterations=2)
-    filled = np.asarray(ndimage.binary_fill_holes(closed))
+    # Filled while swollen: a plain closing leaves gaps in curved shells.
+    cube = np.ones((3,) * grid.ndim)
+    swollen = ndimage.binary_fill_holes(ndimage.binary_dilation(grid, cube, iterations=2))
+    filled = np.asarray(ndimage.binary_erosion(swollen, cube, iterations=2)) | grid
     place = np.floor((points - corner) / cell).astype(int)
     held = np.all((place >= 0) & (place < shape), axis=1)
     result = np.zeros(len(points), bool)

@@ -15,6 +15,7 @@ from egs_warp.gaussians import GaussianCloud
 from egs_warp.plane import Plane
 from egs_warp.votes import MaskedView, Votes, blending_votes, check_size
 
+_NOTHING_ABOVE = "object: nothing of it lies above the plane; check the masks, box or point, or give --plane"
 _MIN_OPACITY = 0.1
 """Fainter Gaussians make no connection; they go with what surrounds them."""
 _SEEN = 0.02
@@ -159,7 +160,7 @@ def _body(
     lying = core & scene.level & (scene.heights < 3.0 * foot) & (not spec.masks)
     indices = np.flatnonzero(core & ~lying)
     if len(indices) == 0:
-        raise UserError("object: nothing of it lies above the plane; check the masks, box or point, or give --plane")
+        raise UserError(_NOTHING_ABOVE)
     parts = connected_parts(scene.cloud, indices, cell=size / CELLS, plane=scene.plane, above=foot)
     mass = np.bincount(parts, weights=scene.opacity[indices])
     if spec.point is not None:
@@ -174,7 +175,10 @@ def _body(
         near = np.unique(parts[away < away.min() + 4.0 * size / CELLS])
         best = int(near[np.argmax(mass[near])])
     else:
-        best = int(np.argmax(np.bincount(parts, weights=scene.opacity[indices] * wanted[indices])))
+        claimed = np.bincount(parts, weights=scene.opacity[indices] * wanted[indices])
+        best = int(np.argmax(claimed))
+        if claimed[best] == 0.0:
+            raise UserError(_NOTHING_ABOVE)
     chosen, small = np.zeros((2, len(core)), bool)
     chosen[indices[parts == best]] = True
     small[indices[mass[parts] < _SMALL * mass[best]]] = True
@@ -193,7 +197,7 @@ def _first_size(scene: _Scene, wanted: np.ndarray, spec: ObjectSpec) -> float:
         return float(np.linalg.norm(spec.box.high - spec.box.low))
     standing = wanted & scene.solid & (scene.heights > 0.0)
     if not standing.any():
-        raise UserError("object: nothing of it lies above the plane; check the masks, box or point, or give --plane")
+        raise UserError(_NOTHING_ABOVE)
     return _diagonal(scene.means[standing]) * (0.5 if spec.point is not None else 1.0)
 
 
