@@ -12,7 +12,6 @@ from egs_warp.deformation import DeformedGaussians, Deformer, node_positions
 from egs_warp.embedding import CageLocator, PointEmbedding, embed_gaussians
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.kernels import carrying as kernels
-from egs_warp.kernels.deformation import tet_gradients_kernel
 from egs_warp.kernels.spherical_harmonics import rotate_sh_kernel
 from egs_warp.launching import launch_rows
 from egs_warp.precision import Vec3
@@ -129,7 +128,7 @@ class _Peer:
         else:
             gradients = wp.empty(len(self._cage.mesh.tets), dtype=wp.mat33, device=rest.device)
             launch_rows(
-                tet_gradients_kernel,
+                kernels.tet_gradients_kernel,
                 len(self._cage.mesh.tets),
                 inputs=[uploaded, self._cage.tets, self._cage.inverse_edges],
                 outputs=[gradients],

@@ -11,6 +11,7 @@ import warp as wp
 from egs_warp.embedding import GaussianEmbedding
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
+from egs_warp.kernels import carried_cage
 from egs_warp.kernels import deformation as kernels
 from egs_warp.kernels import deformation_cuda as kernels_cuda
 from egs_warp.kernels.spherical_harmonics import rotate_sh_kernel
@@ -56,7 +57,7 @@ class Deformer:
         self.max_stretch = max_stretch
         self._degree = cloud.sh_degree
         with wp.ScopedDevice(cloud.device):
-            self._carried_tets = wp.empty(kernels.TET_ROWS * len(embedding.cage.mesh.tets), dtype=wp.vec4)
+            self._carried_tets = wp.empty(carried_cage.TET_ROWS * len(embedding.cage.mesh.tets), dtype=wp.vec4)
             self._rest_nodes = wp.array(embedding.cage.mesh.nodes, dtype=Vec3)
             self._mean_tets = wp.empty(cloud.count, dtype=wp.int32)
             self._end_tets = wp.empty((6, cloud.count), dtype=wp.int32)
@@ -74,7 +75,7 @@ class Deformer:
             )
         points, cage = embedding.points, embedding.cage
         launch_rows(
-            kernels.plan_arms_kernel,
+            carried_cage.plan_arms_kernel,
             cloud.count,
             inputs=[
                 cloud.rotations,
@@ -129,7 +130,7 @@ class Deformer:
         cage, rest = self.embedding.cage, self.rest
         uploaded = node_positions(positions, len(cage.mesh.nodes), rest.device)
         launch_rows(
-            kernels.carry_tets_kernel,
+            carried_cage.carry_tets_kernel,
             len(cage.mesh.tets),
             inputs=[uploaded, self._rest_nodes, cage.tets, cage.inverse_edges],
             outputs=[self._carried_tets],

@@ -2,11 +2,42 @@
 
 import warp as wp
 
-from egs_warp.kernels.deformation import exponential, interpolated, single, single_matrix, turn_of, write_gaussian
+from egs_warp.kernels.carried_cage import single, single_matrix
+from egs_warp.kernels.decomposition import turn_of
+from egs_warp.kernels.deformation import exponential, write_gaussian
 from egs_warp.kernels.embedding import axes_from_quaternion
 from egs_warp.precision import Mat33, Vec3, Vec4, real
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def interpolated(corners: wp.vec4i, weights: Vec4, positions: wp.array[Vec3]) -> Vec3:
+    """Eq. (2) read backwards: the point with these weights."""
+    return (
+        weights[0] * positions[corners[0]]
+        + weights[1] * positions[corners[1]]
+        + weights[2] * positions[corners[2]]
+        + weights[3] * positions[corners[3]]
+    )
+
+
+@wp.kernel
+def tet_gradients_kernel(
+    first_row: wp.int32,
+    # In:
+    positions: wp.array[Vec3],
+    tets: wp.array[wp.vec4i],
+    inverse_edges: wp.array[Mat33],
+    # Out:
+    gradients_out: wp.array[wp.mat33],
+):
+    """Deformation gradient of each tetrahedron."""
+    t = first_row + wp.tid()
+    corners = tets[t]
+    x0 = positions[corners[0]]
+    edges = wp.matrix_from_cols(positions[corners[1]] - x0, positions[corners[2]] - x0, positions[corners[3]] - x0)
+    gradients_out[t] = single_matrix(edges * inverse_edges[t])
 
 
 @wp.func

@@ -6,7 +6,8 @@ read row by row, every load would touch 32 cache lines. CUDA C++ only for that; 
 
 import warp as wp
 
-from egs_warp.kernels.deformation import carried_gaussian, load_row, store_row
+from egs_warp.kernels.carried_cage import load_row, store_row
+from egs_warp.kernels.deformation import carried_gaussian
 from egs_warp.kernels.spherical_harmonics import Mat53, Mat73, turned_band_1, turned_band_2, turned_band_3
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})

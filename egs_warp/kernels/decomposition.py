@@ -1,0 +1,260 @@
+"""Small matrices in float32: one-sided Jacobi, polar rotations, frames whose axes keep their order and sign."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+MAX_SWEEPS = wp.constant(8)
+ORTHOGONAL = wp.constant(wp.float32(1.0e-6))
+REGULAR = wp.constant(wp.float32(1.0e-3))
+
+
+@wp.func
+def turn_of(q: wp.vec4) -> wp.mat33:
+    """Rotation matrix [r1 r2 r3] of a w, x, y, z quaternion."""
+    return wp.quat_to_matrix(wp.normalize(wp.quat(q[1], q[2], q[3], q[0])))
+
+
+@wp.func
+def quaternion_of(m: wp.mat33) -> wp.vec4:
+    """w, x, y, z of a rotation matrix, from the largest of the four; without an index, which would cost memory."""
+    xx = m[0, 0]
+    yy = m[1, 1]
+    zz = m[2, 2]
+    q = wp.vec4(1.0 + xx + yy + zz, m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1])
+    if xx + yy + zz < 0.0:
+        if xx >= yy and xx >= zz:
+            q = wp.vec4(m[2, 1] - m[1, 2], 1.0 + xx - yy - zz, m[0, 1] + m[1, 0], m[0, 2] + m[2, 0])
+        elif yy >= zz:
+            q = wp.vec4(m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], 1.0 - xx + yy - zz, m[1, 2] + m[2, 1])
+        else:
+            q = wp.vec4(m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], 1.0 - xx - yy + zz)
+    return wp.normalize(q)
+
+
+@wp.func
+def column(m: wp.mat33, k: wp.int32) -> wp.vec3:
+    return wp.vec3(m[0, k], m[1, k], m[2, k])
+
+
+@wp.struct
+class Columns:
+    """A 3x3 matrix by columns, and the rotation that has been applied to it from the right."""
+
+    a: wp.vec3
+    b: wp.vec3
+    c: wp.vec3
+    va: wp.vec3
+    vb: wp.vec3
+    vc: wp.vec3
+
+
+@wp.func
+def rotation_between(a: wp.vec3, b: wp.vec3) -> wp.vec2:
+    """Cosine and sine for which cos a - sin b and sin a + cos b are orthogonal."""
+    aa = wp.dot(a, a)
+    bb = wp.dot(b, b)
+    ab = wp.dot(a, b)
+    if ab * ab <= ORTHOGONAL * ORTHOGONAL * aa * bb:
+        return wp.vec2(1.0, 0.0)
+    cot = (bb - aa) / (2.0 * ab)
+    tangent = wp.where(cot >= 0.0, 1.0, -1.0) / (wp.abs(cot) + wp.sqrt(1.0 + cot * cot))
+    cosine = 1.0 / wp.sqrt(1.0 + tangent * tangent)
+    return wp.vec2(cosine, cosine * tangent)
+
+
+@wp.func
+def orthogonal_columns(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> Columns:
+    """One-sided Jacobi: M V with orthogonal columns (left singular vectors times singular values), and V, det V = +1.
+
+    Each column keeps its own relative precision, so float32 is enough for splats whose scales differ by e^10, and each
+    column moves no further from where it was than it must.
+    """
+    m = Columns()
+    m.a = a
+    m.b = b
+    m.c = c
+    m.va = wp.vec3(1.0, 0.0, 0.0)
+    m.vb = wp.vec3(0.0, 1.0, 0.0)
+    m.vc = wp.vec3(0.0, 0.0, 1.0)
+    sweep = wp.int32(0)
+    while sweep < MAX_SWEEPS:
+        turned = wp.float32(0.0)
+        t = rotation_between(m.a, m.b)
+        turned += wp.abs(t[1])
+        p = t[0] * m.a - t[1] * m.b
+        m.b = t[1] * m.a + t[0] * m.b
+        m.a = p
+        p = t[0] * m.va - t[1] * m.vb
+        m.vb = t[1] * m.va + t[0] * m.vb
+        m.va = p
+        t = rotation_between(m.a, m.c)
+        turned += wp.abs(t[1])
+        p = t[0] * m.a - t[1] * m.c
+        m.c = t[1] * m.a + t[0] * m.c
+        m.a = p
+        p = t[0] * m.va - t[1] * m.vc
+        m.vc = t[1] * m.va + t[0] * m.vc
+        m.va = p
+        t = rotation_between(m.b, m.c)
+        turned += wp.abs(t[1])
+        p = t[0] * m.b - t[1] * m.c
+        m.c = t[1] * m.b + t[0] * m.c
+        m.b = p
+        p = t[0] * m.vb - t[1] * m.vc
+        m.vc = t[1] * m.vb + t[0] * m.vc
+        m.vb = p
+        sweep += 1
+        if turned == 0.0:
+            sweep = MAX_SWEEPS
+    return m
+
+
+@wp.func
+def unit_or(v: wp.vec3, otherwise: wp.vec3) -> wp.vec3:
+    length = wp.length(v)
+    if length > 1.0e-20:
+        return v / length
+    return otherwise
+
+
+@wp.func
+def perpendicular(u: wp.vec3) -> wp.vec3:
+    """Some unit vector perpendicular to the unit vector ``u``."""
+    helper = wp.where(wp.abs(u[0]) < 0.6, wp.vec3(1.0, 0.0, 0.0), wp.vec3(0.0, 1.0, 0.0))
+    return wp.normalize(wp.cross(u, helper))
+
+
+@wp.func
+def unit_pair(a: wp.vec3, b: wp.vec3) -> wp.mat33:
+    """Right-handed frame [a/|a|, b/|b|, a x b] of two orthogonal columns, either of which may have no length."""
+    u = wp.vec3(1.0, 0.0, 0.0)
+    v = wp.vec3(0.0, 1.0, 0.0)
+    if wp.length_sq(a) >= wp.length_sq(b):
+        u = unit_or(a, u)
+        v = unit_or(b - wp.dot(b, u) * u, perpendicular(u))
+    else:
+        v = unit_or(b, v)
+        u = unit_or(a - wp.dot(a, v) * v, perpendicular(v))
+    return wp.matrix_from_cols(u, v, wp.cross(u, v))
+
+
+@wp.func
+def proper_frame(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.mat33:
+    """Unit columns along orthogonal ones; the shortest follows from the two others, so that det = +1 always."""
+    aa = wp.length_sq(a)
+    bb = wp.length_sq(b)
+    cc = wp.length_sq(c)
+    if cc <= aa and cc <= bb:
+        return unit_pair(a, b)
+    if aa <= bb:
+        f = unit_pair(b, c)
+        return wp.matrix_from_cols(
+            wp.vec3(f[0, 2], f[1, 2], f[2, 2]), wp.vec3(f[0, 0], f[1, 0], f[2, 0]), wp.vec3(f[0, 1], f[1, 1], f[2, 1])
+        )
+    f = unit_pair(c, a)
+    return wp.matrix_from_cols(
+        wp.vec3(f[0, 1], f[1, 1], f[2, 1]), wp.vec3(f[0, 2], f[1, 2], f[2, 2]), wp.vec3(f[0, 0], f[1, 0], f[2, 0])
+    )
+
+
+@wp.func
+def rotation_part(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.mat33:
+    """Rotation of the polar decomposition of [a b c], det = +1; for an inverted matrix, the rotation nearest to it."""
+    m = orthogonal_columns(a, b, c)
+    return proper_frame(m.a, m.b, m.c) * wp.transpose(wp.matrix_from_cols(m.va, m.vb, m.vc))
+
+
+@wp.func
+def matched_order(frame: wp.mat33, carried: wp.mat33) -> wp.vec3i:
+    """Which column of ``frame`` belongs to each column of ``carried``: the permutation of greatest total alignment."""
+    d = wp.transpose(carried) * frame
+    best = wp.vec3i(0, 1, 2)
+    most = wp.abs(d[0, 0]) + wp.abs(d[1, 1]) + wp.abs(d[2, 2])
+    total = wp.abs(d[0, 1]) + wp.abs(d[1, 0]) + wp.abs(d[2, 2])
+    if total > most:
+        most = total
+        best = wp.vec3i(1, 0, 2)
+    total = wp.abs(d[0, 0]) + wp.abs(d[1, 2]) + wp.abs(d[2, 1])
+    if total > most:
+        most = total
+        best = wp.vec3i(0, 2, 1)
+    total = wp.abs(d[0, 2]) + wp.abs(d[1, 1]) + wp.abs(d[2, 0])
+    if total > most:
+        most = total
+        best = wp.vec3i(2, 1, 0)
+    total = wp.abs(d[0, 1]) + wp.abs(d[1, 2]) + wp.abs(d[2, 0])
+    if total > most:
+        most = total
+        best = wp.vec3i(1, 2, 0)
+    total = wp.abs(d[0, 2]) + wp.abs(d[1, 0]) + wp.abs(d[2, 1])
+    if total > most:
+        best = wp.vec3i(2, 0, 1)
+    return best
+
+
+@wp.func
+def rotation_of(m: wp.mat33) -> wp.mat33:
+    """``rotation_part`` of a matrix with det > 0, by Newton's iteration X <- (g X + X^-T / g) / 2 (Higham 1986) where that is safe:
+    half the work."""
+    a = column(m, 0)
+    b = column(m, 1)
+    c = column(m, 2)
+    size = wp.dot(a, a) + wp.dot(b, b) + wp.dot(c, c)
+    if wp.dot(wp.cross(a, b), c) < REGULAR * size * wp.sqrt(size):
+        return rotation_part(a, b, c)
+    step = wp.int32(0)
+    while step < MAX_SWEEPS:
+        ca = wp.cross(b, c)
+        cb = wp.cross(c, a)
+        cc = wp.cross(a, b)
+        det = wp.dot(a, ca)
+        size = wp.dot(a, a) + wp.dot(b, b) + wp.dot(c, c)
+        scale = wp.sqrt(wp.sqrt((wp.dot(ca, ca) + wp.dot(cb, cb) + wp.dot(cc, cc)) / size) / det)
+        straight = 0.5 * scale
+        turned = 0.5 / (scale * det)
+        na = straight * a + turned * ca
+        nb = straight * b + turned * cb
+        nc = straight * c + turned * cc
+        moved = wp.length_sq(na - a) + wp.length_sq(nb - b) + wp.length_sq(nc - c)
+        a = na
+        b = nb
+        c = nc
+        step += 1
+        # The error squares itself with every step: the next one would move by 1e-8.
+        if moved < 1.0e-8:
+            step = MAX_SWEEPS
+    return wp.matrix_from_cols(a, b, c)
+
+
+@wp.func
+def chosen(m: wp.mat33, k: wp.int32) -> wp.vec3:
+    """Column k, by comparison: an index that is not known in advance would put the matrix into memory."""
+    return wp.where(k == 0, column(m, 0), wp.where(k == 1, column(m, 1), column(m, 2)))
+
+
+@wp.func
+def signed_as(frame: wp.mat33, order: wp.vec3i, carried: wp.mat33) -> wp.mat33:
+    """Columns of ``frame`` in that order, turned to the side of ``carried``; the least aligned one makes det = +1."""
+    a = chosen(frame, order[0])
+    b = chosen(frame, order[1])
+    c = chosen(frame, order[2])
+    da = wp.dot(a, column(carried, 0))
+    db = wp.dot(b, column(carried, 1))
+    dc = wp.dot(c, column(carried, 2))
+    a = wp.where(da < 0.0, -a, a)
+    b = wp.where(db < 0.0, -b, b)
+    c = wp.where(dc < 0.0, -c, c)
+    if wp.dot(wp.cross(a, b), c) < 0.0:
+        if wp.abs(dc) <= wp.abs(da) and wp.abs(dc) <= wp.abs(db):
+            c = -c
+        elif wp.abs(da) <= wp.abs(db):
+            a = -a
+        else:
+            b = -b
+    return wp.matrix_from_cols(a, b, c)
+
+
+@wp.func
+def scaled_columns(m: wp.mat33, s: wp.vec3) -> wp.mat33:
+    return wp.matrix_from_cols(s[0] * column(m, 0), s[1] * column(m, 1), s[2] * column(m, 2))
