@@ -17,7 +17,7 @@ TOLERANCE = np.radians(8.0)
 MOST_JUMPS = 5
 PYRAMID = 0.79
 """Mean over all directions of what a friction pyramid of four edges gives of Coulomb's cone."""
-RESERVE = 0.7
+RESERVE = 0.8
 """Part of what friction could do at most that one jump is asked for."""
 
 
