@@ -77,11 +77,11 @@ def footprint(thing: GaussianCloud, plane: Plane) -> Hole:
     encloses. Raises ``UserError`` where the object does not reach down to the plane."""
     means, opacity = thing.means.numpy(), thing.opacities()
     heights = plane.heights(means)
-    solid = (opacity > 0.3) & (heights > -np.abs(heights).max() * 0.5)
+    solid = opacity > 0.3
     if not solid.any():
         raise UserError("inpaint: the object has no opaque Gaussian; give another object, a mask, or a place")
     top = float(np.quantile(heights[solid], 0.99))
-    low = solid & (heights < _CONTACT * top)
+    low = solid & (heights < _CONTACT * top) & (heights > -0.5 * top)
     if top <= 0.0 or not low.any():
         raise UserError(
             f"inpaint: the object does not touch the plane (lowest part at {heights[solid].min():.3g}, highest at"
@@ -103,7 +103,7 @@ def footprint(thing: GaussianCloud, plane: Plane) -> Hole:
 
 
 def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
-    """The floor that stands behind the object in every view that has it in sight.
+    """The floor that stands behind the object in every view that has it in sight, which more than half of them must.
 
     Raises ``UserError`` for masks that do not fit their cameras, are empty, or between them hide no common floor.
     """
@@ -119,7 +119,7 @@ def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
     window = _window(plane, middle, float(max(np.ptp(smallest @ first), np.ptp(smallest @ second))))
     columns, rows = np.meshgrid(np.arange(_TEXELS) + 0.5, np.arange(_TEXELS) + 0.5)
     places = window.points(np.stack([columns.ravel(), rows.ravel()], axis=1))
-    hidden, looked = np.ones(len(places), bool), np.zeros(len(places), bool)
+    hidden, looks = np.ones(len(places), bool), np.zeros(len(places), int)
     for view in views:
         camera, mask = view.camera, view.mask
         seen = places @ camera.rotation.T + camera.translation
@@ -129,8 +129,8 @@ def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
         row = np.floor(camera.fy * seen[:, 1] / depth + camera.cy).astype(int)
         inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         hidden[inside] &= mask[row[inside], column[inside]]
-        looked |= inside
-    found = (hidden & looked).reshape(_TEXELS, _TEXELS)
+        looks += inside
+    found = (hidden & (2 * looks > len(views))).reshape(_TEXELS, _TEXELS)
     if not found.any():
         raise UserError("inpaint: the masks hide no floor in common; check that they show one object and the plane")
     return Hole(window, found)

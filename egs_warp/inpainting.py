@@ -46,6 +46,10 @@ _GAP_REACH = 0.25
 """Of the hole's side: gaps in the floor are followed this far from the hole."""
 _GAP_EDGE = 4.0
 """Texels around such a gap that are not trusted either."""
+_CHANNEL = 3.0
+"""Half width, in texels, up to which a gap does not count as open to what lies beyond the floor."""
+_LEAST_RIM = 0.3
+"""Of the hole's edge must be floor."""
 _SHRED = 0.15
 """Of the hole's area: floor that the hole encloses is given up if it is smaller."""
 _LEASH = 4.0
@@ -178,7 +182,7 @@ def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray
     # Pinholes between splats are no gaps.
     solid = ndimage.binary_closing(np.pad(alpha > _KNOWN, 4, mode="edge"), iterations=2)[4:-4, 4:-4]
     near = ndimage.distance_transform_edt(~mask) < _GAP_REACH * _TEXELS_ACROSS
-    gaps, _ = ndimage.label((~solid | mask) & near)
+    gaps, _ = ndimage.label(mask | (~solid & near & ~_void(~solid & ~mask)))
     touching = np.isin(gaps, np.unique(gaps[mask])) & ~mask
     # Where the floor thins out, it is stained.
     hole = mask | (ndimage.distance_transform_edt(~touching) < _GAP_EDGE if touching.any() else touching)
@@ -189,16 +193,25 @@ def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return hole, solid & ~hole
 
 
+def _void(missing: np.ndarray) -> np.ndarray:
+    """(rows, columns) bool: the part of ``missing`` floor that lies beyond the floor's edge. What hangs together with it
+    by a thin channel only is a gap."""
+    wide, _ = ndimage.label(ndimage.distance_transform_edt(np.pad(missing, 1, mode="edge")) > _CHANNEL)
+    edges = np.concatenate([wide[0], wide[-1], wide[:, 0], wide[:, -1]])
+    outside = np.isin(wide, np.unique(edges[edges > 0]))[1:-1, 1:-1]
+    return missing & (ndimage.distance_transform_edt(~outside) <= _CHANNEL + 1.0)
+
+
 def _check(hole: np.ndarray, known: np.ndarray) -> None:
+    if known.sum() < 0.1 * hole.sum():
+        raise UserError("inpaint: the hole covers nearly all of the floor; make it smaller or show more of the floor")
     ring = ndimage.binary_dilation(hole, iterations=4) & ~hole
     share = float(known[ring].mean()) if ring.any() else 0.0
-    if share < 0.15:
+    if share < _LEAST_RIM:
         raise UserError(
             f"inpaint: the hole is off the floor: only {100 * share:.0f} % of its edge touches visible floor;"
             " check plane and hole"
         )
-    if known.sum() < hole.sum() // 4:
-        raise UserError("inpaint: the hole covers nearly all of the floor; make it smaller or show more of the floor")
 
 
 def _trained(kept, new, window, hole, painted, thickness, options, progress) -> GaussianCloud:
