@@ -27,6 +27,9 @@ def add_parser(commands) -> None:
         "--plane", help="nx,ny,nz,d of the ground n.x + d = 0 in the capture's units, or a plane.json; else it is found"
     )
     add_object_flags(animate)
+    animate.add_argument(
+        "--view-from", help="x,y,z or an axis: from the object to the camera of the video, capture's frame"
+    )
     animate.add_argument("--no-inpaint", action="store_true", help="leave the floor under the object as captured")
     animate.add_argument("--no-shadow", action="store_true", help="no shadow on the ground under the object")
     animate.add_argument("--forward", help="x,y,z or an axis: the way of motions; else along the feet")
@@ -86,6 +89,7 @@ def _animate(chosen: argparse.Namespace) -> int:
         motion=chosen.motion,
         up=up,
         plane=plane,
+        view_from=parse_direction("view-from", chosen.view_from) if chosen.view_from else None,
         forward=parse_direction("forward", chosen.forward) if chosen.forward else None,
         gravity_up=parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up else None,
         solids=read_terrain(chosen.terrain) if chosen.terrain else (),
@@ -105,6 +109,7 @@ def _animate_scene(chosen: argparse.Namespace, options) -> int:
     from egs_warp.scene_pipeline import SceneOptions, prepare_scene, viewing_direction
     from egs_warp.terrain import read_terrain
 
+    view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from else None
     given = read_scene(chosen)
     folder = writable_folder(chosen.out)
     scene = prepare_scene(
@@ -124,7 +129,7 @@ def _animate_scene(chosen: argparse.Namespace, options) -> int:
         motion=chosen.motion,
         plane=scene.plane,
         background=scene.background,
-        view_from=viewing_direction(scene, given.cameras),
+        view_from=view_from if view_from is not None else viewing_direction(scene, given.cameras),
         forward=parse_direction("forward", chosen.forward) if chosen.forward else None,
         gravity_up=parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up else None,
         solids=read_terrain(chosen.terrain) if chosen.terrain else (),
