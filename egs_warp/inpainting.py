@@ -44,9 +44,9 @@ _RIM = 12
 """Texels around the hole that take part in the training."""
 _GAP_REACH = 0.25
 """Of the hole's side: gaps in the floor are followed this far from the hole."""
-_GAP_EDGE = 4.0
+_GAP_EDGE = 6.0
 """Texels around such a gap that are not trusted either."""
-_CHANNEL = 3.0
+_CHANNEL = 9.0
 """Half width, in texels, up to which a gap does not count as open to what lies beyond the floor."""
 _LEAST_RIM = 0.3
 """Of the hole's edge must be floor."""
