@@ -366,7 +366,7 @@ def _draw(
             marks = [time.perf_counter()]
             deformed = deformer.deform(trajectory.positions[step])
             marks.append(time.perf_counter())
-            backdrop = behind.background(deformed.cloud.means.numpy(), cloud.opacities(), height=height)
+            backdrop = behind.background(deformed.cloud, height=height)
             image = render(deformed.cloud, camera, background=backdrop).colour_srgb8()
             wp.synchronize_device(device)
             marks.append(time.perf_counter())

@@ -24,6 +24,8 @@ CELLS = 64
 """Across the object, for connectivity."""
 _SMALL = 0.01
 """Of the object's opacity mass: a connected part below this is a floater."""
+_HOLLOW = 0.35
+"""Of the object's size: a point in the middle of a hollow body is this far from its skin, or less."""
 _ROUGHEST = 0.02
 """Of the object's size: a floor is not taken to scatter more than this."""
 FOOTPRINT_HEIGHT = 0.08
@@ -166,14 +168,15 @@ def _body(
     if spec.point is not None:
         away = np.linalg.norm(scene.means[indices] - spec.point, axis=1)
         # A point may lie in the middle of an object, which is hollow.
-        if away.min() > 0.25 * size:
+        if away.min() > _HOLLOW * size:
             raise UserError(
-                f"object: nothing solid above the plane within {0.25 * size:.3g} of the point "
+                f"object: nothing solid above the plane within {_HOLLOW * size:.3g} of the point "
                 f"{','.join(f'{v:g}' for v in spec.point)}; give a point on the object, in the capture's units"
             )
-        # The heaviest of what is about as near: the nearest may be a stray.
-        near = np.unique(parts[away < away.min() + 4.0 * size / CELLS])
-        best = int(near[np.argmax(mass[near])])
+        # The nearest of what matters: beside the object, strays and loose matter inside it do not.
+        around = np.unique(parts[away < _HOLLOW * size])
+        around = around[mass[around] > 0.05 * mass[around].max()]
+        best = int(around[np.argmin([away[parts == one].min() for one in around])])
     else:
         claimed = np.bincount(parts, weights=scene.opacity[indices] * wanted[indices])
         best = int(np.argmax(claimed))

@@ -22,9 +22,8 @@ _SHADOW_LAYERS = ((0.0, 0.08, 0.02), (0.08, 0.3, 0.06), (0.3, 2.0, 0.13))
 class Behind(Protocol):
     """What an animation is drawn over."""
 
-    def background(self, means: np.ndarray, opacities: np.ndarray, *, height: float) -> np.ndarray:
-        """(H, W, 3) float32: what is seen behind Gaussians with ``means`` (n, 3), with their shadow; ``height`` is the
-        body's, world units."""
+    def background(self, body: GaussianCloud, *, height: float) -> np.ndarray:
+        """(H, W, 3) float32: what is seen behind ``body``, with its shadow; ``height`` is the body's, world units."""
         ...
 
 
@@ -51,13 +50,19 @@ class ContactShadow:
         """(H, W) size of a pixel on the plane, world units."""
         self._uv = ((self.flat / reach + 1.0) * 0.5 * _SHADOW_TEXELS - 0.5).astype(np.float32)
 
-    def darkness(self, means: np.ndarray, opacities: np.ndarray, *, height: float) -> np.ndarray:
-        """(H, W) float32, 0 to about 0.5: how much light Gaussians with ``means`` (n, 3) take from the plane.
+    def darkness(self, body: GaussianCloud, *, height: float) -> np.ndarray:
+        """(H, W) float32, 0 to about 0.5: how much light the Gaussians of ``body`` take from the plane.
 
-        Shadows of high ones are wider and paler. ``height`` is the body's, world units.
+        Each hides as much of it as its opacity and its broad side say. Shadows of high ones are wider and paler.
+        ``height`` is the body's, world units.
         """
         import cv2
 
+        means = body.means.numpy()
+        scales = np.sort(np.exp(body.log_scales.numpy()), axis=1)
+        texel = 2.0 * self._reach / _SHADOW_TEXELS
+        hidden = body.opacities() * 2.0 * np.pi * scales[:, 1] * scales[:, 2] / texel**2
+        width = float(np.median(scales[:, 1])) / texel
         flat = ((means - self._centre) @ self._tangents.T / self._reach + 1.0) * 0.5 * _SHADOW_TEXELS
         above = np.maximum(self._plane.heights(means), 0.0)
         shade = np.zeros((_SHADOW_TEXELS, _SHADOW_TEXELS), np.float32)
@@ -70,10 +75,10 @@ class ContactShadow:
                 flat[chosen, 0],
                 bins=_SHADOW_TEXELS,
                 range=((0, _SHADOW_TEXELS), (0, _SHADOW_TEXELS)),
-                weights=opacities[chosen],
+                weights=hidden[chosen],
             )
-            covered = 1.0 - np.exp(-layer.astype(np.float32))
-            sigma = max(blur * height / self._reach * 0.5 * _SHADOW_TEXELS, 0.6)
+            covered = 1.0 - np.exp(-cv2.GaussianBlur(layer.astype(np.float32), (0, 0), max(width, 0.6)))
+            sigma = max(blur * height / texel, 0.6)
             # Far layers see more of the sky past the object, so they darken less.
             shade = np.maximum(shade, cv2.GaussianBlur(covered, (0, 0), sigma) * (0.5 - 1.4 * blur))
         return cv2.remap(
@@ -98,11 +103,11 @@ class Floor:
         self._fade = fade.astype(np.float32)[..., None]
         self._bare = (_SKY + self._fade * (colour - _SKY)).astype(np.float32)
 
-    def background(self, means: np.ndarray, opacities: np.ndarray, *, height: float) -> np.ndarray:
+    def background(self, body: GaussianCloud, *, height: float) -> np.ndarray:
         """See ``Behind``."""
         if self._strength == 0.0:
             return self._bare
-        darkness = self._shadow.darkness(means, opacities, height=height)
+        darkness = self._shadow.darkness(body, height=height)
         return self._bare * (1.0 - darkness[..., None] * self._fade)
 
 
@@ -130,9 +135,9 @@ class CapturedScene:
         strength = on_plane * fade * image.alpha.numpy() if shadow else np.zeros_like(fade)
         self._fade = strength.astype(np.float32)[..., None]
 
-    def background(self, means: np.ndarray, opacities: np.ndarray, *, height: float) -> np.ndarray:
+    def background(self, body: GaussianCloud, *, height: float) -> np.ndarray:
         """See ``Behind``."""
         if not self._fade.any():
             return self._image
-        darkness = self._shadow.darkness(means, opacities, height=height)
+        darkness = self._shadow.darkness(body, height=height)
         return self._image * (1.0 - darkness[..., None] * self._fade)

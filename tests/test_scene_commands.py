@@ -1,0 +1,154 @@
+"""The commands from a scene to its parts: files, one line for every mistake; and what the animation is drawn over."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from egs_warp.camera import Camera
+from egs_warp.camera_ring import ring_cameras, write_cameras
+from egs_warp.clearance import Clearing
+from egs_warp.cli import main
+from egs_warp.errors import UserError
+from egs_warp.gaussians import GaussianCloud
+from egs_warp.io import read_capture, write_ply
+from egs_warp.plane import Plane
+from egs_warp.plane_file import read_planes, write_planes
+from egs_warp.render.ground import CapturedScene, ContactShadow
+from egs_warp.scene_pipeline import SceneOptions, prepare_scene, viewing_direction
+from egs_warp.segmentation import ObjectSpec, masks_from_selection
+from tests.test_segmentation import FLOOR, ball_on_floor
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """scene.ply, cameras.json, and the mask of its second view."""
+    path = tmp_path_factory.mktemp("scene")
+    cloud, truth = ball_on_floor()
+    write_ply(path / "scene.ply", cloud)
+    cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.9, count=6, size=96)
+    write_cameras(path / "cameras.json", cameras, [f"photo{k}.png" for k in range(6)])
+    mask = masks_from_selection(cloud, truth, cameras[1:2])[0].mask
+    Image.fromarray(mask.astype(np.uint8) * 255).save(path / "photo1.png")
+    away = Camera.look_at(np.array([0.0, 0.0, 9.0]), np.array([0.0, 1.0, 20.0]), np.eye(3)[1], width=96, height=96)
+    write_cameras(path / "away.json", [away], ["photo1.png"])
+    return path
+
+
+def test_plane_then_segment_take_each_others_files(folder: Path, tmp_path: Path) -> None:
+    scene, cameras, mask = str(folder / "scene.ply"), str(folder / "cameras.json"), str(folder / "photo1.png")
+    shared = ["--object", mask, "--cameras", cameras, "--up", "z"]
+    assert main(["plane", scene, *shared, "--out", str(tmp_path / "plane")]) == 0
+    plane = read_planes(tmp_path / "plane" / "plane.json")[0]
+    assert plane.normal[2] > np.cos(np.radians(0.5)) and abs(plane.offset) < 0.02
+    with Image.open(tmp_path / "plane" / "plane.png") as picture:
+        red, green, _ = np.moveaxis(np.asarray(picture, float), -1, 0)
+        assert (red - green > 90).mean() > 0.01, "no grid in the picture"
+    flags = ["--plane", str(tmp_path / "plane" / "plane.json"), "--straddling", "split"]
+    assert main(["segment", scene, *shared, *flags, "--out", str(tmp_path / "parts")]) == 0
+    thing = read_capture(tmp_path / "parts" / "object.ply").cloud
+    rest = read_capture(tmp_path / "parts" / "background.ply").cloud
+    assert 1450 < thing.count <= 1525
+    assert 3300 < rest.count <= 3601
+    np.testing.assert_allclose(read_planes(tmp_path / "parts" / "plane.json")[0].normal, plane.normal, atol=1e-9)
+    assert (tmp_path / "parts" / "segment.png").is_file()
+
+
+def test_without_cameras_a_ring_is_used_and_written(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "plane"
+    assert main(["plane", str(folder / "scene.ply"), "--object", "0,-0.5,0.5", "--out", str(out)]) == 0
+    assert len(list((out / "images").glob("*.png"))) == 12
+    # What was written can be clicked on.
+    flags = ["--object", "256,256", "--cameras", str(out / "cameras.json"), "--view", "0", "--straddling", "none"]
+    assert main(["segment", str(folder / "scene.ply"), *flags, "--out", str(tmp_path / "parts")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ([], "segment: give --object"),
+        (["--object", "0,0,0.5", "--plane", "{tmp}/no.json"], "no.json: no such file; make it with egs-warp plane"),
+        (["--object", "0,0,0.5", "--plane", "0,0,1,-5"], "nothing of it lies above the plane"),
+        (["--object", "0,0,0.5", "--plane", "0,0,1,0.9"], "it touches no plane: its lowest part is"),
+        (["--object", "0,0,0.5", "--cameras", "{folder}/away.json"], "no camera sees it around the object"),
+        (["--object", "{folder}/photo1.png", "--cameras", "{folder}/away.json"], "the masks"),
+        (["--object", "5,5,5,6,6,6"], "the box holds nothing of the capture"),
+    ],
+)
+def test_mistakes_are_one_line(
+    folder: Path, tmp_path: Path, flags: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = [flag.format(folder=folder, tmp=tmp_path) for flag in flags]
+    status = main(["segment", str(folder / "scene.ply"), "--up", "z", *given, "--out", str(tmp_path / "out")])
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("egs-warp:")]
+    assert status == 2
+    assert message in lines[-1]
+
+
+def test_plane_files_are_checked(tmp_path: Path) -> None:
+    path = tmp_path / "plane.json"
+    planes = [FLOOR, Plane.from_coefficients(0.0, 1.0, 0.0, 2.0)]
+    write_planes(path, planes, facts=[{"noise": 0.01}])
+    for one, other in zip(read_planes(path), planes, strict=True):
+        np.testing.assert_allclose([*one.normal, one.offset], [*other.normal, other.offset])
+    for text, message in (
+        ("{", "not readable JSON"),
+        ("[]", "it has no planes"),
+        ('{"planes": [{"normal": [1, 2]}]}', "plane 0 needs normal"),
+        ('{"planes": [{"normal": [0, 0, 0], "offset": 1}]}', "a normal that is not zero"),
+    ):
+        path.write_text(text)
+        with pytest.raises(UserError, match=message):
+            read_planes(path)
+
+
+def test_the_shadow_falls_where_the_floor_is_seen() -> None:
+    """Darker under the body, unchanged elsewhere and on what hides the floor; softer and paler from above."""
+    cloud, truth = ball_on_floor()
+    floor = cloud.subset(~truth)
+    camera = Camera.look_at(np.array([0.0, -4.0, 2.5]), np.zeros(3), np.eye(3)[2], width=120, height=120)
+    where = {"centre": np.zeros(3), "reach": 2.0}
+    fields = ("rotations", "log_scales", "opacity_logits", "sh")
+
+    def placed(source: GaussianCloud, means: np.ndarray) -> GaussianCloud:
+        return GaussianCloud.from_numpy(means, *(getattr(source, name).numpy() for name in fields))
+
+    ball = cloud.subset(truth)
+    body = placed(ball, ball.means.numpy() * [1.0, 1.0, 0.1])
+    bare = CapturedScene(floor, camera, FLOOR, **where, shadow=False).background(body, height=1.0)
+    dark = CapturedScene(floor, camera, FLOOR, **where).background(body, height=1.0)
+    shadow = ContactShadow(camera, FLOOR, **where)
+    away = np.linalg.norm(shadow.flat, axis=-1)
+    under, far = shadow.hit & (away < 0.2), shadow.hit & (away > 1.2)
+    assert dark[under].mean() < 0.75 * bare[under].mean()
+    np.testing.assert_array_equal(dark[far], bare[far])
+    lifted = shadow.darkness(placed(body, body.means.numpy() + [0.0, 0.0, 0.4]), height=1.0)
+    assert 0.0 < lifted.max() < shadow.darkness(body, height=1.0).max() <= 0.5
+    # A wall in front of the floor takes no shadow.
+    wall = placed(floor, floor.means.numpy()[:, [0, 2, 1]] + [0.0, -1.2, 1.0])
+    plain, shaded = (
+        CapturedScene(wall, camera, FLOOR, **where, shadow=one).background(body, height=1.0) for one in (False, True)
+    )
+    np.testing.assert_allclose(shaded, plain, atol=0.02)
+
+
+def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:
+    cloud, _ = ball_on_floor()
+    stages: list[str] = []
+    prepared = prepare_scene(
+        cloud,
+        ObjectSpec(point=np.array([0.0, -0.5, 0.5])),
+        options=SceneOptions(clearing=Clearing.SPLIT, inpaint=False),
+        progress=stages.append,
+    )
+    assert stages == ["plane", "segment"]
+    assert prepared.background is prepared.bare
+    assert any("straddled the plane: static split" in note for note in prepared.notes)
+    cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.9, count=3, elevations=(20.0, 40.0, 60.0))
+    direction = viewing_direction(prepared, cameras)
+    np.testing.assert_allclose(direction, cameras[1].centre - prepared.located.centre)
+    up = viewing_direction(prepared, [])
+    assert 0.3 < up @ prepared.plane.normal / np.linalg.norm(up) < 0.6
