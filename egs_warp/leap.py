@@ -92,6 +92,10 @@ class Leap(Jump):
         change = (needed - seen.velocity[:2]) * dt / max(THRUST_LEAD * left, dt)
         return self._balanced(seen, np.array([*(seen.velocity[:2] + change), velocity[2]]), dt)
 
+    def _risen(self, seen: Measurement, dt: float) -> bool:
+        # A body in the air has thrust, however fast it goes; waiting for the asked speed there would lose the steering of the feet.
+        return super()._risen(seen, dt) or not (seen.touching or seen.sole_height <= 0.0)
+
     def _falling(self, seen: Measurement, dt: float) -> tuple[np.ndarray, float, np.ndarray]:
         """As for any jump, but the feet touch down when they have fallen by their distance to the ground now."""
         touch_down, latest, velocity = super()._falling(seen, dt)

@@ -44,11 +44,11 @@ def _length(name: str, default: float, *, above: bool = False) -> Value:
 
 VALUES: Mapping[str, tuple[Value, ...]] = {
     "jump": (_length("distance", 0.5), _length("height", 0.2, above=True)),
-    "hop": (_length("distance", 0.7, above=True), _length("height", 0.2, above=True)),
+    "hop": (_length("distance", 0.7, above=True), _length("height", 0.3, above=True)),
     "twist": (
         Value("heading_degrees", 180.0, -LARGEST_TURN, LARGEST_TURN, "degrees"),
         _length("distance", 0.0),
-        _length("height", 0.2, above=True),
+        _length("height", 0.25, above=True),
     ),
     "walk": (Value("steps", 4, 1, 50, "steps", whole=True), _length("step_length", 0.1, above=True)),
     "trajectory": (),

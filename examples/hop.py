@@ -25,7 +25,7 @@ def main(arguments: list[str] | None = None) -> dict:
     report = animate(
         chess.object,
         chosen.out,
-        motion=f"hop height=0.3 x{chosen.hops}",
+        motion=f"hop x{chosen.hops}",
         plane=chess.plane,
         background=chess.background,
         forward=np.array([1.0, 0.0, 0.0]),
