@@ -48,7 +48,7 @@ _GAP_EDGE = 6.0
 """Texels around such a gap that are not trusted either."""
 _CHANNEL = 9.0
 """Half width, in texels, up to which a gap does not count as open to what lies beyond the floor."""
-_LEAST_RIM = 0.3
+_LEAST_RIM = 0.4
 """Of the hole's edge must be floor."""
 _SHRED = 0.15
 """Of the hole's area: floor that the hole encloses is given up if it is smaller."""
