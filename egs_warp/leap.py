@@ -19,6 +19,8 @@ DEEPEST_CROUCH = 0.3
 """Of the height of the centre of mass; a higher jump thrusts harder instead."""
 FOOTHOLD = 0.4
 """Of the footprint: how far from the capture point the feet may be put down for the sake of the target."""
+RUN_ON = 0.1
+"""Of sqrt(H / g): for how long the feet go on at the body's speed when they touch down, swinging and sliding (measured on the pawn)."""
 CLEARANCE = 0.15
 """Of the height of a step: how far above it the feet are before they swing ahead."""
 THRUST_LEAD = 0.7
@@ -119,7 +121,8 @@ class Leap(Jump):
         capture_time = np.sqrt(self.pose.standing_height / self.gravity)
         capture = touch_down[:2] + seen.velocity[:2] * capture_time + self.pose.base_offset
         low, high = self.pose.support_low, self.pose.support_high
-        return np.clip(self._goal_base, capture + FOOTHOLD * low, capture + FOOTHOLD * high)
+        goal = self._goal_base - RUN_ON * self._time_unit * seen.velocity[:2]
+        return np.clip(goal, capture + FOOTHOLD * low, capture + FOOTHOLD * high)
 
     def _advance_phase(self, seen: Measurement, time: float, dt: float) -> None:
         # What a foot brushes on its way up is no landing.
