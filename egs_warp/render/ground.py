@@ -125,12 +125,18 @@ class CapturedScene:
         shadow: bool = True,
     ) -> None:
         """``scene`` in the world's units; ``centre`` (3,) and ``reach`` bound the shadow."""
+        import cv2
+
         image = render(scene, camera)
         self._image = np.clip(image.colour.numpy(), 0.0, 1.0)
         self._shadow = ContactShadow(camera, plane, centre=centre, reach=reach)
-        # What is seen there, over how far the plane is: splats of a floor scatter by a few hundredths of that.
-        off = np.abs(image.depth.numpy() / np.where(self._shadow.hit, self._shadow.depth, np.inf) - 1.0)
-        on_plane = np.clip(2.0 - off / 0.03, 0.0, 1.0) * self._shadow.hit
+        # How far what is seen lies behind the plane, over the plane's distance. Splats of a floor scatter by a few
+        # hundredths of that, and through thin spots of it one sees deeper.
+        behind = image.depth.numpy() / np.where(self._shadow.hit, self._shadow.depth, np.inf) - 1.0
+        on_plane = np.clip(2.0 - np.where(behind < 0.0, -behind / 0.03, behind / 0.1), 0.0, 1.0) * self._shadow.hit
+        # Specks in the air before the floor would shine in the shadow.
+        kernel = 2 * (max(camera.width, camera.height) // 40) + 1
+        on_plane = cv2.medianBlur(np.rint(255.0 * on_plane).astype(np.uint8), kernel) / 255.0
         fade = np.clip(1.6 - 1.6 * np.linalg.norm(self._shadow.flat, axis=-1) / reach, 0.0, 1.0)
         strength = on_plane * fade * image.alpha.numpy() if shadow else np.zeros_like(fade)
         self._fade = strength.astype(np.float32)[..., None]
