@@ -12,21 +12,23 @@ from egs_warp.objectives import Objective, SpinObjective
 from egs_warp.sequence import Place
 from egs_warp.stance import Ground, Measurement, PoseFamily, Weights
 
-LEAN = 0.16
+LEAN = 0.2
 """Of the distance: how far the weight is put ahead before take-off. With it over the middle of the feet a push forward would
 turn the body backward."""
 DEEPEST_CROUCH = 0.3
 """Of the height of the centre of mass; a higher jump thrusts harder instead."""
 FOOTHOLD = 0.4
 """Of the footprint: how far from the capture point the feet may be put down for the sake of the target."""
-RUN_ON = 0.1
+RUN_ON = 0.05
 """Of sqrt(H / g): for how long the feet go on at the body's speed when they touch down, swinging and sliding (measured on the pawn)."""
 CLEARANCE = 0.15
 """Of the height of a step: how far above it the feet are before they swing ahead."""
 THRUST_LEAD = 0.7
 """Part of the time of a thrust in which the speed forward is to be reached."""
-AIRBORNE_POSE = 0.4
-"""Weight of the pose in the air, where nothing else can be steered and the feet have to get to their place."""
+AIRBORNE_POSE = 0.08
+"""Weight of the pose in the air, where nothing else can be steered and the feet have to get to their place. Much more crumples the body."""
+IN_TIME = 2.5
+"""Over the time left in the air: the rate at which the pose of the landing is approached, gently at first."""
 CALM = 0.03
 """Speed of the centre of mass, in sqrt(g H), below which a body that has landed is at rest."""
 
@@ -71,6 +73,7 @@ class Leap(Jump):
         self.plan = replace(self.plan, crouch_depth=crouch, thrust_time=2.0 * stroke / self.plan.speed_up)
         self._calm_since: float | None = None
         self._pose_weight = self.weights.pose
+        self._stance_follow = self._follow
 
     @staticmethod
     def _lean(place: Place, target: JumpTarget) -> float:
@@ -104,6 +107,7 @@ class Leap(Jump):
         speed, gap = seen.velocity[2], max(seen.sole_height, 0.0)
         left = min(max((speed + np.sqrt(speed**2 + 2.0 * self.gravity * gap)) / self.gravity, dt), latest)
         touch_down[:2] = seen.com[:2] + seen.velocity[:2] * left
+        self._follow = min(IN_TIME / left, self._stance_follow)
         return touch_down, left, velocity
 
     def _fly(self, state: BodyState, seen: Measurement, dt: float) -> list[Objective | SpinObjective]:
@@ -128,6 +132,7 @@ class Leap(Jump):
         # What a foot brushes on its way up is no landing.
         super()._advance_phase(replace(seen, touching=seen.touching and seen.velocity[2] < 0.0), time, dt)
         in_air = self.phase is JumpPhase.FLIGHT
+        self._follow = self._stance_follow
         self.weights = replace(self.weights, pose=AIRBORNE_POSE if in_air else self._pose_weight)
         if in_air and not self.left_ground:
             self.pose, self.ground = self._landing_pose, self._landing

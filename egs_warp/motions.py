@@ -140,6 +140,7 @@ class Jump:
         self._goal_base = self._start_base + [target.distance, 0.0]
         self._pose = np.eye(3)
         self._time_unit = float(np.sqrt(body.height / self.gravity))
+        self._follow = 6.0 / self._time_unit
         self._flew = False
         self._overran: list[JumpPhase] = []
 
@@ -186,8 +187,8 @@ class Jump:
             JumpPhase.SETTLE: elapsed >= 0.3 * self._time_unit,
             JumpPhase.CROUCH: elapsed >= plan.crouch_time,
             JumpPhase.THRUST: self._risen(seen, dt),
-            JumpPhase.FLIGHT: self._flew and seen.touching and seen.velocity[2] < 0.0,
-            JumpPhase.LAND: elapsed >= 5.0 * self._time_unit,
+            JumpPhase.FLIGHT: self._flew and self._landed(seen),
+            JumpPhase.LAND: elapsed >= 9.0 * self._time_unit,
             JumpPhase.REST: False,
         }
         if self.phase is JumpPhase.FLIGHT and not seen.touching:
@@ -199,6 +200,11 @@ class Jump:
         if following[self.phase]:
             self.phase = list(JumpPhase)[list(JumpPhase).index(self.phase) + 1]
             self._entered = time
+
+    def _landed(self, seen: Measurement) -> bool:
+        """Whether the body stands on the ground again; the first foot to brush it is too little to balance on."""
+        low = seen.com[2] < self._start_com[2] + 0.06 * self.body.height
+        return seen.touching and seen.velocity[2] < 0.0 and (low or seen.load > 1.0)
 
     def _sufficient_speed(self, seen: Measurement, dt: float) -> float:
         """Speed up, m/s, at the end of this step from which free flight reaches the asked height."""
@@ -284,6 +290,6 @@ class Jump:
             pose=pose,
             pose_rate=rate,
             spin=spin,
-            follow=6.0 / self._time_unit,
+            follow=self._follow,
             weights=self.weights,
         )
