@@ -20,7 +20,7 @@ MIN_OPACITY = 2.0 / 255.0
 
 SPLIT_DEGREES = 4.0
 """Ends of an axis turned against each other by less than this are left alone. With arms of sqrt 3 standard deviations; the
-paper's 15 degrees at 3 are 9 here, which gave 0.02 to 0.13 dB less in benchmarks/table1.py."""
+paper's 15 degrees at 3 are 9 here, which gave 0.01 to 0.02 dB less on Table 1's chair, and more where finer misfits split."""
 
 LEAST_MISFIT = 7e-4
 """Over the cage's diagonal: an affine motion that is wrong by less than this is good enough. Less would follow a motion
