@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,10 +16,16 @@ from egs_warp.cli_input import check_device, parse_plane, parse_up
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.io.cameras import PosedImage, read_cameras
 from egs_warp.io.capture import read_capture
-from egs_warp.object_input import read_object
+from egs_warp.object_input import read_object, shrunk
 from egs_warp.plane import Plane
 from egs_warp.plane_file import read_planes
 from egs_warp.segmentation import ObjectSpec
+
+if TYPE_CHECKING:
+    from egs_warp.finetune import TrainingView
+
+_PHOTO_SIDE = 320
+"""Pixels: enough for the few Gaussians at the object's foot."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +43,27 @@ class SceneInput:
     def cameras(self) -> list[Camera]:
         """The capture's own."""
         return [one.camera for one in self.posed]
+
+    def photographs(self) -> list[TrainingView]:
+        """The photos beside the cameras, reduced to ``_PHOTO_SIDE`` pixels; none without PyTorch."""
+        import cv2
+
+        from egs_warp.scene_pipeline import has_torch
+
+        if not has_torch():
+            return []
+        from egs_warp.finetune import TrainingView
+
+        views = []
+        for one in self.posed:
+            picture = None if one.image is None else cv2.imread(str(one.image), cv2.IMREAD_COLOR)
+            # Photos that do not fit their cameras have been replaced by something else.
+            if picture is None or picture.shape[:2] != (one.camera.height, one.camera.width):
+                continue
+            small = shrunk(one.camera, _PHOTO_SIDE)
+            reduced = cv2.resize(picture, (small.width, small.height), interpolation=cv2.INTER_AREA)
+            views.append(TrainingView(small, reduced[..., ::-1].astype(np.float32) / 255.0))
+        return views
 
 
 def add_object_flags(parser: argparse.ArgumentParser) -> None:

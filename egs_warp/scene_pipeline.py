@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,6 +27,9 @@ from egs_warp.plane_search import find_planes, plane_under, refine_plane
 from egs_warp.rectified import PlaneWindow
 from egs_warp.segmentation import CELLS, ObjectSpec, Segmentation, segment
 from egs_warp.votes import blending_votes
+
+if TYPE_CHECKING:
+    from egs_warp.finetune import TrainingView
 
 _PLANE_ELEVATIONS = (40.0, 58.0, 75.0)
 """Degrees: seen at a grazing angle, splats in front hide those behind, and the floor seems to lie higher."""
@@ -100,6 +104,7 @@ def prepare_scene(
     spec: ObjectSpec,
     *,
     cameras: Sequence[Camera] = (),
+    photographs: Sequence[TrainingView] | None = None,
     up: np.ndarray | None = None,
     plane: Plane | None = None,
     options: SceneOptions | None = None,
@@ -107,14 +112,15 @@ def prepare_scene(
 ) -> PreparedScene:
     """Everything between a capture and its animation: plane, segmentation, clearing of the plane, inpainting.
 
-    ``cameras`` are the capture's own, if known; ``up`` (3,) is roughly up, and guessed if not given; ``progress`` is
+    ``cameras`` are the capture's own, if known; ``photographs`` of the whole scene take the place of renders in the
+    fine-tune at the plane; ``up`` (3,) is roughly up, and guessed if not given; ``progress`` is
     told the name of each stage. Raises ``UserError`` as the stages do.
     """
     options = options or SceneOptions()
     progress("plane")
     located = locate_plane(cloud, spec, cameras=cameras, up=up, plane=plane)
     progress("segment")
-    thing, bare, notes = take_apart(cloud, located, options)
+    thing, bare, notes = take_apart(cloud, located, options, photographs)
     background = bare
     if options.inpaint:
         progress("inpaint")
@@ -132,20 +138,31 @@ def prepare_scene(
 
 
 def take_apart(
-    cloud: GaussianCloud, located: LocatedPlane, options: SceneOptions
+    cloud: GaussianCloud,
+    located: LocatedPlane,
+    options: SceneOptions,
+    photographs: Sequence[TrainingView] | None = None,
 ) -> tuple[GaussianCloud, GaussianCloud, tuple[str, ...]]:
     """Object, clear of the plane; background with a hole; and what there is to say."""
     found = located.segmentation
     method = options.clearing or (Clearing.FINETUNE if has_torch() else Clearing.SPLIT)
     untouched = cloud.subset(found.object_mask)
     heights, reach = reach_across(untouched, located.plane, options.clearing_options.reach)
-    thing = clear_plane(untouched, located.plane, method, options=options.clearing_options)
     if not found.background_mask.any():
         raise UserError("object: it is the whole capture, so there is no background; leave --object out")
+    thing = clear_plane(
+        untouched,
+        located.plane,
+        method,
+        views=photographs or None,
+        surroundings=cloud.subset(~found.object_mask) if photographs else None,
+        options=options.clearing_options,
+    )
     notes = (
         f"the object has {untouched.count} of {cloud.count} Gaussians; {int(found.buried_mask.sum())} under it and "
         f"{int(found.floater_mask.sum())} floaters beside it were dropped",
-        f"{int((np.abs(heights) < reach).sum())} of the object's Gaussians straddled the plane: {method.value}",
+        f"{int((np.abs(heights) < reach).sum())} of the object's Gaussians straddled the plane: {method.value}"
+        + (f" against {len(photographs)} photographs" if photographs and method is Clearing.FINETUNE else ""),
     )
     return thing, cloud.subset(found.background_mask), notes
 

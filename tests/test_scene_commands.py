@@ -10,13 +10,14 @@ from PIL import Image
 
 from egs_warp.camera import Camera
 from egs_warp.camera_ring import ring_cameras, write_cameras
-from egs_warp.clearance import Clearing
+from egs_warp.clearance import Clearing, ClearingOptions, clear_plane, reach_across
 from egs_warp.cli import main
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.io import read_capture, write_ply
 from egs_warp.plane import Plane
 from egs_warp.plane_file import read_planes, write_planes
+from egs_warp.render import render
 from egs_warp.render.ground import CapturedScene, ContactShadow
 from egs_warp.scene_pipeline import SceneOptions, prepare_scene, viewing_direction
 from egs_warp.segmentation import ObjectSpec, masks_from_selection
@@ -86,6 +87,43 @@ def test_mistakes_are_one_line(
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("egs-warp:")]
     assert status == 2
     assert message in lines[-1]
+
+
+def test_photographs_beside_the_cameras_clear_the_plane(folder: Path) -> None:
+    """Eq. (21) against photographs of the whole scene; a photo of another size than its camera is no photo of it."""
+    pytest.importorskip("torch")
+    from egs_warp.io import read_cameras
+    from egs_warp.scene_input import SceneInput
+
+    cloud, truth = ball_on_floor()
+    posed = read_cameras(folder / "cameras.json")
+    images = folder / "images"
+    images.mkdir(exist_ok=True)
+    for one in posed[:5]:
+        picture = render(cloud, one.camera, background=(0.0, 0.0, 0.0)).colour_srgb8()
+        Image.fromarray(picture[:50] if one is posed[4] else picture).save(images / one.name)
+    given = SceneInput(cloud, read_cameras(folder / "cameras.json"), None, None, None, ())
+    photographs = given.photographs()
+    assert len(photographs) == 4
+    assert photographs[0].image.shape == (96, 96, 3)
+    expected = render(cloud, posed[0].camera, background=(0.0, 0.0, 0.0)).colour.numpy()
+    np.testing.assert_allclose(photographs[0].image, np.clip(expected, 0.0, 1.0), atol=0.51 / 255)
+    thing = cloud.subset(truth & (cloud.means.numpy()[:, 2] > 0.0))
+    tuned = clear_plane(
+        thing,
+        FLOOR,
+        Clearing.FINETUNE,
+        views=photographs,
+        surroundings=cloud.subset(~truth),
+        options=ClearingOptions(iterations=60, subdivisions=0, weight=3.0),
+    )
+
+    def crossing(one: GaussianCloud) -> float:
+        heights, reach = reach_across(one, FLOOR)
+        return float(np.maximum(reach - np.abs(heights), 0.0).sum())
+
+    assert thing.count - 10 <= tuned.count <= thing.count
+    assert crossing(tuned) < 0.6 * crossing(thing)
 
 
 def test_plane_files_are_checked(tmp_path: Path) -> None:

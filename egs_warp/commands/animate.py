@@ -116,6 +116,7 @@ def _animate_scene(chosen: argparse.Namespace, options) -> int:
         given.cloud,
         given.spec,
         cameras=given.cameras,
+        photographs=given.photographs(),
         up=given.up,
         plane=given.plane,
         options=SceneOptions(inpaint=not chosen.no_inpaint),

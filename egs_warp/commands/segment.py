@@ -40,6 +40,7 @@ def _segment(chosen: argparse.Namespace) -> int:
         given.cloud,
         given.spec,
         cameras=given.cameras,
+        photographs=given.photographs(),
         up=given.up,
         plane=given.plane,
         options=SceneOptions(
