@@ -19,7 +19,7 @@ DEEPEST_CROUCH = 0.3
 """Of the height of the centre of mass; a higher jump thrusts harder instead."""
 FOOTHOLD = 0.4
 """Of the footprint: how far from the capture point the feet may be put down for the sake of the target."""
-RUN_ON = 0.05
+RUN_ON = 0.08
 """Of sqrt(H / g): for how long the feet go on at the body's speed when they touch down, swinging and sliding (measured on the pawn)."""
 CLEARANCE = 0.15
 """Of the height of a step: how far above it the feet are before they swing ahead."""

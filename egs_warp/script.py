@@ -48,7 +48,7 @@ VALUES: Mapping[str, tuple[Value, ...]] = {
     "twist": (
         Value("heading_degrees", 180.0, -LARGEST_TURN, LARGEST_TURN, "degrees"),
         _length("distance", 0.0),
-        _length("height", 0.25, above=True),
+        _length("height", 0.3, above=True),
     ),
     "walk": (Value("steps", 4, 1, 50, "steps", whole=True), _length("step_length", 0.1, above=True)),
     "trajectory": (),

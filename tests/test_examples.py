@@ -27,7 +27,7 @@ def example(name: str) -> ModuleType:
 @pytest.mark.parametrize(
     ("name", "asked"),
     [
-        ("twist", {"heading_degrees": 180.0, "distance": 0.0, "height": 0.25}),
+        ("twist", {"heading_degrees": 180.0, "distance": 0.0, "height": 0.3}),
         ("hop", {"distance": 0.7, "height": 0.3, "square": 1.0}),
         ("walk", {"steps": 4.0, "step_length": 0.1, "distance": 0.4}),
     ],
