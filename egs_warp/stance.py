@@ -36,6 +36,8 @@ class Measurement:
     """Metres: lowest contact point above the plane."""
     touching: bool
     """Whether a contact force acts."""
+    load: float
+    """Normal contact forces, body weights."""
     heading: float
     """Radians about z, from the start."""
 
@@ -123,6 +125,7 @@ class PoseFamily:
             base=self._base(local),
             sole_height=report.min_gap if report is not None else 0.0,
             touching=bool(forces > 1e-6 * self.body.weight),
+            load=float(forces / self.body.weight),
             heading=float(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])),
         )
 
