@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import warp as wp
-from scipy import ndimage, sparse
-from scipy.sparse.linalg import spsolve
+from scipy import ndimage
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.rectified import SH_BAND_0, PlaneWindow, RectifiedImage, mean_colours
+from egs_warp.soap_film import soap_film
 
 _WIDTH = 0.62
 """Standard deviation along the plane, in spacings."""
@@ -50,30 +50,6 @@ def rim_heights(before: RectifiedImage, hole: np.ndarray, known: np.ndarray) -> 
     share = ndimage.gaussian_filter(known.astype(np.float64), _RIM_SMOOTHING)
     rim = ndimage.gaussian_filter(rest, _RIM_SMOOTHING) / np.maximum(share, 0.05)
     return level + soap_film(rim, hole)
-
-
-def soap_film(values: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """(rows, columns) ``values`` with the solution of Laplace's equation in ``hole``."""
-    index = np.full(hole.shape, -1)
-    index[hole] = np.arange(hole.sum())
-    rows, columns, sums = [], [], np.zeros(int(hole.sum()))
-    degree = np.zeros(int(hole.sum()))
-    at = np.argwhere(hole)
-    for step in ((0, 1), (1, 0), (0, -1), (-1, 0)):
-        there = at + step
-        inside = ((there >= 0) & (there < hole.shape)).all(axis=1)
-        there = np.clip(there, 0, np.array(hole.shape) - 1)
-        other = np.where(inside, index[there[:, 0], there[:, 1]], -2)
-        degree += inside
-        rows.append(np.flatnonzero(other >= 0))
-        columns.append(other[other >= 0])
-        fixed = other == -1
-        sums[fixed] += values[there[fixed, 0], there[fixed, 1]]
-    row, column = np.concatenate(rows), np.concatenate(columns)
-    matrix = sparse.diags(degree) - sparse.coo_array((np.ones(len(row)), (row, column)), shape=(len(at), len(at)))
-    film = values.astype(np.float64).copy()
-    film[hole] = spsolve(sparse.csc_array(matrix), sums)
-    return film
 
 
 def flat_gaussians(

@@ -18,13 +18,14 @@ from egs_warp.holes import Hole, disc, footprint, unseen
 from egs_warp.inpainters import OpenCvInpainter
 from egs_warp.inpainting import InpaintOptions, InpaintResult, inpaint
 from egs_warp.io import read_capture, write_ply
-from egs_warp.new_floor import rim_heights, soap_film, with_gloss
+from egs_warp.new_floor import rim_heights, with_gloss
 from egs_warp.plane_file import write_planes
 from egs_warp.plane_fit import plane_depth
 from egs_warp.rectified import PlaneWindow, RectifiedImage, mean_colours, rectify
 from egs_warp.render import render
 from egs_warp.scenes import scene
 from egs_warp.scenes.rooms import joined
+from egs_warp.soap_film import soap_film
 from egs_warp.votes import MaskedView
 from tests.floors import PLANE, floor, on_plane, pattern
 
