@@ -15,6 +15,8 @@ from egs_warp.stance import Ground, Measurement, PoseFamily, Weights
 LEAN = 0.2
 """Of the distance: how far the weight is put ahead before take-off. With it over the middle of the feet a push forward would
 turn the body backward."""
+FURTHEST_LEAN = 0.35
+"""Of the way from under the centre of mass to the front of the feet."""
 DEEPEST_CROUCH = 0.3
 """Of the height of the centre of mass; a higher jump thrusts harder instead."""
 FOOTHOLD = 0.4
@@ -26,7 +28,8 @@ CLEARANCE = 0.15
 THRUST_LEAD = 0.7
 """Part of the time of a thrust in which the speed forward is to be reached."""
 AIRBORNE_POSE = 0.08
-"""Weight of the pose in the air, where nothing else can be steered and the feet have to get to their place. Much more crumples the body."""
+"""Weight of the pose in the air, where nothing else can be steered and the feet have to get to their place. Much more crumples the body, and
+one so slender that it was made stiffer to stand (``SoftBody.stiffening``) buckles under less, by the square."""
 IN_TIME = 2.5
 """Over the time left in the air: the rate at which the pose of the landing is approached, gently at first."""
 CALM = 0.03
@@ -73,12 +76,13 @@ class Leap(Jump):
         self.plan = replace(self.plan, crouch_depth=crouch, thrust_time=2.0 * stroke / self.plan.speed_up)
         self._calm_since: float | None = None
         self._pose_weight = self.weights.pose
+        self._airborne_weight = max(AIRBORNE_POSE / place.body.stiffening**2, self._pose_weight)
         self._stance_follow = self._follow
 
     @staticmethod
     def _lean(place: Place, target: JumpTarget) -> float:
         ahead = place.ground.axes[0] @ (place.touching - place.body.centre_of_mass(place.standing)).T
-        return min(LEAN * target.distance, 0.5 * float(ahead.max()))
+        return min(LEAN * target.distance, FURTHEST_LEAN * float(ahead.max()))
 
     @property
     def left_ground(self) -> bool:
@@ -133,7 +137,7 @@ class Leap(Jump):
         super()._advance_phase(replace(seen, touching=seen.touching and seen.velocity[2] < 0.0), time, dt)
         in_air = self.phase is JumpPhase.FLIGHT
         self._follow = self._stance_follow
-        self.weights = replace(self.weights, pose=AIRBORNE_POSE if in_air else self._pose_weight)
+        self.weights = replace(self.weights, pose=self._airborne_weight if in_air else self._pose_weight)
         if in_air and not self.left_ground:
             self.pose, self.ground = self._landing_pose, self._landing
             self._goal_base = self._start_base
