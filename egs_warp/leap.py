@@ -28,8 +28,8 @@ CLEARANCE = 0.15
 THRUST_LEAD = 0.7
 """Part of the time of a thrust in which the speed forward is to be reached."""
 AIRBORNE_POSE = 0.08
-"""Weight of the pose in the air, where nothing else can be steered and the feet have to get to their place. Much more crumples the body, and
-one so slender that it was made stiffer to stand (``SoftBody.stiffening``) buckles under less, by the square."""
+"""Weight of the pose in the air, where nothing else can be steered and the feet have to get to their place. Much more crumples
+the body, and one so slender that it was made stiffer to stand (``SoftBody.stiffening``) buckles under less, by the square."""
 IN_TIME = 2.5
 """Over the time left in the air: the rate at which the pose of the landing is approached, gently at first."""
 CALM = 0.03
