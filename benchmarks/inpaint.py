@@ -69,7 +69,9 @@ def built_in(name: str, device: str) -> Case:
 def real(name: str, device: str) -> Case | None:
     """A hole in uncovered floor; None where the capture is not on this machine."""
     file, coefficients, centre, radius = REAL[name]
-    path = Path(os.environ.get("EGS_WARP_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "scenes" / file
+    path = (
+        Path(os.environ.get("EGS_WARP_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "scenes" / file
+    )
     if not path.exists():
         return None
     hole = disc(Plane.from_coefficients(*coefficients), np.array(centre), radius)
@@ -202,24 +204,24 @@ def judge_case(case: Case, options: argparse.Namespace) -> tuple[list[dict[str, 
     scores: dict[str, list[tuple[float, ...]]] = {OURS: [], CV2: [], NO_PRIOR: []}
     cv2_seconds = []
     strip = np.zeros(0)
-    for number, camera in enumerate(cameras):
+    for camera in cameras[1:]:
         truth, true_depth = picture(case.truth, camera)
         # What stands before the floor is the same in every picture.
         ahead = true_depth - plane_depth(case.hole.plane, camera)
         mask = hole_pixels(result, camera) & (np.abs(ahead) < 0.25 * case.hole.bounds()[1])
+        if mask.sum() < 100:
+            continue
         hollow, hollow_depth = picture(empty, camera)
         started = time.perf_counter()
         smooth = max(by_opencv(hollow, mask), key=lambda image: psnr(image[mask], truth[mask]))
         cv2_seconds.append(time.perf_counter() - started)
         ours, unprior = picture(result.cloud, camera), picture(unguided, camera)
-        if number == 1:
+        if strip.size == 0:
             strip = shown(
                 [hollow, smooth, unprior[0], ours[0], truth],
                 [hollow_depth, None, unprior[1], ours[1], true_depth],
                 case.name,
             )
-        if number == 0 or mask.sum() < 100:
-            continue
         for method, (image, depth) in {OURS: ours, CV2: (smooth, None), NO_PRIOR: unprior}.items():
             off = np.nan if depth is None else np.abs(depth[mask] - true_depth[mask]).mean() / case.hole.bounds()[1]
             scores[method].append(
