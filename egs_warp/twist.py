@@ -14,8 +14,8 @@ from egs_warp.stance import Measurement, Weights
 
 AIRBORNE_SHARE = 0.88
 """Of the planned time of flight the body is off the ground: it stretches before it leaves it and before it lands."""
-SPARE_SPIN = 1.15
-"""Spin is built with this factor in hand: wide in the air it is slowed, narrow it is not sped up by as much."""
+SPARE_SPIN = 1.27
+"""Spin is built with this factor in hand: the muscles fall short of what is asked, and wide in the air the body is slowed."""
 SLIDE = np.radians(5.0)
 """By this angle the feet slide on while friction stops the spin on landing."""
 WIDEST = 1.15

@@ -158,7 +158,7 @@ def test_a_twist_asks_friction_for_the_spin_that_is_left(place: Place, turn: flo
     for angle in np.sign(turn) * np.array([0.0, 0.3, 0.6]):
         report = twist.objectives(BodyState(moved(place, float(angle), np.zeros(3)), still, 0.0), None, DT)
         asked.append(report[1].target[2] / inertia)
-    flight = 0.88 * twist.plan.flight_time / 1.15
+    flight = 0.88 * twist.plan.flight_time / 1.27
     left = abs(turn) - np.radians(5.0) - np.array([0.0, 0.3, 0.6])
     assert np.allclose(np.abs(asked), left / flight, rtol=1e-2) and np.all(np.sign(asked) == np.sign(turn))
     for angle in np.linspace(0.6, abs(turn), 12) * np.sign(turn):
