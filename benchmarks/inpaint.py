@@ -272,7 +272,7 @@ def size_rows(options: argparse.Namespace) -> list[dict[str, Any]]:
     holes = {radius: disc(made.plane, np.array([0.1, 0.2, 0.0]), radius) for radius in (0.16, 0.32)}
     clouds = {radius: damaged(made.background, hole) for radius, hole in holes.items()}
     seconds: dict[float, list[float]] = {radius: [] for radius in holes}
-    for _ in range(max(2, options.repeat)):
+    for _ in range(max(3, options.repeat)):
         for radius, hole in holes.items():
             run = inpaint(clouds[radius], hole, options=InpaintOptions(seed=options.seed))
             seconds[radius].append(sum(run.seconds.values()))

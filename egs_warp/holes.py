@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from egs_warp.bitmaps import depth_inside, distance_to
 from egs_warp.camera import Camera
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
@@ -96,10 +97,10 @@ def footprint(thing: GaussianCloud, plane: Plane) -> Hole:
     covered = np.pad(rectify(thing.subset(low), window, thickness=np.inf).alpha > 0.5, _TEXELS // 2)
     # Feet stay apart, but a sole is whole, though its Gaussians, which nobody has seen, are a sieve.
     reach = _BRIDGED * _TEXELS
-    wide = ndimage.distance_transform_edt(~covered) <= reach
-    closed = (ndimage.distance_transform_edt(wide) > reach) | covered
+    wide = distance_to(covered) <= reach
+    closed = (depth_inside(wide) > reach) | covered
     inner = (slice(_TEXELS // 2, -(_TEXELS // 2)),) * 2
-    return Hole(window, ndimage.binary_fill_holes(closed)[inner])
+    return Hole(window, np.asarray(ndimage.binary_fill_holes(closed))[inner])
 
 
 def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:

@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 from scipy import ndimage
 
+from egs_warp.bitmaps import connected_parts, depth_inside, distance_to
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.holes import Hole
@@ -159,7 +160,7 @@ def _look(background: GaussianCloud, hole: Hole, margin: float) -> tuple[PlaneWi
     full = side * (1.0 + 2.0 * margin)
     across = round(_WINDOW * _TEXELS_ACROSS)
     window = PlaneWindow(plane, centre, full / _TEXELS_ACROSS, across, across)
-    mask = ndimage.distance_transform_edt(~hole.drawn_on(window)) <= margin * side / window.texel
+    mask = distance_to(hole.drawn_on(window)) <= margin * side / window.texel
     means = background.means.numpy()
     floor = near_plane(background, plane, _THICKNESS * side) & (background.opacities() > _SOLID)
     floor &= window.sample(np.ones(mask.shape, bool), means)
@@ -180,13 +181,14 @@ def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """The hole with the gaps in the floor that touch it and the shreds between them, and where the floor is known; both
     (rows, columns) bool."""
     # Pinholes between splats are no gaps.
-    solid = ndimage.binary_closing(np.pad(alpha > _KNOWN, 4, mode="edge"), iterations=2)[4:-4, 4:-4]
-    near = ndimage.distance_transform_edt(~mask) < _GAP_REACH * _TEXELS_ACROSS
-    gaps, _ = ndimage.label(mask | (~solid & near & ~_void(~solid & ~mask)))
+    closed: Any = ndimage.binary_closing(np.pad(alpha > _KNOWN, 4, mode="edge"), iterations=2)
+    solid = np.asarray(closed[4:-4, 4:-4])
+    near = distance_to(mask) < _GAP_REACH * _TEXELS_ACROSS
+    gaps, _ = connected_parts(mask | (~solid & near & ~_void(~solid & ~mask)))
     touching = np.isin(gaps, np.unique(gaps[mask])) & ~mask
     # Where the floor thins out, it is stained.
-    hole = mask | (ndimage.distance_transform_edt(~touching) < _GAP_EDGE if touching.any() else touching)
-    parts, count = ndimage.label(~hole)
+    hole = mask | (distance_to(touching) < _GAP_EDGE if touching.any() else touching)
+    parts, count = connected_parts(~hole)
     sizes = np.bincount(parts.ravel(), minlength=count + 1)
     shreds = (sizes < _SHRED * hole.sum()) & (np.arange(count + 1) > 0)
     hole |= shreds[parts]
@@ -196,10 +198,10 @@ def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def _void(missing: np.ndarray) -> np.ndarray:
     """(rows, columns) bool: the part of ``missing`` floor that lies beyond the floor's edge. What hangs together with it
     by a thin channel only is a gap."""
-    wide, _ = ndimage.label(ndimage.distance_transform_edt(np.pad(missing, 1, mode="edge")) > _CHANNEL)
+    wide, _ = connected_parts(depth_inside(np.pad(missing, 1, mode="edge")) > _CHANNEL)
     edges = np.concatenate([wide[0], wide[-1], wide[:, 0], wide[:, -1]])
     outside = np.isin(wide, np.unique(edges[edges > 0]))[1:-1, 1:-1]
-    return missing & (ndimage.distance_transform_edt(~outside) <= _CHANNEL + 1.0)
+    return missing & (distance_to(outside) <= _CHANNEL + 1.0)
 
 
 def _check(hole: np.ndarray, known: np.ndarray) -> None:

@@ -12,6 +12,8 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
+from egs_warp.bitmaps import connected_parts, depth_inside
+
 _PIECES = (5, 10)
 """Radii, in pixels, of the pieces of the rim whose like is looked for, besides the whole rim."""
 _RING = 6
@@ -53,7 +55,7 @@ def labelled_sources(
     """
     place = np.stack(np.indices(hole.shape), axis=-1)
     sources = place.copy()
-    parts, count = ndimage.label(ndimage.binary_dilation(hole, np.ones((3, 3)), iterations=_RIM), np.ones((3, 3)))
+    parts, count = connected_parts(ndimage.binary_dilation(hole, np.ones((3, 3)), iterations=_RIM), corners=True)
     for part in range(1, count + 1):
         here = parts == part
         offsets = _candidates(image, hole & here, hole, known, shift_limit)
@@ -68,7 +70,7 @@ def labelled_sources(
 def _candidates(image: np.ndarray, part: np.ndarray, hole: np.ndarray, known: np.ndarray, limit: float) -> Offsets:
     """Offsets under which pieces of the rim of ``part``, of several sizes, look most alike somewhere else."""
     usable = (known & ~hole).astype(np.float32)
-    rim = np.argwhere(ndimage.binary_dilation(part) & (usable > 0))
+    rim = np.argwhere(np.asarray(ndimage.binary_dilation(part)) & (usable > 0))
     found: dict[tuple[int, int], np.ndarray] = {}
     middle = np.argwhere(part).mean(axis=0).astype(int)
     whole = int(np.ptp(np.argwhere(part), axis=0).max() // 2 + _RING)
@@ -188,7 +190,7 @@ def _surround_misfit(
     image: np.ndarray, hole: np.ndarray, known: np.ndarray, domain: np.ndarray, offsets: Offsets
 ) -> np.ndarray:
     """(n, k): mean colour difference of each offset over what is known around each pixel of ``domain`` (n, 2)."""
-    width = float(ndimage.distance_transform_edt(hole).max())
+    width = float(depth_inside(hole).max())
     margin = int(2 * width) + 4
     low = np.maximum(domain.min(axis=0) - margin, 0)
     high = np.minimum(domain.max(axis=0) + margin + 1, hole.shape)

@@ -14,6 +14,7 @@ import warp as wp
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
+from egs_warp.bitmaps import depth_inside, nearest_set
 from egs_warp.errors import UserError
 from egs_warp.kernels.patch_synthesis import RADIUS, search_kernel, vote_kernel
 from egs_warp.launching import launch_rows
@@ -84,14 +85,14 @@ class _Level:
         is_source = ndimage.binary_erosion(usable, square, border_value=0)
         targets = ndimage.binary_dilation(hole, square)
         # Deep in the hole the guess counts less than what stands near its rim.
-        confidence = np.where(hole, 1.3 ** -ndimage.distance_transform_edt(hole), np.where(known, 1.0, 0.0))
+        confidence = np.where(hole, 1.3 ** -depth_inside(hole), np.where(known, 1.0, 0.0))
         return cls(image, hole, known, is_source, targets, np.maximum(confidence, 1e-4).astype(np.float32))
 
 
 def _pyramid(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[_Level]:
     """Finest first; each half the size of the one before."""
     levels = [_Level.of(image.astype(np.float32), hole, known)]
-    while ndimage.distance_transform_edt(np.pad(levels[-1].hole, 1)).max() > _COARSEST_HALF_WIDTH:
+    while depth_inside(np.pad(levels[-1].hole, 1)).max() > _COARSEST_HALF_WIDTH:
         fine = levels[-1]
         size = (-(-fine.hole.shape[0] // 2), -(-fine.hole.shape[1] // 2))
         weight = (fine.known & ~fine.hole).astype(np.float32)
@@ -132,7 +133,7 @@ def _doubled(sources: np.ndarray, level: _Level) -> np.ndarray:
 
 def _with_whole_patches(sources: np.ndarray, level: _Level) -> np.ndarray:
     """Each source, or the nearest one around which a whole patch is known."""
-    nearest = ndimage.distance_transform_edt(~level.is_source, return_distances=False, return_indices=True)
+    nearest = nearest_set(level.is_source)
     inside = np.clip(sources, 0, np.array(level.hole.shape) - 1)
     return np.stack([nearest[k][inside[..., 0], inside[..., 1]] for k in (0, 1)], axis=-1).astype(np.int32)
 
