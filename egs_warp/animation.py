@@ -19,6 +19,7 @@ from egs_warp.contact import ContactGeometry, contact_geometry
 from egs_warp.deformation import Deformer
 from egs_warp.embedding import embed_gaussians
 from egs_warp.errors import UserError
+from egs_warp.fibre_files import read_muscles
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.io.atomic import writable_folder
 from egs_warp.locomotion import LocomotionStepper
@@ -119,12 +120,14 @@ def make_creature(
     metres_per_unit: float | None = None,
     friction: float = 0.8,
     sag: float = DEFAULT_SAG,
+    muscles_file: Path | None = None,
     solids: tuple[Solid, ...] = (),
     gravity_up: np.ndarray | None = None,
 ) -> Creature:
     """Give a capture (scene units) a body that stands on ``plane``, or on its own base, square to ``up`` (3,).
 
-    ``solids`` (scene units) are steps and walls beside the ground; ``gravity_up`` (3,) is against gravity if the ground is a slope.
+    ``muscles_file``: see ``body_muscles``. ``solids`` (scene units) are steps and walls beside the ground; ``gravity_up`` (3,) is
+    against gravity if the ground is a slope.
     The body is as stiff as makes it sag by ``sag`` of its height; one that its weight would bend out of shape is made stiffer.
     """
     if plane is None:
@@ -139,19 +142,26 @@ def make_creature(
     geometry = contact_geometry(cloud, cage.mesh, (plane,), solids=solids, friction=friction, device=device)
     while True:
         body = make_body(cage.mesh, plane, up=gravity_up, sag=sag, device=device)
-        muscles = automatic_muscles(
-            cage.mesh,
-            plane.normal,
-            body_weight=body.weight,
-            height=body.height,
-            strength=4.0 * body.stiffening,
-            young_modulus=body.young_modulus,
-        )
+        muscles = body_muscles(body, plane, muscles_file, metres_per_unit=scale)
         stepper = LocomotionStepper(body, muscles, geometry, device=device)
         start = settle(stepper)
         if sag < SMALLEST_SAG or _stands(stepper, start):
             return Creature(cloud, plane, scale, cage, stepper, start, (Solid((plane,)), *solids))
         sag *= 0.5
+
+
+def body_muscles(body: SoftBody, plane: Plane, file: Path | None, *, metres_per_unit: float) -> MuscleSet:
+    """The muscles that ``file`` (JSON, ``egs_warp.fibre_files``) gives a body on ``plane``; without one, automatic ones."""
+    if file is not None:
+        return read_muscles(file, body.mesh, body_weight=body.weight, metres_per_unit=metres_per_unit)
+    return automatic_muscles(
+        body.mesh,
+        plane.normal,
+        body_weight=body.weight,
+        height=body.height,
+        strength=4.0 * body.stiffening,
+        young_modulus=body.young_modulus,
+    )
 
 
 def _stands(stepper: LocomotionStepper, start: BodyState) -> bool:
@@ -172,6 +182,7 @@ def animate(
     plane: Plane | None = None,
     background: GaussianCloud | None = None,
     view_from: np.ndarray | None = None,
+    muscles_file: Path | None = None,
     solids: tuple[Solid, ...] = (),
     gravity_up: np.ndarray | None = None,
     forward: np.ndarray | None = None,
@@ -184,7 +195,7 @@ def animate(
 
     ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.script``). ``background`` (scene
     units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from the object to the camera.
-    ``solids`` and ``gravity_up``: see ``make_creature``; ``forward`` (3,): see ``first_place``. Returns the report
+    ``muscles_file``, ``solids`` and ``gravity_up``: see ``make_creature``; ``forward`` (3,): see ``first_place``. Returns the report
     (docs/report.md). Raises ``UserError`` for bad input, before any file of an earlier run is touched.
     """
     options = options or AnimateOptions()
@@ -199,6 +210,7 @@ def animate(
             plane=plane,
             metres_per_unit=options.metres_per_unit,
             friction=options.friction,
+            muscles_file=muscles_file,
             solids=solids,
             gravity_up=gravity_up,
         )

@@ -50,3 +50,12 @@ def check_device(name: str) -> None:
 
     if name not in (devices := [str(device) for device in wp.get_devices()]):
         raise UserError(f"--device {name}: this machine has {', '.join(devices)}")
+
+
+def guessed_up(capture) -> tuple[np.ndarray, str]:
+    """(3,) up of a ``Capture`` whose file cannot tell, and what to say about it."""
+    from egs_warp.base_plane import guess_up
+
+    up, reason = guess_up(capture.cloud, capture.up)
+    axis = "xyz"[int(np.argmax(np.abs(up)))]
+    return up, f"up is taken to be {'-' if up.sum() < 0 else '+'}{axis} ({reason}); if not, give --up"

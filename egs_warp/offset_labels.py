@@ -70,7 +70,7 @@ def labelled_sources(
 def _candidates(image: np.ndarray, part: np.ndarray, hole: np.ndarray, known: np.ndarray, limit: float) -> Offsets:
     """Offsets under which pieces of the rim of ``part``, of several sizes, look most alike somewhere else."""
     usable = (known & ~hole).astype(np.float32)
-    rim = np.argwhere(np.asarray(ndimage.binary_dilation(part)) & (usable > 0))
+    rim = np.argwhere(np.logical_and(ndimage.binary_dilation(part), usable > 0.0))
     found: dict[tuple[int, int], np.ndarray] = {}
     middle = np.argwhere(part).mean(axis=0).astype(int)
     whole = int(np.ptp(np.argwhere(part), axis=0).max() // 2 + _RING)

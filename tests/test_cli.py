@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from egs_warp.cli_input import parse_plane, parse_up
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.io import write_ply
+from egs_warp.scenes import pawn
 
 
 @pytest.mark.parametrize(
@@ -55,6 +58,22 @@ def test_flat_object_leaves_an_earlier_result_alone(tmp_path: Path, capsys: pyte
     assert "Traceback" not in capsys.readouterr().err
     assert (out / "jump.mp4").read_bytes() == b"precious"
     assert [path.name for path in out.iterdir()] == ["jump.mp4"]
+
+
+def test_own_muscles_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The picture shows what the file says; a fibre outside of the body is refused by name."""
+    thing = pawn()
+    write_ply(tmp_path / "pawn.ply", thing.cloud)
+    flags = ["muscles", str(tmp_path / "pawn.ply"), "--plot", str(tmp_path / "muscles.png")]
+    flags += ["--plane", ",".join(str(x) for x in (*thing.plane.normal, thing.plane.offset))]
+    foot = -thing.plane.offset * thing.plane.normal
+    for far, status in ((0.3, 0), (9.0, 2)):
+        ends = {"from": (foot + 0.1 * thing.plane.normal).tolist(), "to": (foot + far * thing.plane.normal).tolist()}
+        (tmp_path / "own.json").write_text(json.dumps({"fibres": [{"name": "spine", "kind": "longitudinal", **ends}]}))
+        assert main([*flags, "--muscles", str(tmp_path / "own.json")]) == status
+    said = capsys.readouterr()
+    assert "1 fibres, 4 segments" in said.out and 'fibre "spine"' in said.err
+    assert cv2.imread(str(tmp_path / "muscles.png")) is not None
 
 
 def test_axes_and_planes_are_read() -> None:

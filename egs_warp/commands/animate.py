@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
-import numpy as np
-
-from egs_warp.cli_input import check_device, parse_direction, parse_up
+from egs_warp.cli_input import check_device, guessed_up, parse_direction, parse_up
 from egs_warp.scene_input import add_object_flags, plane_of, read_scene, say
 
 
@@ -37,6 +34,9 @@ def add_parser(commands) -> None:
     animate.add_argument(
         "--terrain", type=Path, help="JSON with steps and walls: solids as lists of faces [nx,ny,nz,d]"
     )
+    animate.add_argument(
+        "--muscles", type=Path, help="JSON with fibres (docs/motions.md); else they are made automatically"
+    )
     animate.add_argument("--distance", type=float, help="of a jump or hop, body heights (0.5; 0.7)")
     animate.add_argument("--height", type=float, help="rise of the centre of mass, body heights (0.2)")
     animate.add_argument("--heading-degrees", type=float, help="of a twist, counter-clockwise from above (180)")
@@ -54,7 +54,6 @@ def _animate(chosen: argparse.Namespace) -> int:
 
     wp.config.log_level = wp.LOG_WARNING
     from egs_warp.animation import animate, as_options, summary
-    from egs_warp.base_plane import guess_up
     from egs_warp.io import read_capture
     from egs_warp.terrain import read_terrain
 
@@ -79,10 +78,9 @@ def _animate(chosen: argparse.Namespace) -> int:
     if capture.infinite_opacities:
         notes.append(f"{capture.infinite_opacities} infinite opacities were read as 0 or 1")
     if plane is None and up is None:
-        up, reason = guess_up(capture.cloud, capture.up)
-        axis = "xyz"[int(np.argmax(np.abs(up)))]
-        notes.append(f"up is taken to be {'-' if up.sum() < 0 else '+'}{axis} ({reason}); if not, give --up")
-        print(f"egs-warp: {notes[-1]}", file=sys.stderr)
+        up, note = guessed_up(capture)
+        notes.append(note)
+        say(note)
     report = animate(
         capture.cloud,
         chosen.out,
@@ -92,6 +90,7 @@ def _animate(chosen: argparse.Namespace) -> int:
         view_from=parse_direction("view-from", chosen.view_from) if chosen.view_from else None,
         forward=parse_direction("forward", chosen.forward) if chosen.forward else None,
         gravity_up=parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up else None,
+        muscles_file=chosen.muscles,
         solids=read_terrain(chosen.terrain) if chosen.terrain else (),
         options=options,
         source=Path(chosen.capture).name,
@@ -133,6 +132,7 @@ def _animate_scene(chosen: argparse.Namespace, options) -> int:
         view_from=view_from if view_from is not None else viewing_direction(scene, given.cameras),
         forward=parse_direction("forward", chosen.forward) if chosen.forward else None,
         gravity_up=parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up else None,
+        muscles_file=chosen.muscles,
         solids=read_terrain(chosen.terrain) if chosen.terrain else (),
         options=options,
         source=Path(chosen.capture).name,

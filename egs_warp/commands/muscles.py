@@ -1,0 +1,53 @@
+"""``egs-warp muscles``: the fibres of a body, drawn."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from egs_warp.cli_input import guessed_up, parse_plane, parse_up
+from egs_warp.scene_input import say
+
+
+def add_parser(commands) -> None:
+    """Add the command to the subparsers ``commands``."""
+    muscles = commands.add_parser("muscles", help="draw the muscles of a capture's body, automatic ones or your own")
+    muscles.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog or an unbundled SOG folder")
+    muscles.add_argument("--plot", required=True, type=Path, help="picture.png with the body from three sides")
+    muscles.add_argument(
+        "--muscles", type=Path, help="JSON with fibres (docs/motions.md); else they are made automatically"
+    )
+    muscles.add_argument("--up", help="axis that points up: x, y, z or with a minus, as --up=-y; else it is guessed")
+    muscles.add_argument(
+        "--plane", help="nx,ny,nz,d of the ground n.x + d = 0 in the capture's units; else it is found"
+    )
+    muscles.set_defaults(run=_muscles)
+
+
+def _muscles(chosen: argparse.Namespace) -> int:
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING
+    from egs_warp.animation import body_muscles
+    from egs_warp.base_plane import find_base_plane
+    from egs_warp.body import make_body
+    from egs_warp.cage import build_cage
+    from egs_warp.fibre_plot import plot_muscles
+    from egs_warp.io import read_capture
+
+    up = parse_up(chosen.up) if chosen.up else None
+    plane = parse_plane(chosen.plane) if chosen.plane else None
+    capture = read_capture(chosen.capture)
+    if plane is None:
+        if up is None:
+            up, note = guessed_up(capture)
+            say(note)
+        plane = find_base_plane(capture.cloud, up)
+    cage = build_cage(capture.cloud, plane)
+    scale = 1.0 / cage.height(plane)
+    cage, plane = cage.scaled(scale), plane.scaled(scale)
+    body = make_body(cage.mesh, plane)
+    muscles = body_muscles(body, plane, chosen.muscles, metres_per_unit=scale)
+    plot_muscles(cage.mesh, muscles, chosen.plot, up=plane.normal)
+    print(f"{muscles.fibre_count} fibres, {muscles.segment_count} segments; wrote {chosen.plot}")
+    return 0
