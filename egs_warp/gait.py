@@ -27,7 +27,7 @@ class Gait:
     def of(cls, steps: int, step_length: float, *, height: float, gravity: float) -> Gait:
         """The gait of a body of ``height`` metres under ``gravity`` m/s^2."""
         time_unit = float(np.sqrt(height / gravity))
-        return cls(steps, step_length, 0.78 * time_unit, 0.63 * time_unit, 0.03 * height)
+        return cls(steps, step_length, 0.94 * time_unit, 0.78 * time_unit, 0.03 * height)
 
     @property
     def swings(self) -> int:

@@ -65,7 +65,7 @@ def test_a_walk_goes_along_its_feet_and_refuses_other_bodies() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("slope", [0.0, 5.0])
 def test_a_coarse_stool_takes_a_step(slope: float) -> None:
-    """One step, up a slope too, and the closing one: each foot lands once, none slips (3 % of the stride on the slope), distance met, the
+    """One step, up a slope too, and the closing one: each foot lands once, none slips 2 % of the stride, the distance is met, the
     audit holds."""
     tilt = np.radians(slope)
     up = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
@@ -84,8 +84,7 @@ def test_a_coarse_stool_takes_a_step(slope: float) -> None:
     trajectory = record(body, stepper.geometry, start, 0.0, reports, drag=0.0, segments=stepper.muscles.segment_count)
     fell, reached, found = walk.footfalls(trajectory, 0, -1), measure(trajectory), audit(trajectory)
     assert walk.phase is WalkPhase.REST and walk.notes() == []
-    # The bound of 2 % is for flat ground; up a slope the splayed legs of so coarse a stool spring by a little more.
-    assert fell.landings == 4 and fell.slip < (0.02 if slope == 0.0 else 0.03) and fell.sole_shift < 0.05
+    assert fell.landings == 4 and fell.slip < 0.02 and fell.sole_shift < 0.05
     assert air > 0.3 * walk.gait.lift
     assert reached.distance * body.height == pytest.approx(0.06, rel=0.1)
     assert reached.tilt_degrees < 3.0 and abs(reached.heading_degrees) < 3.0 and reached.airborne_frames == 0.0
