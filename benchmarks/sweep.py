@@ -77,7 +77,7 @@ def run(case: Case) -> dict:
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING
-    from egs_warp.animation import first_place, make_creature
+    from egs_warp.creature import first_place, make_creature
     from egs_warp.errors import UserError
     from egs_warp.io import read_capture
     from egs_warp.repertoire import longest, parts_of

@@ -101,3 +101,21 @@ def write_report(path: Path, report: dict) -> None:
     """Write ``report`` as indented JSON; the file appears whole or not at all."""
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(report, indent=2) + "\n")
+
+
+def summary(report: dict) -> str:
+    """A few lines for the terminal."""
+    lines = []
+    for entry in report["motion"]:
+        reached, asked = entry["reached"], entry["asked"]
+        pairs = [
+            f"{name} {reached[name]:.3f} of {asked[name]:g}" if name in asked else f"{name} {reached[name]:.3f}"
+            for name in ("distance", "height", "heading_degrees")
+        ]
+        lines.append(
+            f"{entry['name']}: {', '.join(pairs)}, tilt {reached['tilt_degrees']:.1f} degrees, "
+            f"airborne {reached['airborne_frames']:.0f} frames (lengths in body heights)"
+        )
+        lines += [f"note: {note}" for note in entry["notes"]]
+    lines.append("audit: " + ", ".join(f"{name} {value:.2g}" for name, value in report["audit"].items()))
+    return "\n".join([*lines, *(f"note: {note}" for note in report["notes"])])

@@ -90,7 +90,7 @@ def simulate(
     frames: int,
     step: float | None = None,
     finished: Callable[[], bool] = lambda: False,
-    progress: Callable[[int], None] = lambda frame: None,
+    progress: Callable[[int], object] = lambda frame: None,
 ) -> Simulation:
     """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``.
 

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from egs_warp.animation import AnimateOptions, animate, summary
+from egs_warp.animation import AnimateOptions, animate
+from egs_warp.report import summary
 from egs_warp.scenes import scene
 from egs_warp.scenes.rooms import SQUARE
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from egs_warp.animation import AnimateOptions, animate, summary
+from egs_warp.animation import AnimateOptions, animate
+from egs_warp.report import summary
 from egs_warp.scenes import stool
 
 

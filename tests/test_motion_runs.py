@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egs_warp.animation import first_place, make_creature
+from egs_warp.creature import first_place, make_creature
 from egs_warp.hop import Hop
 from egs_warp.plane import Plane
 from egs_warp.repertoire import longest, parts_of

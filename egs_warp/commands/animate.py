@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from egs_warp.cli_input import check_device, guessed_up, parse_direction, parse_up
 from egs_warp.scene_input import add_object_flags, plane_of, read_scene, say
@@ -53,26 +54,24 @@ def _animate(chosen: argparse.Namespace) -> int:
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING
-    from egs_warp.animation import animate, as_options, summary
-    from egs_warp.io import read_capture
-    from egs_warp.terrain import read_terrain
+    from egs_warp.report import summary
 
-    options = as_options(
-        distance=chosen.distance,
-        height=chosen.height,
-        heading_degrees=chosen.heading_degrees,
-        frames=chosen.frames,
-        size=chosen.size,
-        seed=chosen.seed,
-        metres_per_unit=chosen.metres_per_unit,
-        friction=chosen.friction,
-        shadow=not chosen.no_shadow,
-    )
-    if chosen.object:
-        return _animate_scene(chosen, options)
+    report, more = _animate_scene(chosen) if chosen.object else _animate_capture(chosen)
+    print(summary(report))
+    print(f"wrote the video, sheet.png, report.json, trajectory.npz{more} into {chosen.out}")
+    return 0
+
+
+def _animate_capture(chosen: argparse.Namespace) -> tuple[dict, str]:
+    """A capture that is the object alone; returns the report, and what was written besides."""
+    from egs_warp.animation import animate
+    from egs_warp.io import read_capture
+
+    asked = _asked(chosen)
     check_device(chosen.device)
     up = parse_up(chosen.up) if chosen.up else None
     plane = plane_of(chosen.plane) if chosen.plane else None
+    view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from else None
     capture = read_capture(chosen.capture, device=chosen.device)
     notes = list(capture.notes)
     if capture.infinite_opacities:
@@ -81,33 +80,17 @@ def _animate(chosen: argparse.Namespace) -> int:
         up, note = guessed_up(capture)
         notes.append(note)
         say(note)
-    report = animate(
-        capture.cloud,
-        chosen.out,
-        motion=chosen.motion,
-        up=up,
-        plane=plane,
-        view_from=parse_direction("view-from", chosen.view_from) if chosen.view_from else None,
-        forward=parse_direction("forward", chosen.forward) if chosen.forward else None,
-        gravity_up=parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up else None,
-        muscles_file=chosen.muscles,
-        solids=read_terrain(chosen.terrain) if chosen.terrain else (),
-        options=options,
-        source=Path(chosen.capture).name,
-        notes=tuple(notes),
-    )
-    print(summary(report))
-    print(f"wrote the video, sheet.png, report.json, trajectory.npz into {chosen.out}")
-    return 0
+    report = animate(capture.cloud, chosen.out, up=up, plane=plane, view_from=view_from, notes=tuple(notes), **asked)
+    return report, ""
 
 
-def _animate_scene(chosen: argparse.Namespace, options) -> int:
+def _animate_scene(chosen: argparse.Namespace) -> tuple[dict, str]:
     """The object of a scene, cut out of it, over the rest of the scene."""
-    from egs_warp.animation import animate, summary
+    from egs_warp.animation import animate
     from egs_warp.io.atomic import writable_folder
     from egs_warp.scene_pipeline import SceneOptions, prepare_scene, viewing_direction
-    from egs_warp.terrain import read_terrain
 
+    asked = _asked(chosen)
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from else None
     given = read_scene(chosen)
     folder = writable_folder(chosen.out)
@@ -126,21 +109,29 @@ def _animate_scene(chosen: argparse.Namespace, options) -> int:
     report = animate(
         scene.object,
         folder,
-        motion=chosen.motion,
         plane=scene.plane,
         background=scene.background,
         view_from=view_from if view_from is not None else viewing_direction(scene, given.cameras),
-        forward=parse_direction("forward", chosen.forward) if chosen.forward else None,
-        gravity_up=parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up else None,
-        muscles_file=chosen.muscles,
-        solids=read_terrain(chosen.terrain) if chosen.terrain else (),
-        options=options,
-        source=Path(chosen.capture).name,
         notes=(*given.notes, *scene.notes),
+        **asked,
     )
     scene.write(folder)
-    print(summary(report))
-    print(
-        f"wrote the video, sheet.png, report.json, trajectory.npz, object.ply, background.ply, plane.json into {folder}"
-    )
-    return 0
+    return report, ", object.ply, background.ply, plane.json"
+
+
+def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
+    """What the flags say of the motion, as arguments of ``animate``."""
+    from egs_warp.animation import AnimateOptions
+    from egs_warp.terrain import read_terrain
+
+    numbers = ("distance", "height", "heading_degrees", "frames", "size", "seed", "metres_per_unit", "friction")
+    given = {name: getattr(chosen, name) for name in numbers if getattr(chosen, name) is not None}
+    return {
+        "motion": chosen.motion,
+        "forward": parse_direction("forward", chosen.forward) if chosen.forward else None,
+        "gravity_up": parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up else None,
+        "muscles_file": chosen.muscles,
+        "solids": read_terrain(chosen.terrain) if chosen.terrain else (),
+        "options": AnimateOptions(**given, shadow=not chosen.no_shadow),
+        "source": Path(chosen.capture).name,
+    }

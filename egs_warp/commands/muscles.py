@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from egs_warp.cli_input import guessed_up, parse_plane, parse_up
-from egs_warp.scene_input import say
+from egs_warp.cli_input import guessed_up, parse_up
+from egs_warp.scene_input import plane_of, say
 
 
 def add_parser(commands) -> None:
@@ -19,7 +19,7 @@ def add_parser(commands) -> None:
     )
     muscles.add_argument("--up", help="axis that points up: x, y, z or with a minus, as --up=-y; else it is guessed")
     muscles.add_argument(
-        "--plane", help="nx,ny,nz,d of the ground n.x + d = 0 in the capture's units; else it is found"
+        "--plane", help="nx,ny,nz,d of the ground n.x + d = 0 in the capture's units, or a plane.json; else it is found"
     )
     muscles.set_defaults(run=_muscles)
 
@@ -28,15 +28,15 @@ def _muscles(chosen: argparse.Namespace) -> int:
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING
-    from egs_warp.animation import body_muscles
     from egs_warp.base_plane import find_base_plane
     from egs_warp.body import make_body
     from egs_warp.cage import build_cage
+    from egs_warp.creature import body_muscles
     from egs_warp.fibre_plot import plot_muscles
     from egs_warp.io import read_capture
 
     up = parse_up(chosen.up) if chosen.up else None
-    plane = parse_plane(chosen.plane) if chosen.plane else None
+    plane = plane_of(chosen.plane) if chosen.plane else None
     capture = read_capture(chosen.capture)
     if plane is None:
         if up is None:
