@@ -124,6 +124,20 @@ def microphone() -> PaintedMesh:
     return PaintedMesh("microphone", vertices, faces, checkers(0.06, ((0.15, 0.15, 0.2), (0.75, 0.75, 0.8))))
 
 
+def spot() -> PaintedMesh:
+    """Keenan Crane's cow."""
+    vertices, faces = _read_obj(data_folder() / "meshes" / "spot" / "spot_triangulated.obj")
+    vertices, faces = _subdivided(_standing(vertices[:, [0, 2, 1]] * [1, -1, 1]), faces, 0.03)
+    return PaintedMesh("spot", vertices, faces, checkers(0.07, ((0.9, 0.9, 0.85), (0.35, 0.25, 0.2))))
+
+
+def stool() -> PaintedMesh:
+    """The bar stool."""
+    vertices, faces = _read_obj(data_folder() / "meshes" / "stool" / "stools_stool_model_0.obj")
+    vertices, faces = _subdivided(_standing(vertices), faces, 0.03)
+    return PaintedMesh("stool", vertices, faces, checkers(0.07, ((0.3, 0.35, 0.6), (0.85, 0.75, 0.5))))
+
+
 def bar() -> PaintedMesh:
     """The checkered bar of Figure 8: a quarter as thick as it is high, in bricks of long sides, as long Gaussians want."""
     corners = np.array([[x, y, z] for x in (-0.125, 0.125) for y in (-0.125, 0.125) for z in (0.0, 1.0)])
