@@ -8,7 +8,6 @@ from enum import Enum
 
 import numpy as np
 import qdldl
-import scipy.sparse as sparse
 
 from egs_warp.body import BodyState, SoftBody
 
@@ -207,47 +206,3 @@ def conserve_angular_momentum(
     spin = np.linalg.solve(body.inertia(positions), missing)
     arms_after = positions - body.centre_of_mass(positions)
     return velocities + np.cross(spin, arms_after), float(np.linalg.norm(spin))
-
-
-def static_equilibrium(body: SoftBody, held: sparse.csr_matrix, start: np.ndarray) -> np.ndarray:
-    """(N, 3) positions at rest under gravity with the points ``held @ positions`` kept where they are at ``start``.
-
-    Implicit steps from rest with stiff springs at the held points, each point inside one tetrahedron; used to begin a motion from a
-    settled pose. The springs give way by 1e-5 H under the whole weight.
-    """
-    time_unit = np.sqrt(body.height / np.linalg.norm(body.gravity))
-    dt = 0.05 * time_unit
-    factorisation = Factorisation(body)
-    positions = start.copy()
-    gravity = body.node_mass[:, None] * body.gravity
-    anchors = held @ start
-    stiffness = 1e5 * body.weight / (body.height * max(len(anchors), 1))
-    for _ in range(400):
-        step = ImplicitStep(body, BodyState(positions, np.zeros_like(positions)), dt, factorisation)
-        result = step.minimise(gravity, np.zeros_like(positions), _springs(step, held, anchors, stiffness))
-        moved = dt * float(np.abs(result.velocities).max())
-        positions = step.end_positions(result.velocities)
-        dt = min(dt * 1.3, 0.2 * time_unit)
-        if moved < 1e-7 * body.height:
-            break
-    return positions
-
-
-def _springs(step: ImplicitStep, held: sparse.csr_matrix, anchors: np.ndarray, stiffness: float) -> PenaltyTerms:
-    """Springs that pull ``held @ positions`` to ``anchors`` (K, 3), implicit in the end velocity."""
-    assembly, dt = step.body.assembly, step.dt
-    pairs = sparse.triu(held.T @ held).tocoo()
-    where = assembly.entries_of_node_pairs(pairs.row, pairs.col)
-    values = dt**2 * stiffness * pairs.data[:, None] * np.eye(3).ravel()
-
-    def stretch(velocities: np.ndarray) -> np.ndarray:
-        return held @ step.end_positions(velocities) - anchors
-
-    def add_hessian(_: np.ndarray, entries: np.ndarray) -> None:
-        np.add.at(entries, where[where >= 0], values[where >= 0])
-
-    return PenaltyTerms(
-        energy=lambda v: 0.5 * stiffness * float((stretch(v) ** 2).sum()),
-        gradient=lambda v: dt * stiffness * (held.T @ stretch(v)),
-        add_hessian=add_hessian,
-    )
