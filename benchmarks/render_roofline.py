@@ -15,7 +15,7 @@ import warp as wp
 
 from egs_warp.camera import Camera
 from egs_warp.gaussians import GaussianCloud
-from egs_warp.kernels.render_ellipse import ALPHA_CUT, ALPHA_LIMIT, TILE, TILE_PIXELS, TRANSMITTANCE_STOP
+from egs_warp.kernels.render_ellipse import ALPHA_CUT, TILE_PIXELS, TRANSMITTANCE_STOP, pixel_of_thread, splat_alpha
 from egs_warp.launching import launch_rows
 from egs_warp.render.backward import backward
 from egs_warp.render.compositing import Background, composite
@@ -41,13 +41,10 @@ def hits_kernel(
 ):
     """Splats that each pixel blends: what no renderer of the same picture can leave out."""
     thread = wp.tid()
-    tile = thread / TILE_PIXELS
-    i = thread % TILE_PIXELS
-    columns = (width + TILE - 1) / TILE
-    column = (tile % columns) * TILE + i % TILE
-    row = (tile / columns) * TILE + i / TILE
-    if column >= width or row >= height:
+    pixel = pixel_of_thread(thread, width)
+    if pixel[0] >= width or pixel[1] >= height:
         return
+    tile = thread / TILE_PIXELS
     passing = wp.float32(1.0)
     hits = wp.int32(0)
     intersection = tile_start[tile]
@@ -55,17 +52,13 @@ def hits_kernel(
     while intersection < end:
         g = gaussian_from_intersection[intersection]
         intersection += 1
-        e = ellipse[g]
-        f = falloff[g]
-        dy = wp.float32(row) + 0.5 - e[1]
-        u = wp.float32(column) + 0.5 - e[0] + e[3] * dy
-        alpha = wp.min(wp.exp(f[1] - f[0] * dy * dy - e[2] * u * u), ALPHA_LIMIT)
+        alpha = splat_alpha(ellipse[g], falloff[g], pixel)
         if alpha >= ALPHA_CUT:
             passing = passing * (1.0 - alpha)
             hits += 1
             if passing <= TRANSMITTANCE_STOP:
                 intersection = end
-    hits_out[row * width + column] = hits
+    hits_out[pixel[1] * width + pixel[0]] = hits
 
 
 @wp.kernel
@@ -202,7 +195,7 @@ def _counts(projected: ProjectedGaussians, lists: TileLists, view: Any) -> dict[
     hits = wp.zeros(int(view.width * view.height), dtype=wp.int32, device=device)
     wp.launch(
         hits_kernel,
-        dim=lists.tile_count * 256,
+        dim=lists.tile_count * TILE_PIXELS,
         inputs=[
             *(view.width, view.height, lists.tile_start, lists.gaussian_from_intersection),
             *(projected.ellipse, projected.falloff),

@@ -1,39 +1,93 @@
-"""What is seldom asked of a picture: median depth and normals."""
+"""Tiles to pixels, and back: what blends is in ``composite_cpu`` and ``composite_cuda``."""
 
 import warp as wp
 
-from egs_warp.kernels.render_ellipse import ALPHA_CUT, ALPHA_LIMIT, TILE, TILE_PIXELS, TRANSMITTANCE_STOP
-from egs_warp.kernels.render_projection import View, rotation_matrix
+from egs_warp.kernels import composite_cpu, composite_cuda
+from egs_warp.kernels.render_backward import pixel_gradient
+from egs_warp.kernels.render_ellipse import TILE, TILE_PIXELS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
-@wp.kernel
-def splat_normals_kernel(
-    first: wp.int32,
-    # In:
-    view: View,
-    means: wp.array[wp.vec3],
-    rotations: wp.array[wp.vec4],
-    log_scales: wp.array[wp.vec3],
-    # Out:
-    normal_out: wp.array[wp.vec3],
+def _by_device(*, cpu: str = "", cuda: str = "") -> str:
+    return f"""
+#if defined(__CUDA_ARCH__)
+{cuda}
+#else
+{cpu}
+#endif
+"""
+
+
+@wp.func_native(_by_device(cpu=composite_cpu.FORWARD, cuda=composite_cuda.FORWARD))
+def composite_tile(
+    width: wp.int32,
+    height: wp.int32,
+    left: wp.int32,
+    top: wp.int32,
+    start: wp.int32,
+    end: wp.int32,
+    gaussians: wp.array[wp.int32],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    colour_depth: wp.array[wp.vec4],
+    flat_background: wp.vec3,
+    background: wp.array[wp.vec3],
+    colour: wp.array2d[wp.vec3],
+    alpha_out: wp.array2d[wp.float32],
+    depth: wp.array2d[wp.float32],
 ):
-    """Thinnest axis of every Gaussian in camera axes, on the camera's side."""
-    g = wp.tid() + first
-    s = log_scales[g]
-    axis = wp.vec3(1.0, 0.0, 0.0)
-    if s[1] < s[0] and s[1] <= s[2]:
-        axis = wp.vec3(0.0, 1.0, 0.0)
-    elif s[2] < s[0] and s[2] < s[1]:
-        axis = wp.vec3(0.0, 0.0, 1.0)
-    normal = view.rotation * (rotation_matrix(rotations[g]) * axis)
-    towards = wp.dot(normal, view.rotation * means[g] + view.translation)
-    normal_out[g] = wp.where(towards > 0.0, -normal, normal)
+    """Front-to-back blend of one tile by its thread (CPU) or block (CUDA)."""
+    ...
+
+
+@wp.func_native(_by_device(cpu=composite_cpu.BACKWARD))
+def composite_backward_tile(
+    width: wp.int32,
+    height: wp.int32,
+    left: wp.int32,
+    top: wp.int32,
+    start: wp.int32,
+    end: wp.int32,
+    gaussians: wp.array[wp.int32],
+    slots: wp.array[wp.int32],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    colour_depth: wp.array[wp.vec4],
+    sum_gradient: wp.array[wp.vec4],
+    remaining: wp.array[wp.float32],
+    moments: wp.array2d[wp.vec4],
+):
+    """Gradient sums of one tile's splats (CPU); the same walk and rounding as ``composite_tile``."""
+    ...
+
+
+@wp.func_native(_by_device(cuda=composite_cuda.BACKWARD))
+def composite_backward_block(
+    width: wp.int32,
+    height: wp.int32,
+    left: wp.int32,
+    top: wp.int32,
+    start: wp.int32,
+    end: wp.int32,
+    gaussians: wp.array[wp.int32],
+    slots: wp.array[wp.int32],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    colour_depth: wp.array[wp.vec4],
+    sum_gradient: wp.vec4,
+    remaining: wp.float32,
+    moments: wp.array2d[wp.vec4],
+):
+    """Gradient sums of one tile's splats by its block (CUDA); the same walk and rounding as ``composite_tile``.
+
+    ``sum_gradient`` and ``remaining`` are those of the thread's own pixel.
+    """
+    ...
 
 
 @wp.kernel
-def composite_geometry_kernel(
+def composite_tile_kernel(
     first: wp.int32,
     # In:
     width: wp.int32,
@@ -43,43 +97,133 @@ def composite_geometry_kernel(
     ellipse: wp.array[wp.vec4],
     falloff: wp.array[wp.vec2],
     colour_depth: wp.array[wp.vec4],
-    normal: wp.array[wp.vec3],
+    flat_background: wp.vec3,
+    background: wp.array[wp.vec3],
     # Out:
-    median_depth_out: wp.array[wp.float32],
-    normal_out: wp.array[wp.vec3],
+    colour_out: wp.array2d[wp.vec3],
+    alpha_out: wp.array2d[wp.float32],
+    depth_out: wp.array2d[wp.float32],
 ):
-    """One thread walks one pixel for what is seldom asked: where half of the light is stopped, and the mean normal."""
-    thread = wp.tid() + first
-    tile = thread / TILE_PIXELS
-    i = thread % TILE_PIXELS
+    """One thread composites one tile (CPU), or one block of ``TILE_PIXELS`` threads (CUDA)."""
+    tile = (wp.tid() + first) / wp.block_dim()
     columns = (width + TILE - 1) / TILE
-    column = (tile % columns) * TILE + i % TILE
-    row = (tile / columns) * TILE + i / TILE
-    if column >= width or row >= height:
-        return
-    x = wp.float32(column) + 0.5
-    y = wp.float32(row) + 0.5
-    median = wp.float32(0.0)
-    normal_sum = wp.vec3()
-    passing = wp.float32(1.0)
-    intersection = tile_start[tile]
-    end = tile_start[tile + 1]
-    while intersection < end:
-        g = gaussian_from_intersection[intersection]
-        intersection += 1
-        e = ellipse[g]
-        f = falloff[g]
-        dy = y - e[1]
-        u = x - e[0] + e[3] * dy
-        alpha = wp.min(wp.exp(f[1] - f[0] * dy * dy - e[2] * u * u), ALPHA_LIMIT)
-        if alpha >= ALPHA_CUT:
-            after = passing * (1.0 - alpha)
-            if after <= TRANSMITTANCE_STOP:
-                intersection = end
-            else:
-                normal_sum += passing * alpha * normal[g]
-                if passing > 0.5 and after <= 0.5:
-                    median = colour_depth[g][3]
-                passing = after
-    median_depth_out[row * width + column] = median
-    normal_out[row * width + column] = normal_sum
+    composite_tile(
+        width,
+        height,
+        (tile % columns) * TILE,
+        (tile / columns) * TILE,
+        tile_start[tile],
+        tile_start[tile + 1],
+        gaussian_from_intersection,
+        ellipse,
+        falloff,
+        colour_depth,
+        flat_background,
+        background,
+        colour_out,
+        alpha_out,
+        depth_out,
+    )
+
+
+@wp.kernel
+def composite_backward_tile_kernel(
+    first: wp.int32,
+    # In:
+    width: wp.int32,
+    height: wp.int32,
+    tile_start: wp.array[wp.int32],
+    gaussian_from_intersection: wp.array[wp.int32],
+    slot_from_intersection: wp.array[wp.int32],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    colour_depth: wp.array[wp.vec4],
+    sum_gradient: wp.array[wp.vec4],
+    remaining: wp.array[wp.float32],
+    # Out:
+    moments_out: wp.array2d[wp.vec4],
+):
+    """One thread walks one tile again and sums each splat's gradient over its pixels.
+
+    With k = alpha dL/dalpha per pixel, ``moments_out[slot]`` holds (sum k, k u, k dy, k u^2), (k u dy, k dy^2, by depth, 0)
+    and (by colour, 0).
+    """
+    tile = wp.tid() + first
+    columns = (width + TILE - 1) / TILE
+    composite_backward_tile(
+        width,
+        height,
+        (tile % columns) * TILE,
+        (tile / columns) * TILE,
+        tile_start[tile],
+        tile_start[tile + 1],
+        gaussian_from_intersection,
+        slot_from_intersection,
+        ellipse,
+        falloff,
+        colour_depth,
+        sum_gradient,
+        remaining,
+        moments_out,
+    )
+
+
+@wp.kernel
+def composite_backward_block_kernel(
+    # In:
+    width: wp.int32,
+    height: wp.int32,
+    tile_start: wp.array[wp.int32],
+    gaussian_from_intersection: wp.array[wp.int32],
+    slot_from_intersection: wp.array[wp.int32],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    colour_depth: wp.array[wp.vec4],
+    colour: wp.array2d[wp.vec3],
+    alpha: wp.array2d[wp.float32],
+    depth: wp.array2d[wp.float32],
+    colour_gradient: wp.array2d[wp.vec3],
+    alpha_gradient: wp.array2d[wp.float32],
+    depth_gradient: wp.array2d[wp.float32],
+    # Out:
+    moments_out: wp.array2d[wp.vec4],
+):
+    """A block of 256 threads does for one tile what ``composite_backward_tile_kernel`` does with one."""
+    tile = wp.tid() / TILE_PIXELS
+    columns = (width + TILE - 1) / TILE
+    left = (tile % columns) * TILE
+    top = (tile / columns) * TILE
+    # A warp has 8 x 4 pixels; two such parts stand side by side.
+    i = wp.tid() % TILE_PIXELS
+    part = i / 32
+    column = left + (part % 2) * 8 + i % 8
+    row = top + (part / 2) * 4 + (i % 32) / 8
+    by_sums = wp.vec4()
+    remaining = wp.float32(0.0)
+    if column < width and row < height:
+        by_sums, remaining = pixel_gradient(
+            row,
+            column,
+            colour,
+            alpha,
+            depth,
+            colour_gradient,
+            alpha_gradient,
+            depth_gradient,
+        )
+    composite_backward_block(
+        width,
+        height,
+        left,
+        top,
+        tile_start[tile],
+        tile_start[tile + 1],
+        gaussian_from_intersection,
+        slot_from_intersection,
+        ellipse,
+        falloff,
+        colour_depth,
+        by_sums,
+        remaining,
+        moments_out,
+    )

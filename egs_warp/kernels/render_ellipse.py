@@ -1,4 +1,4 @@
-"""Screen ellipses: constants of the splatting model and the exact ellipse-tile test."""
+"""Screen ellipses: constants of the splatting model, a splat's alpha, and the exact ellipse-tile test."""
 
 import warp as wp
 
@@ -16,6 +16,23 @@ TRANSMITTANCE_STOP = wp.constant(wp.float32(1.0e-4))
 TILE = wp.constant(16)
 """Side of a square tile in pixels."""
 TILE_PIXELS = wp.constant(256)
+
+
+@wp.func
+def pixel_of_thread(thread: wp.int32, width: wp.int32) -> wp.vec2i:
+    """Column and row of the pixel of a thread, ``TILE_PIXELS`` threads to a tile; it may lie outside of the picture."""
+    tile = thread / TILE_PIXELS
+    i = thread % TILE_PIXELS
+    columns = (width + TILE - 1) / TILE
+    return wp.vec2i((tile % columns) * TILE + i % TILE, (tile / columns) * TILE + i / TILE)
+
+
+@wp.func
+def splat_alpha(ellipse: wp.vec4, falloff: wp.vec2, pixel: wp.vec2i) -> wp.float32:
+    """What one splat hides of a pixel's middle, at most ``ALPHA_LIMIT``."""
+    dy = wp.float32(pixel[1]) + 0.5 - ellipse[1]
+    u = wp.float32(pixel[0]) + 0.5 - ellipse[0] + ellipse[3] * dy
+    return wp.min(wp.exp(falloff[1] - falloff[0] * dy * dy - ellipse[2] * u * u), ALPHA_LIMIT)
 
 
 @wp.func

@@ -9,6 +9,8 @@ import warp as wp
 
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.kernels.render_backward import pixel_gradients_kernel, project_backward_kernel
+from egs_warp.kernels.render_compositing import composite_backward_block_kernel, composite_backward_tile_kernel
+from egs_warp.kernels.render_ellipse import TILE_PIXELS
 from egs_warp.launching import launch_again, launch_rows
 from egs_warp.render.arrays import empty
 from egs_warp.render.compositing import RenderedImage
@@ -62,20 +64,14 @@ def backward(
     ]
     pixels = [image.colour, image.alpha, image.depth, colour_gradient, alpha_gradient, depth_gradient]
     if device.is_cuda:
-        # Imported here because this module holds CUDA code that a CPU cannot compile.
-        from egs_warp.kernels.render_cuda import composite_backward_block_kernel
-
         launch_again(
             composite_backward_block_kernel,
-            lists.tile_count * 256,
+            lists.tile_count * TILE_PIXELS,
             inputs=[*walked, *pixels],
             outputs=[moments],
             device=device,
         )
     else:
-        # Likewise: a GPU's compiler would refuse this one.
-        from egs_warp.kernels.render_cpu import composite_backward_tile_kernel
-
         pixel_count = int(view.width) * int(view.height)
         sum_gradient = empty(pixel_count, wp.vec4, device)
         remaining = empty(pixel_count, wp.float32, device)

@@ -9,8 +9,10 @@ import numpy as np
 import warp as wp
 
 from egs_warp.gaussians import GaussianCloud
-from egs_warp.kernels.render_compositing import composite_geometry_kernel, splat_normals_kernel
-from egs_warp.launching import launch_again, launch_rows
+from egs_warp.kernels.render_compositing import composite_tile_kernel
+from egs_warp.kernels.render_ellipse import TILE_PIXELS
+from egs_warp.kernels.render_geometry import composite_geometry_kernel, splat_normals_kernel
+from egs_warp.launching import launch_rows
 from egs_warp.render.arrays import empty
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.tiles import TileLists
@@ -66,25 +68,15 @@ def composite(
         background.flat,
         background.image,
     ]
-    outputs = [colour, alpha, depth]
-    if device.is_cuda:
-        # Imported here because this module holds CUDA code that a CPU cannot compile.
-        from egs_warp.kernels.render_cuda import composite_block_kernel
-
-        launch_again(composite_block_kernel, lists.tile_count * 256, inputs=inputs, outputs=outputs, device=device)
-    else:
-        # Likewise: a GPU's compiler would refuse this one.
-        from egs_warp.kernels.render_cpu import composite_tile_kernel
-
-        launch_rows(
-            composite_tile_kernel,
-            lists.tile_count,
-            inputs=inputs,
-            outputs=outputs,
-            device=device,
-            threads=threads,
-            work=lists.work,
-        )
+    launch_rows(
+        composite_tile_kernel,
+        lists.tile_count * (TILE_PIXELS if device.is_cuda else 1),
+        inputs=inputs,
+        outputs=[colour, alpha, depth],
+        device=device,
+        threads=threads,
+        work=lists.work,
+    )
     return RenderedImage(colour, alpha, depth)
 
 
@@ -113,7 +105,7 @@ def add_geometry(
     normal = empty(width * height, wp.vec3, device)
     launch_rows(
         composite_geometry_kernel,
-        lists.tile_count * 256,
+        lists.tile_count * TILE_PIXELS,
         inputs=[
             *(width, height, lists.tile_start, lists.gaussian_from_intersection),
             *(projected.ellipse, projected.falloff, projected.colour_depth, splat_normals),

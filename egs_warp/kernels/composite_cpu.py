@@ -1,14 +1,8 @@
-"""Compositing on a CPU: one thread for a tile, eight pixels of a row at a time.
+"""The C++ of compositing on a CPU: one thread for a tile, eight pixels of a row at a time.
 
 Only rows and half rows inside the ellipse are visited, without branches in between, so that the compiler makes vector
 code of them; it does not of the same loop written in Warp's Python, which took about four times as long.
 """
-
-import warp as wp
-
-from egs_warp.kernels.render_ellipse import TILE
-
-wp.set_module_options({"enable_backward": False})
 
 _SHARED = """
     #pragma clang fp contract(fast)
@@ -45,7 +39,7 @@ _SHARED = """
     };
 """
 
-_EACH_ROW = """
+_EACH_PIXEL = """
         const wp::vec4 e = ellipse.data[id];
         const wp::vec2 f = falloff.data[id];
         const wp::vec4 c = colour_depth.data[id];
@@ -70,9 +64,27 @@ _EACH_ROW = """
                 if (open_in_half[2 * row + half] == 0) continue;
                 const int at = row * 16 + half * 8;
                 const float origin = (float)(half * 8) - middle;
+                int closed = 0;
+                #pragma clang loop vectorize(enable)
+                for (int k = 0; k < 8; ++k) {
+                    const float u = origin + (float)k;
+                    const float raw = exponential(at_row - a * u * u);
+                    const float alpha = raw < LIMIT ? raw : LIMIT;
+                    const float before = passing[at + k];
+                    const float after = before * (1.0f - alpha);
+                    const int hit = (alpha >= CUT) & (before > 0.0f);
+                    const int stop = hit & (after <= STOP);
 """
 
-_FORWARD = (
+_PIXELS_DONE = """
+                }
+                open_pixels -= closed;
+                open_in_half[2 * row + half] -= closed;
+            }
+        }
+"""
+
+FORWARD = (
     _SHARED
     + """
     // Transmittance; zero outside of the image, negative once a pixel is full.
@@ -85,18 +97,8 @@ _FORWARD = (
     for (int i = start; i < end && open_pixels > 0; ++i) {
         const int id = gaussians.data[i];
 """
-    + _EACH_ROW
+    + _EACH_PIXEL
     + """
-                int closed = 0;
-                #pragma clang loop vectorize(enable)
-                for (int k = 0; k < 8; ++k) {
-                    const float u = origin + (float)k;
-                    const float raw = exponential(at_row - a * u * u);
-                    const float alpha = raw < LIMIT ? raw : LIMIT;
-                    const float before = passing[at + k];
-                    const float after = before * (1.0f - alpha);
-                    const int hit = (alpha >= CUT) & (before > 0.0f);
-                    const int stop = hit & (after <= STOP);
                     const float weight = (hit & !stop) ? before * alpha : 0.0f;
                     passing[at + k] = stop ? -before : (hit ? after : before);
                     closed += stop;
@@ -104,11 +106,9 @@ _FORWARD = (
                     green[at + k] += weight * c[1];
                     blue[at + k] += weight * c[2];
                     far[at + k] += weight * c[3];
-                }
-                open_pixels -= closed;
-                open_in_half[2 * row + half] -= closed;
-            }
-        }
+"""
+    + _PIXELS_DONE
+    + """
     }
     for (int row = 0; row < tile_height; ++row)
         for (int column = 0; column < tile_width; ++column) {
@@ -124,7 +124,7 @@ _FORWARD = (
 """
 )
 
-_BACKWARD = (
+BACKWARD = (
     _SHARED
     + """
     alignas(64) float passing[256], rest[256], by_red[256], by_green[256], by_blue[256], by_far[256];
@@ -149,18 +149,8 @@ _BACKWARD = (
         const int id = gaussians.data[i];
         alignas(64) float sums[10][8] = {};
 """
-    + _EACH_ROW
+    + _EACH_PIXEL
     + """
-                int closed = 0;
-                #pragma clang loop vectorize(enable)
-                for (int k = 0; k < 8; ++k) {
-                    const float u = origin + (float)k;
-                    const float raw = exponential(at_row - a * u * u);
-                    const float alpha = raw < LIMIT ? raw : LIMIT;
-                    const float before = passing[at + k];
-                    const float after = before * (1.0f - alpha);
-                    const int hit = (alpha >= CUT) & (before > 0.0f);
-                    const int stop = hit & (after <= STOP);
                     const int drawn = hit & !stop;
                     const float weight = drawn ? before * alpha : 0.0f;
                     passing[at + k] = stop ? 0.0f : (hit ? after : before);
@@ -182,11 +172,9 @@ _BACKWARD = (
                     sums[7][k] += weight * by_red[at + k];
                     sums[8][k] += weight * by_green[at + k];
                     sums[9][k] += weight * by_blue[at + k];
-                }
-                open_pixels -= closed;
-                open_in_half[2 * row + half] -= closed;
-            }
-        }
+"""
+    + _PIXELS_DONE
+    + """
         for (int q = 0; q < 10; ++q) {
             float total = 0.0f;
             for (int k = 0; k < 8; ++k) total += sums[q][k];
@@ -196,128 +184,3 @@ _BACKWARD = (
     }
 """
 )
-
-
-@wp.func_native(_FORWARD)
-def composite_tile(
-    width: wp.int32,
-    height: wp.int32,
-    left: wp.int32,
-    top: wp.int32,
-    start: wp.int32,
-    end: wp.int32,
-    gaussians: wp.array[wp.int32],
-    ellipse: wp.array[wp.vec4],
-    falloff: wp.array[wp.vec2],
-    colour_depth: wp.array[wp.vec4],
-    flat_background: wp.vec3,
-    background: wp.array[wp.vec3],
-    colour: wp.array2d[wp.vec3],
-    alpha_out: wp.array2d[wp.float32],
-    depth: wp.array2d[wp.float32],
-):
-    """Front-to-back blend of one tile."""
-    ...
-
-
-@wp.func_native(_BACKWARD)
-def composite_backward_tile(
-    width: wp.int32,
-    height: wp.int32,
-    left: wp.int32,
-    top: wp.int32,
-    start: wp.int32,
-    end: wp.int32,
-    gaussians: wp.array[wp.int32],
-    slots: wp.array[wp.int32],
-    ellipse: wp.array[wp.vec4],
-    falloff: wp.array[wp.vec2],
-    colour_depth: wp.array[wp.vec4],
-    sum_gradient: wp.array[wp.vec4],
-    remaining: wp.array[wp.float32],
-    moments: wp.array2d[wp.vec4],
-):
-    """Gradient sums of one tile's splats; the same walk and rounding as ``composite_tile``."""
-    ...
-
-
-@wp.kernel
-def composite_tile_kernel(
-    first: wp.int32,
-    # In:
-    width: wp.int32,
-    height: wp.int32,
-    tile_start: wp.array[wp.int32],
-    gaussian_from_intersection: wp.array[wp.int32],
-    ellipse: wp.array[wp.vec4],
-    falloff: wp.array[wp.vec2],
-    colour_depth: wp.array[wp.vec4],
-    flat_background: wp.vec3,
-    background: wp.array[wp.vec3],
-    # Out:
-    colour_out: wp.array2d[wp.vec3],
-    alpha_out: wp.array2d[wp.float32],
-    depth_out: wp.array2d[wp.float32],
-):
-    """One thread composites one tile."""
-    tile = wp.tid() + first
-    columns = (width + TILE - 1) / TILE
-    composite_tile(
-        width,
-        height,
-        (tile % columns) * TILE,
-        (tile / columns) * TILE,
-        tile_start[tile],
-        tile_start[tile + 1],
-        gaussian_from_intersection,
-        ellipse,
-        falloff,
-        colour_depth,
-        flat_background,
-        background,
-        colour_out,
-        alpha_out,
-        depth_out,
-    )
-
-
-@wp.kernel
-def composite_backward_tile_kernel(
-    first: wp.int32,
-    # In:
-    width: wp.int32,
-    height: wp.int32,
-    tile_start: wp.array[wp.int32],
-    gaussian_from_intersection: wp.array[wp.int32],
-    slot_from_intersection: wp.array[wp.int32],
-    ellipse: wp.array[wp.vec4],
-    falloff: wp.array[wp.vec2],
-    colour_depth: wp.array[wp.vec4],
-    sum_gradient: wp.array[wp.vec4],
-    remaining: wp.array[wp.float32],
-    # Out:
-    moments_out: wp.array2d[wp.vec4],
-):
-    """One thread walks one tile again and sums each splat's gradient over its pixels.
-
-    With k = alpha dL/dalpha per pixel, ``moments_out[slot]`` holds (sum k, k u, k dy, k u^2), (k u dy, k dy^2, by depth, 0)
-    and (by colour, 0).
-    """
-    tile = wp.tid() + first
-    columns = (width + TILE - 1) / TILE
-    composite_backward_tile(
-        width,
-        height,
-        (tile % columns) * TILE,
-        (tile / columns) * TILE,
-        tile_start[tile],
-        tile_start[tile + 1],
-        gaussian_from_intersection,
-        slot_from_intersection,
-        ellipse,
-        falloff,
-        colour_depth,
-        sum_gradient,
-        remaining,
-        moments_out,
-    )

@@ -1,16 +1,9 @@
-"""Compositing on CUDA: one block of 256 threads for a tile, one warp for each of its 8 x 4 pixel parts.
+"""The CUDA C++ of compositing: one block of 256 threads for a tile, one warp for each of its 8 x 4 pixel parts.
 
 Splats pass through shared memory in batches. The thread that loads a splat also finds which of the eight parts its
 ellipse reaches, and each warp then visits only its own. CUDA C++ because Warp's tile functions offer neither ballots
 nor per-warp control flow; Warp compiles it at run time like every other kernel.
 """
-
-import warp as wp
-
-from egs_warp.kernels.render_backward import pixel_gradient
-from egs_warp.kernels.render_ellipse import TILE, TILE_PIXELS
-
-wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 # log2(255), and alpha = exp2(log2 opacity - a u^2 - v dy^2) with a and v in units of log2 e.
 _SHARED = """
@@ -41,20 +34,26 @@ _SHARED = """
     };
 """
 
-_FORWARD = (
-    _SHARED
-    + """
+# All splats of the tile pass through shared memory, 256 at a time; ``group`` walks those there by 32s.
+_BATCHES = """
     __shared__ float4 s_shape[256];
     __shared__ float4 s_colour[256];
     __shared__ float2 s_falloff[256];
     __shared__ unsigned char s_parts[256];
     const int thread = threadIdx.x, lane = thread & 31, part = thread >> 5;
-    const float px = (float)((part & 1) * 8 + (lane & 7)), py = (float)((part >> 1) * 4 + (lane >> 3));
+    const int part_x = (part & 1) * 8, part_y = (part >> 1) * 4;
+    const float px = (float)(part_x + (lane & 7)), py = (float)(part_y + (lane >> 3));
     const bool inside = left + (int)px < width && top + (int)py < height;
     const float4* shapes = (const float4*)ellipse.data;
     const float2* falloffs = (const float2*)falloff.data;
     const float4* colours = (const float4*)colour_depth.data;
-    float passing = 1.0f, r = 0.0f, g = 0.0f, b = 0.0f, d = 0.0f;
+    auto log2_alpha = [&](int k) -> float {
+        const float4 shape = s_shape[k];
+        const float2 f = s_falloff[k];
+        const float dy = py - shape.y;
+        const float u = fmaf(shape.w, dy, px - shape.x);
+        return f.y - f.x * dy * dy - shape.z * u * u;
+    };
     bool open = inside;
     // The loads of the next batch are under way while this one is blended.
     float4 next_shape, next_colour;
@@ -65,10 +64,12 @@ _FORWARD = (
             next_shape = __ldg(shapes + id);
             next_falloff = __ldg(falloffs + id);
             next_colour = __ldg(colours + id);
+            ALSO_FETCH
         }
     };
     fetch(start + thread);
-    for (int base = start; base < end; base += 256) {
+    int base = start;
+    for (; base < end; base += 256) {
         if (__syncthreads_count(open) == 0) break;
         unsigned parts = 0;
         if (base + thread < end) {
@@ -80,6 +81,7 @@ _FORWARD = (
             parts = parts_of(shape.x, shape.y, shape.z, shape.w, v, log_opacity + LOG2_255);
             s_shape[thread] = shape;
             s_colour[thread] = next_colour;
+            ALSO_STORE
             s_falloff[thread] = make_float2(v, log_opacity);
         }
         s_parts[thread] = (unsigned char)parts;
@@ -87,6 +89,20 @@ _FORWARD = (
         fetch(base + 256 + thread);
         const int batch = min(256, end - base);
         for (int group = 0; group < batch; group += 32) {
+"""
+
+
+def _batches(*, also_fetch: str = "", also_store: str = "") -> str:
+    return _BATCHES.replace("ALSO_FETCH", also_fetch).replace("ALSO_STORE", also_store)
+
+
+FORWARD = (
+    _SHARED
+    + """
+    float passing = 1.0f, r = 0.0f, g = 0.0f, b = 0.0f, d = 0.0f;
+"""
+    + _batches()
+    + """
             if (!__any_sync(0xffffffffu, open)) break;
             unsigned mine_here = __ballot_sync(0xffffffffu, (s_parts[group + lane] >> part) & 1u);
             while (mine_here) {
@@ -98,13 +114,8 @@ _FORWARD = (
                     const bool real = mine_here != 0;
                     const int k = real ? group + __ffs(mine_here) - 1 : group;
                     mine_here &= mine_here - 1;
-                    const float4 shape = s_shape[k];
-                    const float2 f = s_falloff[k];
-                    const float dy = py - shape.y;
-                    const float u = fmaf(shape.w, dy, px - shape.x);
-                    const float power = f.y - f.x * dy * dy - shape.z * u * u;
                     chosen[i] = k;
-                    alphas[i] = real ? fminf(exp2f(power), LIMIT) : 0.0f;
+                    alphas[i] = real ? fminf(exp2f(log2_alpha(k)), LIMIT) : 0.0f;
                 }
                 #pragma unroll
                 for (int i = 0; i < 4; ++i) {
@@ -139,67 +150,24 @@ _FORWARD = (
 """
 )
 
-_BACKWARD = (
+BACKWARD = (
     _SHARED
     + """
-    __shared__ float4 s_shape[256];
-    __shared__ float4 s_colour[256];
-    __shared__ float2 s_falloff[256];
     __shared__ int s_slot[256];
-    __shared__ unsigned char s_parts[256];
     __shared__ float4 s_gradient[256];
     __shared__ float s_k[8][8][33];       // warp, splat of eight, pixel: alpha dL/dalpha
     __shared__ float s_weight[8][8][33];  // and blending weight
     __shared__ int s_chosen[8][8];
     __shared__ float s_sum[8][32][11];    // warp, splat of 32, quantity
     __shared__ unsigned s_visited[8];
-    const int thread = threadIdx.x, lane = thread & 31, part = thread >> 5;
-    const int part_x = (part & 1) * 8, part_y = (part >> 1) * 4;
-    const float px = (float)(part_x + (lane & 7)), py = (float)(part_y + (lane >> 3));
-    const bool inside = left + (int)px < width && top + (int)py < height;
-    const float4* shapes = (const float4*)ellipse.data;
-    const float2* falloffs = (const float2*)falloff.data;
-    const float4* colours = (const float4*)colour_depth.data;
     float* out = (float*)moments.data;
     float passing = 1.0f, rest = remaining;
     const float4 gradient = make_float4(sum_gradient[0], sum_gradient[1], sum_gradient[2], sum_gradient[3]);
-    s_gradient[thread] = gradient;
-    bool open = inside;
-    // The loads of the next batch are under way while this one is blended.
-    float4 next_shape, next_colour;
-    float2 next_falloff;
+    s_gradient[threadIdx.x] = gradient;
     int next_slot;
-    auto fetch = [&](int i) {
-        if (i < end) {
-            const int id = gaussians.data[i];
-            next_shape = __ldg(shapes + id);
-            next_falloff = __ldg(falloffs + id);
-            next_colour = __ldg(colours + id);
-            next_slot = slots.data[i];
-        }
-    };
-    fetch(start + thread);
-    int base = start;
-    for (; base < end; base += 256) {
-        if (__syncthreads_count(open) == 0) break;
-        unsigned parts = 0;
-        if (base + thread < end) {
-            float4 shape = next_shape;
-            shape.x -= (float)left + 0.5f;
-            shape.y -= (float)top + 0.5f;
-            shape.z *= LOG2_E;
-            const float v = next_falloff.x * LOG2_E, log_opacity = next_falloff.y * LOG2_E;
-            parts = parts_of(shape.x, shape.y, shape.z, shape.w, v, log_opacity + LOG2_255);
-            s_shape[thread] = shape;
-            s_colour[thread] = next_colour;
-            s_slot[thread] = next_slot;
-            s_falloff[thread] = make_float2(v, log_opacity);
-        }
-        s_parts[thread] = (unsigned char)parts;
-        __syncthreads();
-        fetch(base + 256 + thread);
-        const int batch = min(256, end - base);
-        for (int group = 0; group < batch; group += 32) {
+"""
+    + _batches(also_fetch="next_slot = slots.data[i];", also_store="s_slot[thread] = next_slot;")
+    + """
             unsigned todo = __ballot_sync(0xffffffffu, (s_parts[group + lane] >> part) & 1u);
             unsigned visited = 0;
             while (todo && __any_sync(0xffffffffu, open)) {
@@ -213,13 +181,8 @@ _BACKWARD = (
                         const bool real = todo != 0;
                         const int k = real ? __ffs(todo) - 1 : 0;
                         todo &= todo - 1;
-                        const float4 shape = s_shape[group + k];
-                        const float2 f = s_falloff[group + k];
-                        const float dy = py - shape.y;
-                        const float u = fmaf(shape.w, dy, px - shape.x);
-                        const float power = f.y - f.x * dy * dy - shape.z * u * u;
                         pair[i] = k;
-                        raw[i] = real ? exp2f(power) : 0.0f;
+                        raw[i] = real ? exp2f(log2_alpha(group + k)) : 0.0f;
                     }
                     #pragma unroll
                     for (int i = 0; i < 2; ++i) {
@@ -314,149 +277,3 @@ _BACKWARD = (
     }
 """
 )
-
-
-@wp.func_native(_FORWARD)
-def composite_block(
-    width: wp.int32,
-    height: wp.int32,
-    left: wp.int32,
-    top: wp.int32,
-    start: wp.int32,
-    end: wp.int32,
-    gaussians: wp.array[wp.int32],
-    ellipse: wp.array[wp.vec4],
-    falloff: wp.array[wp.vec2],
-    colour_depth: wp.array[wp.vec4],
-    flat_background: wp.vec3,
-    background: wp.array[wp.vec3],
-    colour: wp.array2d[wp.vec3],
-    alpha_out: wp.array2d[wp.float32],
-    depth: wp.array2d[wp.float32],
-):
-    """Front-to-back blend of one tile by its block."""
-    ...
-
-
-@wp.func_native(_BACKWARD)
-def composite_backward_block(
-    width: wp.int32,
-    height: wp.int32,
-    left: wp.int32,
-    top: wp.int32,
-    start: wp.int32,
-    end: wp.int32,
-    gaussians: wp.array[wp.int32],
-    slots: wp.array[wp.int32],
-    ellipse: wp.array[wp.vec4],
-    falloff: wp.array[wp.vec2],
-    colour_depth: wp.array[wp.vec4],
-    sum_gradient: wp.vec4,
-    remaining: wp.float32,
-    moments: wp.array2d[wp.vec4],
-):
-    """Gradient sums of one tile's splats by its block; the same walk and rounding as ``composite_block``.
-
-    ``sum_gradient`` and ``remaining`` are those of the thread's own pixel.
-    """
-    ...
-
-
-@wp.kernel
-def composite_block_kernel(
-    # In:
-    width: wp.int32,
-    height: wp.int32,
-    tile_start: wp.array[wp.int32],
-    gaussian_from_intersection: wp.array[wp.int32],
-    ellipse: wp.array[wp.vec4],
-    falloff: wp.array[wp.vec2],
-    colour_depth: wp.array[wp.vec4],
-    flat_background: wp.vec3,
-    background: wp.array[wp.vec3],
-    # Out:
-    colour_out: wp.array2d[wp.vec3],
-    alpha_out: wp.array2d[wp.float32],
-    depth_out: wp.array2d[wp.float32],
-):
-    """A block of 256 threads composites one tile; the same picture as ``composite_pixel_kernel``."""
-    tile = wp.tid() / TILE_PIXELS
-    columns = (width + TILE - 1) / TILE
-    composite_block(
-        width,
-        height,
-        (tile % columns) * TILE,
-        (tile / columns) * TILE,
-        tile_start[tile],
-        tile_start[tile + 1],
-        gaussian_from_intersection,
-        ellipse,
-        falloff,
-        colour_depth,
-        flat_background,
-        background,
-        colour_out,
-        alpha_out,
-        depth_out,
-    )
-
-
-@wp.kernel
-def composite_backward_block_kernel(
-    # In:
-    width: wp.int32,
-    height: wp.int32,
-    tile_start: wp.array[wp.int32],
-    gaussian_from_intersection: wp.array[wp.int32],
-    slot_from_intersection: wp.array[wp.int32],
-    ellipse: wp.array[wp.vec4],
-    falloff: wp.array[wp.vec2],
-    colour_depth: wp.array[wp.vec4],
-    colour: wp.array2d[wp.vec3],
-    alpha: wp.array2d[wp.float32],
-    depth: wp.array2d[wp.float32],
-    colour_gradient: wp.array2d[wp.vec3],
-    alpha_gradient: wp.array2d[wp.float32],
-    depth_gradient: wp.array2d[wp.float32],
-    # Out:
-    moments_out: wp.array2d[wp.vec4],
-):
-    """A block of 256 threads does for one tile what ``composite_backward_tile_kernel`` does with one."""
-    tile = wp.tid() / TILE_PIXELS
-    columns = (width + TILE - 1) / TILE
-    left = (tile % columns) * TILE
-    top = (tile / columns) * TILE
-    # A warp has 8 x 4 pixels; two such parts stand side by side.
-    i = wp.tid() % TILE_PIXELS
-    part = i / 32
-    column = left + (part % 2) * 8 + i % 8
-    row = top + (part / 2) * 4 + (i % 32) / 8
-    by_sums = wp.vec4()
-    remaining = wp.float32(0.0)
-    if column < width and row < height:
-        by_sums, remaining = pixel_gradient(
-            row,
-            column,
-            colour,
-            alpha,
-            depth,
-            colour_gradient,
-            alpha_gradient,
-            depth_gradient,
-        )
-    composite_backward_block(
-        width,
-        height,
-        left,
-        top,
-        tile_start[tile],
-        tile_start[tile + 1],
-        gaussian_from_intersection,
-        slot_from_intersection,
-        ellipse,
-        falloff,
-        colour_depth,
-        by_sums,
-        remaining,
-        moments_out,
-    )
