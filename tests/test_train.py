@@ -19,7 +19,9 @@ from tests.test_finetune import ball, ring
 
 pytest.importorskip("torch")
 from egs_warp.finetune import TrainingView, psnr
-from egs_warp.training import backdrop_colour, laid_over, middle_of, read_views, rough_cloud, train
+from egs_warp.posed_photos import backdrop_colour, laid_over, read_views
+from egs_warp.rough_cloud import middle_of, rough_cloud
+from egs_warp.training import train
 
 
 def posed_folder(folder: Path, *, count: int = 9, size: int = 32, alpha: bool = False) -> Path:
