@@ -27,12 +27,11 @@ import mesh_scenes as scenes
 from egs_warp.camera import Camera
 from egs_warp.deformation import Deformer
 from egs_warp.embedding import CageLocator, embed_gaussians
-from egs_warp.gaussians import GaussianCloud
+from egs_warp.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.capture import read_capture
 from egs_warp.render import render
 from egs_warp.splitting import split_bent, split_for_motion
 
-SH_0 = 0.28209479177387814
 POP = 1.3
 
 
@@ -48,7 +47,7 @@ def flow_to(camera: Camera, now: GaussianCloud, after: GaussianCloud) -> np.ndar
     reach = max(float(np.abs(moved).max()), 1e-6)
     colour = np.zeros((now.count, 1, 3))
     # Colours lie between 0 and 1: half is no motion.
-    colour[:, 0, :2] = moved / (2.0 * reach) / SH_0
+    colour[:, 0, :2] = moved / (2.0 * reach) / SH_BAND_0
     drawn = render(
         replace(now, sh=wp.array(colour, dtype=wp.vec3, device=now.device)), camera, background=(0.0, 0.0, 0.0)
     )

@@ -14,11 +14,11 @@ import torch
 import warp as wp
 
 from egs_warp.camera import Camera
+from egs_warp.gaussians import SH_BAND_0
 from egs_warp.render.autograd import render_torch
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.tiles import TileLists
 
-SH_BAND_0 = 0.28209479177387814
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,9 @@ import warp as wp
 
 from egs_warp.errors import UserError
 
+SH_BAND_0 = 0.28209479177387814
+"""Spherical harmonic of band 0: a colour is 1/2 + SH_BAND_0 x its coefficient, higher bands apart."""
+
 
 @dataclass(frozen=True)
 class GaussianCloud:

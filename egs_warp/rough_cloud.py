@@ -13,9 +13,8 @@ import numpy as np
 from egs_warp.camera import Camera
 from egs_warp.errors import UserError
 from egs_warp.finetune import TrainingView
-from egs_warp.gaussians import GaussianCloud
+from egs_warp.gaussians import SH_BAND_0, GaussianCloud
 
-SH_BAND_0 = 0.28209479177387814
 
 
 def middle_of(cameras: Sequence[Camera]) -> np.ndarray:

@@ -13,12 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.gaussians import GaussianCloud
+from egs_warp.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.morton import morton_order
 from egs_warp.io.ply import PlyHeader, channel_major, coefficient_major, columns_as_float32, read_elements
 from egs_warp.io.raw import (
-    SH_C0,
     RawCapture,
     bit_field,
     byte,
@@ -81,7 +80,7 @@ def decode_compressed_ply(data: bytes, header: PlyHeader, source: Path) -> RawCa
     log_scales = _between(limits[:, 1], _fields(words["packed_scale"], _POSITION_FIELDS))
     colours = _between(limits[:, 2], _fields(words["packed_color"], _COLOUR_FIELDS))
     three = (_fields(words["packed_rotation"], _ROTATION_FIELDS) - 0.5) * np.sqrt(2.0)
-    f_dc = ((colours - 0.5) / SH_C0).astype(np.float32)
+    f_dc = ((colours - 0.5) / SH_BAND_0).astype(np.float32)
     f_rest = (
         _decode_rest(elements["sh"], len(vertex), source)
         if "sh" in elements
@@ -128,7 +127,7 @@ def write_compressed_ply(path: Path | str, cloud: GaussianCloud, *, keep_order: 
     means = cloud.means.numpy()
     order = np.arange(cloud.count) if keep_order else morton_order(means)
     sh = cloud.sh.numpy()[order]
-    colours = sh[:, 0].astype(np.float64) * SH_C0 + 0.5
+    colours = sh[:, 0].astype(np.float64) * SH_BAND_0 + 0.5
     log_scales = np.clip(cloud.log_scales.numpy()[order].astype(np.float64), -_SCALE_LIMIT, _SCALE_LIMIT)
     bounds = []
     words = {}

@@ -10,9 +10,6 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.gaussians import unit_quaternions
 
-SH_C0 = 0.28209479177387814
-"""Band-0 spherical harmonic: colour = 1/2 + SH_C0 f_dc."""
-
 EXTREME_LOGIT = 16.0
 """Stands for an opacity logit of infinity: 1 - opacity is then 1e-7, below half a step of float32 at 1."""
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.gaussians import GaussianCloud
+from egs_warp.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.atomic import atomic_write
-from egs_warp.io.raw import SH_C0, RawCapture, byte, bytes_from_logits, logits_from_bytes
+from egs_warp.io.raw import RawCapture, byte, bytes_from_logits, logits_from_bytes
 
 _ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
 _LEAST_SCALE = float(np.finfo(np.float32).tiny)
@@ -44,7 +44,7 @@ def decode_splat(data: bytes, source: Path) -> RawCapture:
         rotations=(rows["rotation"].astype(np.float32) - np.float32(128.0)) / np.float32(128.0),
         log_scales=np.log(np.where(scales == 0, np.float32(_LEAST_SCALE), scales)),
         opacity_logits=logits_from_bytes(colour[:, 3]),
-        sh=((colour[:, None, :3] / 255.0 - 0.5) / SH_C0).astype(np.float32),
+        sh=((colour[:, None, :3] / 255.0 - 0.5) / SH_BAND_0).astype(np.float32),
         notes=(f"{zero} Gaussians with a scale of 0 read as {_LEAST_SCALE:.0e}",) if zero else (),
     )
 
@@ -58,7 +58,7 @@ def write_splat(path: Path | str, cloud: GaussianCloud) -> None:
     rows["position"] = cloud.means.numpy()
     with np.errstate(over="ignore"):
         rows["scale"] = np.minimum(np.exp(cloud.log_scales.numpy()), np.finfo(np.float32).max)
-    rows["colour"][:, :3] = byte((cloud.sh.numpy()[:, 0].astype(np.float64) * SH_C0 + 0.5) * 255.0)
+    rows["colour"][:, :3] = byte((cloud.sh.numpy()[:, 0].astype(np.float64) * SH_BAND_0 + 0.5) * 255.0)
     rows["colour"][:, 3] = bytes_from_logits(cloud.opacity_logits.numpy())
     rows["rotation"] = byte(cloud.rotations.numpy() * 128.0 + 128.0)
     with atomic_write(path) as temporary, open(temporary, "wb") as file:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from egs_warp.gaussians import GaussianCloud
+from egs_warp.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.kernels.scenes import bake_light_kernel
 
 # Real spherical harmonics in the INRIA sign convention, bands 1 to 3.
@@ -22,7 +22,6 @@ _SH3 = (
     1.445305721320277,
     -0.5900435899266435,
 )
-_SH0 = 0.28209479177387814
 
 
 @dataclass(frozen=True)
@@ -134,7 +133,7 @@ def sh_from_colour(
     x, y, z = (-lobe_directions).T
     xx, yy, zz = x * x, y * y, z * z
     bands = [
-        np.stack([np.full_like(x, _SH0)], 1),
+        np.stack([np.full_like(x, SH_BAND_0)], 1),
         np.stack([-_SH1 * y, _SH1 * z, -_SH1 * x], 1) * 0.9,
         np.stack(
             [
@@ -164,7 +163,7 @@ def sh_from_colour(
     lobe = np.concatenate(bands, axis=1)
     peak = (1.0 + 3 * 0.9 + 5 * 0.6 + 7 * 0.25) / (4.0 * np.pi)
     sh = (lobe * (lobe_strength / peak)[:, None])[:, :, None] * np.array(lobe_colour)
-    sh[:, 0] += (colour - 0.5) / _SH0
+    sh[:, 0] += (colour - 0.5) / SH_BAND_0
     return sh
 
 
