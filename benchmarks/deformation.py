@@ -30,8 +30,8 @@ from egs_warp.kernels.carried_cage import load_row, store_row
 
 BYTES_READ = 12 + 16 + 12 + 4
 """Mean, rotation, scales, tetrahedron of the mean; the carried cage itself stays in cache."""
-BYTES_READ_ACROSS = 6 * (4 + 4 + 4)
-"""Tetrahedron, share and length of each arm, of Gaussians that reach into several tetrahedra."""
+BYTES_READ_ACROSS = 6 * (4 + 4) + 3 * 4
+"""Tetrahedron and share of each arm, weight of each axis, of Gaussians that reach into several tetrahedra."""
 BYTES_WRITTEN = 12 + 16 + 12 + 16
 """Mean, rotation, scales, turn."""
 BYTES_OF_COLOUR = 192 + 192

@@ -8,7 +8,7 @@ from enum import Enum
 import numpy as np
 import warp as wp
 
-from egs_warp.deformation import DeformedGaussians, Deformer, node_positions
+from egs_warp.deformation import CageCarrier, DeformedGaussians, Deformer, node_positions
 from egs_warp.embedding import CageLocator, PointEmbedding, embed_gaussians
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.kernels import carrying as kernels
@@ -94,6 +94,7 @@ class _Peer:
                 )
                 self._corners: PointEmbedding = cage.locate(corners)
             else:
+                self._carrier = CageCarrier(cage)
                 means = wp.array(cloud.means.numpy().astype(np.float64), dtype=Vec3)
                 self._means: PointEmbedding = cage.locate(means)
 
@@ -126,16 +127,8 @@ class _Peer:
             inputs = [*shape, corners, LOCAL_REACH, self._least_length]
             self._launch(kernels.carry_local_tetrahedron_kernel, inputs, outputs)
         else:
-            gradients = wp.empty(len(self._cage.mesh.tets), dtype=wp.mat33, device=rest.device)
-            launch_rows(
-                kernels.tet_gradients_kernel,
-                len(self._cage.mesh.tets),
-                inputs=[uploaded, self._cage.tets, self._cage.inverse_edges],
-                outputs=[gradients],
-                device=rest.device,
-            )
             means = self._means
-            inputs = [*shape, uploaded, means.nodes, means.weights, means.tets, gradients]
+            inputs = [*shape, uploaded, means.nodes, means.weights, means.tets, self._carrier.carry(uploaded)]
             self._launch(kernels.carry_gradient_kernel, inputs, outputs)
         if rest.sh_degree:
             self._launch(rotate_sh_kernel, [turns, rest.sh, rest.sh_degree], [cloud.sh])

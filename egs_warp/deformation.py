@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from egs_warp.embedding import GaussianEmbedding
+from egs_warp.embedding import CageLocator, GaussianEmbedding
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.kernels import carried_cage
@@ -47,6 +48,36 @@ class BendMeasure:
     """(n, 3) metres: what the affine F leaves out along each axis, at one standard deviation from the mean."""
 
 
+class CageCarrier:
+    """The map of every tetrahedron of a cage, frame after frame, in the same arrays."""
+
+    def __init__(self, cage: CageLocator) -> None:
+        self._cage = cage
+        tet_count = len(cage.mesh.tets)
+        with wp.ScopedDevice(cage.tets.device):
+            self._rest = wp.array(cage.mesh.nodes, dtype=Vec3)
+            self._carried = carried_cage.CarriedCage()
+            self._carried.maps = wp.empty(3 * tet_count, dtype=wp.vec4)
+            self._carried.frames = wp.empty(2 * tet_count, dtype=wp.vec4)
+
+    def carry(self, positions: wp.array | np.ndarray) -> Any:
+        """A ``CarriedCage`` for node ``positions``, as for ``Deformer.deform``."""
+        cage, device = self._cage, self._cage.tets.device
+        launch_rows(
+            carried_cage.carry_tets_kernel,
+            len(cage.mesh.tets),
+            inputs=[
+                node_positions(positions, len(cage.mesh.nodes), device),
+                self._rest,
+                cage.tets,
+                cage.inverse_edges,
+            ],
+            outputs=[self._carried],
+            device=device,
+        )
+        return self._carried
+
+
 class Deformer:
     """Carries one cloud, frame after frame, into the same output arrays."""
 
@@ -56,12 +87,13 @@ class Deformer:
         self.embedding = embedding
         self.max_stretch = max_stretch
         self._degree = cloud.sh_degree
+        self._carrier = CageCarrier(embedding.cage)
         with wp.ScopedDevice(cloud.device):
-            self._carried_tets = wp.empty(carried_cage.TET_ROWS * len(embedding.cage.mesh.tets), dtype=wp.vec4)
-            self._rest_nodes = wp.array(embedding.cage.mesh.nodes, dtype=Vec3)
-            self._mean_tets = wp.empty(cloud.count, dtype=wp.int32)
-            self._end_tets = wp.empty((6, cloud.count), dtype=wp.int32)
-            self._shares = wp.empty((6, cloud.count), dtype=wp.float32)
+            self._plan = carried_cage.ArmPlan()
+            self._plan.mean_tets = wp.empty(cloud.count, dtype=wp.int32)
+            self._plan.end_tets = wp.empty((6, cloud.count), dtype=wp.int32)
+            self._plan.shares = wp.empty((6, cloud.count), dtype=wp.float32)
+            self._plan.bulges = wp.empty((3, cloud.count), dtype=wp.float32)
             self._deformed = DeformedGaussians(
                 GaussianCloud(
                     means=wp.empty_like(cloud.means),
@@ -79,6 +111,7 @@ class Deformer:
             cloud.count,
             inputs=[
                 cloud.rotations,
+                cloud.log_scales,
                 points.tets,
                 points.weights,
                 embedding.arms,
@@ -86,7 +119,7 @@ class Deformer:
                 cage.inverse_edges,
                 LEAST_BRIDGE * cage.extent,
             ],
-            outputs=[self._mean_tets, self._end_tets, self._shares],
+            outputs=[self._plan],
             device=cloud.device,
         )
 
@@ -120,32 +153,21 @@ class Deformer:
             launch_rows(
                 kernels.measure_bend_kernel,
                 count,
-                inputs=self._carrying_inputs(positions),
+                inputs=[*self._carrying_inputs(positions), self.embedding.arms],
                 outputs=[bend, curl, error],
                 device=self.rest.device,
             )
         return BendMeasure(bend.numpy(), curl.numpy(), error.numpy())
 
     def _carrying_inputs(self, positions: wp.array | np.ndarray) -> list[object]:
-        cage, rest = self.embedding.cage, self.rest
-        uploaded = node_positions(positions, len(cage.mesh.nodes), rest.device)
-        launch_rows(
-            carried_cage.carry_tets_kernel,
-            len(cage.mesh.tets),
-            inputs=[uploaded, self._rest_nodes, cage.tets, cage.inverse_edges],
-            outputs=[self._carried_tets],
-            device=rest.device,
-        )
+        rest = self.rest
         return [
             rest.means,
             rest.rotations,
             rest.log_scales,
             self.max_stretch,
-            self._carried_tets,
-            self._mean_tets,
-            self._end_tets,
-            self._shares,
-            self.embedding.arms,
+            self._carrier.carry(positions),
+            self._plan,
         ]
 
 

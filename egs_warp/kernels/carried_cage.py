@@ -48,8 +48,15 @@ def store_row(rows: wp.array[wp.vec4], row: wp.int32, value: wp.vec4):
     ...
 
 
-TET_ROWS = wp.constant(5)
-"""Rows of a carried tetrahedron: three rows of F, each with one coordinate of x0' behind it; x0; R_polar as w, x, y, z."""
+@wp.struct
+class CarriedCage:
+    """The affine map x0' + F (x - x0) of each tetrahedron, and the rotation of F. Arrays in a struct, since eight functions pass
+    them on."""
+
+    maps: wp.array[wp.vec4]
+    """(3 T,) rows of F, each with one coordinate of x0' behind it: all that most arms ask for, close together."""
+    frames: wp.array[wp.vec4]
+    """(2 T,) x0; R_polar as w, x, y, z."""
 
 
 @wp.kernel
@@ -61,9 +68,8 @@ def carry_tets_kernel(
     tets: wp.array[wp.vec4i],
     inverse_edges: wp.array[Mat33],
     # Out:
-    carried_out: wp.array[wp.vec4],
+    cage_out: CarriedCage,
 ):
-    """The affine map x0' + F (x - x0) of each tetrahedron and the rotation of F, as ``TET_ROWS`` rows."""
     t = first_row + wp.tid()
     corners = tets[t]
     x0 = positions[corners[0]]
@@ -72,9 +78,9 @@ def carry_tets_kernel(
     moved = single(x0)
     start = single(rest[corners[0]])
     for i in range(3):
-        carried_out[TET_ROWS * t + i] = wp.vec4(f[i, 0], f[i, 1], f[i, 2], moved[i])
-    carried_out[TET_ROWS * t + 3] = wp.vec4(start[0], start[1], start[2], 0.0)
-    carried_out[TET_ROWS * t + 4] = quaternion_of(rotation_part(column(f, 0), column(f, 1), column(f, 2)))
+        cage_out.maps[3 * t + i] = wp.vec4(f[i, 0], f[i, 1], f[i, 2], moved[i])
+    cage_out.frames[2 * t] = wp.vec4(start[0], start[1], start[2], 0.0)
+    cage_out.frames[2 * t + 1] = quaternion_of(rotation_part(column(f, 0), column(f, 1), column(f, 2)))
 
 
 @wp.struct
@@ -87,11 +93,11 @@ class Affine:
 
 
 @wp.func
-def affine_of(carried: wp.array[wp.vec4], tet: wp.int32) -> Affine:
-    a = load_row(carried, TET_ROWS * tet)
-    b = load_row(carried, TET_ROWS * tet + 1)
-    c = load_row(carried, TET_ROWS * tet + 2)
-    s = load_row(carried, TET_ROWS * tet + 3)
+def affine_of(cage: CarriedCage, tet: wp.int32) -> Affine:
+    a = load_row(cage.maps, 3 * tet)
+    b = load_row(cage.maps, 3 * tet + 1)
+    c = load_row(cage.maps, 3 * tet + 2)
+    s = load_row(cage.frames, 2 * tet)
     result = Affine()
     result.gradient = wp.mat33(a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2])
     result.moved = wp.vec3(a[3], b[3], c[3])
@@ -100,15 +106,50 @@ def affine_of(carried: wp.array[wp.vec4], tet: wp.int32) -> Affine:
 
 
 @wp.func
+def turn_of_tet(cage: CarriedCage, tet: wp.int32) -> wp.vec4:
+    """R_polar as w, x, y, z."""
+    return load_row(cage.frames, 2 * tet + 1)
+
+
+@wp.func
 def image(map: Affine, point: wp.vec3) -> wp.vec3:
     return map.moved + map.gradient * (point - map.start)
 
 
-BRIDGES = wp.constant(wp.float32(2.0))
-"""Share that marks an arm whose end has nothing to do with the tetrahedron of the mean: look where the end has gone."""
-
 RIGID = wp.constant(wp.float32(3.0))
 """Share of the first arm that marks a Gaussian far outside the cage, which is not stretched but only turned and moved."""
+
+
+Six = wp.types.vector(length=6, dtype=wp.int32)
+SixReal = wp.types.vector(length=6, dtype=wp.float32)
+
+
+@wp.func
+def exponential(v: wp.vec3) -> wp.vec3:
+    return wp.vec3(wp.exp(v[0]), wp.exp(v[1]), wp.exp(v[2]))
+
+
+@wp.func
+def reach_of(arms: wp.array2d[wp.float32], row: wp.int32, axis: wp.int32, scale: wp.float32) -> wp.float32:
+    """Distance between the ends of an axis; gradients jump between tetrahedra, and over a much shortened arm the jump is no
+    derivative."""
+    return wp.max(arms[row, axis] + arms[row, 3 + axis], 3.0 * scale)
+
+
+@wp.struct
+class ArmPlan:
+    """What ``carried_arms`` wants to know about each of n Gaussians, once for all frames. Arrays of one value a Gaussian:
+    threads side by side read side by side."""
+
+    mean_tets: wp.array[wp.int32]
+    """(n,) tetrahedron of the mean; its one's complement if the Gaussian is not simply carried by that tetrahedron."""
+    end_tets: wp.array2d[wp.int32]
+    """(6, n)"""
+    shares: wp.array2d[wp.float32]
+    """(6, n) share of each arm that lies in the tetrahedron of the mean; less than 0: minus the length of an arm whose end has nothing
+    to do with that tetrahedron, so that one must look where the end has gone."""
+    bulges: wp.array2d[wp.float32]
+    """(3, n) metres: s_k^2 over the reach of both arms."""
 
 
 @wp.kernel
@@ -116,6 +157,7 @@ def plan_arms_kernel(
     first_row: wp.int32,
     # In:
     rotations: wp.array[wp.vec4],
+    log_scales: wp.array[wp.vec3],
     point_tets: wp.array[wp.int32],
     weights: wp.array[Vec4],
     arms: wp.array2d[wp.float32],
@@ -123,16 +165,12 @@ def plan_arms_kernel(
     inverse_edges: wp.array[Mat33],
     least_bridge: wp.float32,
     # Out:
-    mean_tets_out: wp.array[wp.int32],
-    end_tets_out: wp.array2d[wp.int32],
-    shares_out: wp.array2d[wp.float32],
+    plan_out: ArmPlan,
 ):
-    """What ``carried_arms`` wants to know about each Gaussian, once for all frames.
-
-    The motion is continuous and linear in each tetrahedron. So an arm that goes from the tetrahedron of the mean (gradient F)
+    """The motion is continuous and linear in each tetrahedron. So an arm that goes from the tetrahedron of the mean (gradient F)
     through a face into the next one (gradient G) is carried to (u F + (1 - u) G) r per length, u the share of it before
     the face: no difference of positions, which for a tiny arm would be mostly rounding. A longer arm that ends elsewhere
-    ``BRIDGES``.
+    bridges a gap.
     """
     row = first_row + wp.tid()
     mean_tet = point_tets[7 * row]
@@ -167,46 +205,43 @@ def plan_arms_kernel(
                 if drop > real(0.0):
                     share = wp.float32(wp.clamp(height / drop, real(0.0), real(1.0)))
             elif arms[row, k] > least_bridge:
-                share = BRIDGES
-        end_tets_out[k, row] = tet
-        shares_out[k, row] = share
+                share = -arms[row, k]
+        plan_out.end_tets[k, row] = tet
+        plan_out.shares[k, row] = share
+    scales = exponential(log_scales[row])
+    for k in range(3):
+        plan_out.bulges[k, row] = scales[k] * scales[k] / reach_of(arms, row, k, scales[k])
     w = weights[7 * row]
     if wp.min(w) < real(-1.0) or wp.max(w) > real(2.0):
         straddles = wp.bool(True)
-        shares_out[0, row] = RIGID
-    # One's complement marks a Gaussian that is not simply carried by one tetrahedron.
-    mean_tets_out[row] = wp.where(straddles, -1 - mean_tet, mean_tet)
+        plan_out.shares[0, row] = RIGID
+    plan_out.mean_tets[row] = wp.where(straddles, -1 - mean_tet, mean_tet)
 
 
 @wp.func
 def carried_arm(
-    k: wp.int32,
-    gaussian: wp.int32,
+    tet: wp.int32,
+    share: wp.float32,
     mean_tet: wp.int32,
     mean: wp.vec3,
     moved_mean: wp.vec3,
     axis: wp.vec3,
     through: wp.vec3,
     max_stretch: wp.float32,
-    carried: wp.array[wp.vec4],
-    end_tets: wp.array2d[wp.int32],
-    shares: wp.array2d[wp.float32],
-    arms: wp.array2d[wp.float32],
+    cage: CarriedCage,
 ) -> wp.vec3:
     """Where one arm along ``axis`` has gone, per length: a column of D_s D_m^-1 R (Eq. 14). ``through`` is F axis.
 
     An arm that bridges a gap between two limbs can be stretched far more than the matter at either end. That is a spike:
     its length is held to ``max_stretch`` times the larger stretch at its two ends.
     """
-    tet = end_tets[k, gaussian]
     if tet == mean_tet:
         return through
-    end = affine_of(carried, tet)
+    end = affine_of(cage, tet)
     there = end.gradient * axis
-    share = shares[k, gaussian]
-    if share <= 1.0:
+    if share >= 0.0:
         return share * through + (1.0 - share) * there
-    result = there + (image(end, mean) - moved_mean) / arms[gaussian, k]
+    result = there - (image(end, mean) - moved_mean) / share
     limit = max_stretch * wp.max(wp.length(through), wp.length(there))
     length = wp.length(result)
     if length > limit:
@@ -223,50 +258,46 @@ class CarriedArms:
     through: wp.mat33
     """F R of the tetrahedron of the mean."""
     mean: wp.vec3
+    tet: wp.int32
+    """That tetrahedron."""
+    straddles: wp.bool
+    """Otherwise F+ and F- are F."""
 
 
 @wp.func
 def carried_arms(
-    gaussian: wp.int32,
-    mean: wp.vec3,
-    axes: wp.mat33,
-    max_stretch: wp.float32,
-    carried: wp.array[wp.vec4],
-    mean_tets: wp.array[wp.int32],
-    end_tets: wp.array2d[wp.int32],
-    shares: wp.array2d[wp.float32],
-    arms: wp.array2d[wp.float32],
+    gaussian: wp.int32, mean: wp.vec3, axes: wp.mat33, max_stretch: wp.float32, cage: CarriedCage, plan: ArmPlan
 ) -> CarriedArms:
     """F+ R and F- R of Eq. (14)."""
-    code = mean_tets[gaussian]
-    tet = wp.where(code < 0, -1 - code, code)
-    around = affine_of(carried, tet)
-    straddles = code < 0
-    if straddles and shares[0, gaussian] == RIGID:
-        around.gradient = turn_of(load_row(carried, TET_ROWS * tet + 4))
-        straddles = wp.bool(False)
+    code = plan.mean_tets[gaussian]
     result = CarriedArms()
+    result.tet = wp.where(code < 0, -1 - code, code)
+    result.straddles = code < 0
+    around = affine_of(cage, result.tet)
+    ends = Six()
+    shares = SixReal()
+    if result.straddles:
+        # All at once: on a GPU, loads that wait for each other take most of the time.
+        for k in range(6):
+            ends[k] = plan.end_tets[k, gaussian]
+            shares[k] = plan.shares[k, gaussian]
+        if shares[0] == RIGID:
+            around.gradient = turn_of(turn_of_tet(cage, result.tet))
+            result.straddles = wp.bool(False)
     result.mean = image(around, mean)
     result.through = around.gradient * axes
     result.plus = result.through
     result.minus = result.through
     # Most Gaussians are small and lie in one tetrahedron, whose gradient is then the answer.
-    if straddles:
-        r0 = column(axes, 0)
-        r1 = column(axes, 1)
-        r2 = column(axes, 2)
-        t0 = column(result.through, 0)
-        t1 = column(result.through, 1)
-        t2 = column(result.through, 2)
+    if result.straddles:
+        t = result.tet
         m = result.mean
-        result.plus = wp.matrix_from_cols(
-            carried_arm(0, gaussian, tet, mean, m, r0, t0, max_stretch, carried, end_tets, shares, arms),
-            carried_arm(1, gaussian, tet, mean, m, r1, t1, max_stretch, carried, end_tets, shares, arms),
-            carried_arm(2, gaussian, tet, mean, m, r2, t2, max_stretch, carried, end_tets, shares, arms),
-        )
-        result.minus = -wp.matrix_from_cols(
-            carried_arm(3, gaussian, tet, mean, m, -r0, -t0, max_stretch, carried, end_tets, shares, arms),
-            carried_arm(4, gaussian, tet, mean, m, -r1, -t1, max_stretch, carried, end_tets, shares, arms),
-            carried_arm(5, gaussian, tet, mean, m, -r2, -t2, max_stretch, carried, end_tets, shares, arms),
-        )
+        for k in range(3):
+            r = column(axes, k)
+            f = column(result.through, k)
+            plus = carried_arm(ends[k], shares[k], t, mean, m, r, f, max_stretch, cage)
+            minus = carried_arm(ends[3 + k], shares[3 + k], t, mean, m, -r, -f, max_stretch, cage)
+            for i in range(3):
+                result.plus[i, k] = plus[i]
+                result.minus[i, k] = -minus[i]
     return result

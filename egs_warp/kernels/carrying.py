@@ -2,9 +2,9 @@
 
 import warp as wp
 
-from egs_warp.kernels.carried_cage import single, single_matrix
+from egs_warp.kernels.carried_cage import CarriedCage, affine_of, exponential, single, single_matrix
 from egs_warp.kernels.decomposition import turn_of
-from egs_warp.kernels.deformation import exponential, write_gaussian
+from egs_warp.kernels.deformation import write_gaussian
 from egs_warp.kernels.embedding import axes_from_quaternion
 from egs_warp.precision import Mat33, Vec3, Vec4, real
 
@@ -20,24 +20,6 @@ def interpolated(corners: wp.vec4i, weights: Vec4, positions: wp.array[Vec3]) ->
         + weights[2] * positions[corners[2]]
         + weights[3] * positions[corners[3]]
     )
-
-
-@wp.kernel
-def tet_gradients_kernel(
-    first_row: wp.int32,
-    # In:
-    positions: wp.array[Vec3],
-    tets: wp.array[wp.vec4i],
-    inverse_edges: wp.array[Mat33],
-    # Out:
-    gradients_out: wp.array[wp.mat33],
-):
-    """Deformation gradient of each tetrahedron."""
-    t = first_row + wp.tid()
-    corners = tets[t]
-    x0 = positions[corners[0]]
-    edges = wp.matrix_from_cols(positions[corners[1]] - x0, positions[corners[2]] - x0, positions[corners[3]] - x0)
-    gradients_out[t] = single_matrix(edges * inverse_edges[t])
 
 
 @wp.func
@@ -125,7 +107,7 @@ def carry_gradient_kernel(
     nodes: wp.array[wp.vec4i],
     weights: wp.array[Vec4],
     tet_from_mean: wp.array[wp.int32],
-    gradients: wp.array[wp.mat33],
+    cage: CarriedCage,
     # Out:
     means_out: wp.array[wp.vec3],
     rotations_out: wp.array[wp.vec4],
@@ -136,7 +118,7 @@ def carry_gradient_kernel(
     row = first_row + wp.tid()
     axes = turn_of(rotations[row])
     means_out[row] = single(interpolated(nodes[row], weights[row], positions))
-    stretched = gradients[tet_from_mean[row]] * axes
+    stretched = affine_of(cage, tet_from_mean[row]).gradient * axes
     write_gaussian(row, stretched, axes, exponential(log_scales[row]), rotations_out, log_scales_out, turns_out)
 
 

@@ -128,33 +128,39 @@ def perpendicular(u: wp.vec3) -> wp.vec3:
 @wp.func
 def unit_pair(a: wp.vec3, b: wp.vec3) -> wp.mat33:
     """Right-handed frame [a/|a|, b/|b|, a x b] of two orthogonal columns, either of which may have no length."""
-    u = wp.vec3(1.0, 0.0, 0.0)
-    v = wp.vec3(0.0, 1.0, 0.0)
-    if wp.length_sq(a) >= wp.length_sq(b):
-        u = unit_or(a, u)
-        v = unit_or(b - wp.dot(b, u) * u, perpendicular(u))
+    first = wp.length_sq(a) >= wp.length_sq(b)
+    longer = unit_or(wp.where(first, a, b), wp.where(first, wp.vec3(1.0, 0.0, 0.0), wp.vec3(0.0, 1.0, 0.0)))
+    shorter = wp.where(first, b, a)
+    shorter = shorter - wp.dot(shorter, longer) * longer
+    length = wp.length(shorter)
+    if length > 1.0e-20:
+        shorter = shorter / length
     else:
-        v = unit_or(b, v)
-        u = unit_or(a - wp.dot(a, v) * v, perpendicular(v))
+        shorter = perpendicular(longer)
+    u = wp.where(first, longer, shorter)
+    v = wp.where(first, shorter, longer)
     return wp.matrix_from_cols(u, v, wp.cross(u, v))
 
 
 @wp.func
 def proper_frame(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.mat33:
-    """Unit columns along orthogonal ones; the shortest follows from the two others, so that det = +1 always."""
+    """Unit columns along orthogonal ones; the shortest follows from the two others, so that det = +1 always.
+
+    The two others are picked by comparison: threads that branched would wait for each other.
+    """
     aa = wp.length_sq(a)
     bb = wp.length_sq(b)
     cc = wp.length_sq(c)
-    if cc <= aa and cc <= bb:
-        return unit_pair(a, b)
-    if aa <= bb:
-        f = unit_pair(b, c)
-        return wp.matrix_from_cols(
-            wp.vec3(f[0, 2], f[1, 2], f[2, 2]), wp.vec3(f[0, 0], f[1, 0], f[2, 0]), wp.vec3(f[0, 1], f[1, 1], f[2, 1])
-        )
-    f = unit_pair(c, a)
+    third = cc <= aa and cc <= bb
+    first = aa <= bb
+    f = unit_pair(wp.where(third, a, wp.where(first, b, c)), wp.where(third, b, wp.where(first, c, a)))
+    u = column(f, 0)
+    v = column(f, 1)
+    w = column(f, 2)
     return wp.matrix_from_cols(
-        wp.vec3(f[0, 1], f[1, 1], f[2, 1]), wp.vec3(f[0, 2], f[1, 2], f[2, 2]), wp.vec3(f[0, 0], f[1, 0], f[2, 0])
+        wp.where(third, u, wp.where(first, w, v)),
+        wp.where(third, v, wp.where(first, u, w)),
+        wp.where(third, w, wp.where(first, v, u)),
     )
 
 

@@ -2,7 +2,18 @@
 
 import warp as wp
 
-from egs_warp.kernels.carried_cage import RIGID, TET_ROWS, affine_of, carried_arms, load_row, store_row
+from egs_warp.kernels.carried_cage import (
+    RIGID,
+    ArmPlan,
+    CarriedCage,
+    affine_of,
+    carried_arms,
+    exponential,
+    load_row,
+    reach_of,
+    store_row,
+    turn_of_tet,
+)
 from egs_warp.kernels.decomposition import (
     chosen,
     column,
@@ -20,11 +31,6 @@ from egs_warp.kernels.decomposition import (
 wp.set_module_options({"enable_backward": False})
 
 LEAST_SCALE = wp.constant(wp.float32(1.0e-12))
-
-
-@wp.func
-def exponential(v: wp.vec3) -> wp.vec3:
-    return wp.vec3(wp.exp(v[0]), wp.exp(v[1]), wp.exp(v[2]))
 
 
 @wp.struct
@@ -84,11 +90,8 @@ def carried_gaussian(
     rotation: wp.vec4,
     log_scales: wp.vec3,
     max_stretch: wp.float32,
-    carried: wp.array[wp.vec4],
-    mean_tets: wp.array[wp.int32],
-    end_tets: wp.array2d[wp.int32],
-    shares: wp.array2d[wp.float32],
-    arms: wp.array2d[wp.float32],
+    cage: CarriedCage,
+    plan: ArmPlan,
 ) -> CarriedGaussian:
     """F = (F+ + F-)/2 (Eq. 14), or the F of the mean's tetrahedron where det F <= 0, then Eq. (15).
 
@@ -97,19 +100,17 @@ def carried_gaussian(
     """
     axes = turn_of(rotation)
     scales = exponential(log_scales)
-    both = carried_arms(row, mean, axes, max_stretch, carried, mean_tets, end_tets, shares, arms)
+    both = carried_arms(row, mean, axes, max_stretch, cage, plan)
     result = CarriedGaussian()
     result.mean = both.mean
     stretched = both.through
-    code = mean_tets[row]
     # Alone in one tetrahedron, far outside, or where F is turned inside out: the rotation of that tetrahedron, found once
     # for all.
     own = wp.bool(True)
-    if code < 0 and shares[0, row] < RIGID:
+    if both.straddles:
         bulge = wp.vec3(0.0)
         for k in range(3):
-            reach = wp.max(arms[row, k] + arms[row, 3 + k], 3.0 * scales[k])
-            bulge += (scales[k] * scales[k] / reach) * (column(both.plus, k) - column(both.minus, k))
+            bulge += plan.bulges[k, row] * (column(both.plus, k) - column(both.minus, k))
         result.mean += bulge
         average = 0.5 * (both.plus + both.minus)
         if wp.determinant(average) > 0.0:
@@ -117,7 +118,7 @@ def carried_gaussian(
             own = wp.bool(False)
     turned = wp.mat33()
     if own:
-        result.turn = load_row(carried, TET_ROWS * wp.where(code < 0, -1 - code, code) + 4)
+        result.turn = turn_of_tet(cage, both.tet)
         turned = turn_of(result.turn) * axes
     else:
         turned = rotation_of(stretched)
@@ -136,11 +137,8 @@ def deform_kernel(
     rotations: wp.array[wp.vec4],
     log_scales: wp.array[wp.vec3],
     max_stretch: wp.float32,
-    carried: wp.array[wp.vec4],
-    mean_tets: wp.array[wp.int32],
-    end_tets: wp.array2d[wp.int32],
-    shares: wp.array2d[wp.float32],
-    arms: wp.array2d[wp.float32],
+    cage: CarriedCage,
+    plan: ArmPlan,
     # Out:
     means_out: wp.array[wp.vec3],
     rotations_out: wp.array[wp.vec4],
@@ -155,11 +153,8 @@ def deform_kernel(
         load_row(rotations, row),
         log_scales[row],
         max_stretch,
-        carried,
-        mean_tets,
-        end_tets,
-        shares,
-        arms,
+        cage,
+        plan,
     )
     means_out[row] = result.mean
     store_row(rotations_out, row, result.rotation)
@@ -193,10 +188,8 @@ def measure_bend_kernel(
     rotations: wp.array[wp.vec4],
     log_scales: wp.array[wp.vec3],
     max_stretch: wp.float32,
-    carried: wp.array[wp.vec4],
-    mean_tets: wp.array[wp.int32],
-    end_tets: wp.array2d[wp.int32],
-    shares: wp.array2d[wp.float32],
+    cage: CarriedCage,
+    plan: ArmPlan,
     arms: wp.array2d[wp.float32],
     # In and out:
     bend_out: wp.array[wp.float32],
@@ -210,11 +203,11 @@ def measure_bend_kernel(
     the displacement that F leaves out at one standard deviation along both axes.
     """
     row = first_row + wp.tid()
-    if mean_tets[row] < 0 and shares[0, row] == RIGID:
+    if plan.mean_tets[row] < 0 and plan.shares[0, row] == RIGID:
         return
     scales = exponential(log_scales[row])
     axes = turn_of(rotations[row])
-    both = carried_arms(row, means[row], axes, max_stretch, carried, mean_tets, end_tets, shares, arms)
+    both = carried_arms(row, means[row], axes, max_stretch, cage, plan)
     between = wp.transpose(bend_frame(both.plus, scales)) * bend_frame(both.minus, scales)
     twice_sine = wp.length(
         wp.vec3(between[2, 1] - between[1, 2], between[0, 2] - between[2, 0], between[1, 0] - between[0, 1])
@@ -224,10 +217,9 @@ def measure_bend_kernel(
     curl = curl_out[row]
     error = error_out[row]
     for k in range(3):
-        f_plus = affine_of(carried, end_tets[k, row]).gradient * axes
-        f_minus = affine_of(carried, end_tets[3 + k, row]).gradient * axes
-        # Gradients jump between tetrahedra; over a much shortened arm the jump is no derivative.
-        reach = wp.max(arms[row, k] + arms[row, 3 + k], 3.0 * scales[k])
+        f_plus = affine_of(cage, plan.end_tets[k, row]).gradient * axes
+        f_minus = affine_of(cage, plan.end_tets[3 + k, row]).gradient * axes
+        reach = reach_of(arms, row, k, scales[k])
         for j in range(3):
             # Along the axis itself the ends' own positions are known; across it only the gradients at the ends are.
             a = wp.where(j == k, column(both.plus, k), column(f_plus, j))

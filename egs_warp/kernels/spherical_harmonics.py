@@ -1,7 +1,8 @@
 """Rotate the colour of Gaussians: real spherical harmonics of bands 1 to 3 in the INRIA sign convention.
 
-A band of 2l+1 coefficients is fixed by its values in 2l+1 directions d_i. The turned function is f'(d) = f(Q^T d), so
-its coefficients are A^-1 B c, where row i of A holds the band's basis in d_i and row i of B in Q^T d_i; A^-1 is constant.
+A rotation is one about z, one about y, and one about z again; that about y is one about z between quarter turns about x. About
+z, the coefficients of orders m and -m turn as a pair; a quarter turn about x mixes few (Pinchon and Hoggan 2007). Half
+the work of a full matrix for each band, and no matrix to make.
 """
 
 import numpy as np
@@ -9,91 +10,16 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-Vec5 = wp.types.vector(length=5, dtype=wp.float32)
-Vec7 = wp.types.vector(length=7, dtype=wp.float32)
-Mat55 = wp.types.matrix(shape=(5, 5), dtype=wp.float32)
-Mat77 = wp.types.matrix(shape=(7, 7), dtype=wp.float32)
 Mat53 = wp.types.matrix(shape=(5, 3), dtype=wp.float32)
 Mat73 = wp.types.matrix(shape=(7, 3), dtype=wp.float32)
+Colour = wp.types.matrix(shape=(16, 3), dtype=wp.float32)
+"""All coefficients of degree 3, a row each."""
 
-
-@wp.func
-def band_2(d: wp.vec3) -> Vec5:
-    """The five basis functions of band 2 in the unit direction ``d``."""
-    x = d[0]
-    y = d[1]
-    z = d[2]
-    return Vec5(
-        1.0925484305920792 * x * y,
-        -1.0925484305920792 * y * z,
-        0.31539156525252005 * (2.0 * z * z - x * x - y * y),
-        -1.0925484305920792 * x * z,
-        0.5462742152960396 * (x * x - y * y),
-    )
-
-
-@wp.func
-def band_3(d: wp.vec3) -> Vec7:
-    """The seven basis functions of band 3 in the unit direction ``d``."""
-    x = d[0]
-    y = d[1]
-    z = d[2]
-    xx = x * x
-    yy = y * y
-    zz = z * z
-    return Vec7(
-        -0.5900435899266435 * y * (3.0 * xx - yy),
-        2.890611442640554 * x * y * z,
-        -0.4570457994644658 * y * (4.0 * zz - xx - yy),
-        0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
-        -0.4570457994644658 * x * (4.0 * zz - xx - yy),
-        1.445305721320277 * z * (xx - yy),
-        -0.5900435899266435 * x * (xx - 3.0 * yy),
-    )
-
-
-def _basis(degree: int, d: np.ndarray) -> np.ndarray:
-    """(P, 2 degree + 1) basis values for directions (P, 3)."""
-    x, y, z = d.T
-    if degree == 2:
-        return np.stack(
-            [
-                1.0925484305920792 * x * y,
-                -1.0925484305920792 * y * z,
-                0.31539156525252005 * (2 * z * z - x * x - y * y),
-                -1.0925484305920792 * x * z,
-                0.5462742152960396 * (x * x - y * y),
-            ],
-            axis=1,
-        )
-    return np.stack(
-        [
-            -0.5900435899266435 * y * (3 * x * x - y * y),
-            2.890611442640554 * x * y * z,
-            -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
-            0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
-            -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
-            1.445305721320277 * z * (x * x - y * y),
-            -0.5900435899266435 * x * (x * x - 3 * y * y),
-        ],
-        axis=1,
-    )
-
-
-def _well_spread_directions() -> np.ndarray:
-    """(7, 3) unit directions; of 4000 seeded sets, the one that conditions bands 2 (its first five) and 3 best."""
-    rng = np.random.default_rng(0)
-    sets = rng.normal(size=(4000, 7, 3))
-    sets /= np.linalg.norm(sets, axis=2, keepdims=True)
-    second = _basis(2, sets[:, :5].reshape(-1, 3)).reshape(-1, 5, 5)
-    third = _basis(3, sets.reshape(-1, 3)).reshape(-1, 7, 7)
-    return sets[np.argmin(np.maximum(np.linalg.cond(second), np.linalg.cond(third)))]
-
-
-_DIRECTIONS = _well_spread_directions()
-DIRECTIONS = wp.constant(Mat73(*_DIRECTIONS.ravel()))
-BAND_2_FROM_VALUES = wp.constant(Mat55(*np.linalg.inv(_basis(2, _DIRECTIONS[:5])).ravel()))
-BAND_3_FROM_VALUES = wp.constant(Mat77(*np.linalg.inv(_basis(3, _DIRECTIONS)).ravel()))
+TINY = wp.constant(wp.float32(1.0e-18))
+S34 = wp.constant(wp.float32(np.sqrt(3 / 4)))
+S58 = wp.constant(wp.float32(np.sqrt(5 / 8)))
+S38 = wp.constant(wp.float32(np.sqrt(3 / 8)))
+S1516 = wp.constant(wp.float32(np.sqrt(15 / 16)))
 
 
 @wp.func
@@ -104,24 +30,145 @@ def turned_band_1(c: wp.mat33, turn: wp.mat33) -> wp.mat33:
     return wp.mat33(-w[1, 0], -w[1, 1], -w[1, 2], w[2, 0], w[2, 1], w[2, 2], -w[0, 0], -w[0, 1], -w[0, 2])
 
 
-@wp.func
-def turned_band_2(c: Mat53, back: wp.mat33) -> Mat53:
-    """Coefficients 4 to 8, a row each, after the rotation whose transpose is ``back``."""
-    values = Mat53()
-    for i in range(5):
-        basis = band_2(back * wp.vec3(DIRECTIONS[i, 0], DIRECTIONS[i, 1], DIRECTIONS[i, 2]))
-        values[i] = basis @ c
-    return BAND_2_FROM_VALUES * values
+@wp.struct
+class Turns:
+    """A rotation as three about z, y and z again: cosine and sine of each, the last one first."""
+
+    first: wp.vec2
+    tilt: wp.vec2
+    last: wp.vec2
 
 
 @wp.func
-def turned_band_3(c: Mat73, back: wp.mat33) -> Mat73:
-    """Coefficients 9 to 15, a row each, after the rotation whose transpose is ``back``."""
-    values = Mat73()
-    for i in range(7):
-        basis = band_3(back * wp.vec3(DIRECTIONS[i, 0], DIRECTIONS[i, 1], DIRECTIONS[i, 2]))
-        values[i] = basis @ c
-    return BAND_3_FROM_VALUES * values
+def turns_of(q: wp.vec4) -> Turns:
+    """Euler angles of the unit quaternion w, x, y, z. Where one is arbitrary, every choice is right to rounding."""
+    along = wp.sqrt(q[0] * q[0] + q[3] * q[3])
+    across = wp.sqrt(q[1] * q[1] + q[2] * q[2])
+    half_sum = wp.vec2(1.0, 0.0)
+    half_difference = wp.vec2(1.0, 0.0)
+    if along > TINY:
+        half_sum = wp.vec2(q[0], q[3]) / along
+    if across > TINY:
+        half_difference = wp.vec2(q[2], -q[1]) / across
+    rr = half_sum[0] * half_difference[0]
+    ii = half_sum[1] * half_difference[1]
+    ri = half_sum[0] * half_difference[1]
+    ir = half_sum[1] * half_difference[0]
+    result = Turns()
+    result.first = wp.vec2(rr + ii, ir - ri)
+    result.tilt = wp.vec2(along * along - across * across, 2.0 * along * across)
+    result.last = wp.vec2(rr - ii, ir + ri)
+    return result
+
+
+@wp.func
+def doubled(t: wp.vec2) -> wp.vec2:
+    return wp.vec2(t[0] * t[0] - t[1] * t[1], 2.0 * t[0] * t[1])
+
+
+@wp.func
+def added(t: wp.vec2, u: wp.vec2) -> wp.vec2:
+    return wp.vec2(t[0] * u[0] - t[1] * u[1], t[0] * u[1] + t[1] * u[0])
+
+
+@wp.func
+def band_2_about_z(c: Mat53, t: wp.vec2) -> Mat53:
+    """After a rotation about z by the angle of cosine and sine ``t``: orders m and -m turn by m times it."""
+    t2 = doubled(t)
+    result = Mat53()
+    result[0] = t2[0] * c[0] + t2[1] * c[4]
+    result[1] = t[0] * c[1] + t[1] * c[3]
+    result[2] = c[2]
+    result[3] = t[0] * c[3] - t[1] * c[1]
+    result[4] = t2[0] * c[4] - t2[1] * c[0]
+    return result
+
+
+@wp.func
+def turned_band_2(c: Mat53, turns: Turns) -> Mat53:
+    """Coefficients 4 to 8, a row each, after the rotation. That about y is one about z between quarter turns about x."""
+    f = band_2_about_z(c, turns.first)
+    g = Mat53()
+    g[0] = f[3]
+    g[1] = -f[1]
+    g[2] = -0.5 * f[2] - S34 * f[4]
+    g[3] = -f[0]
+    g[4] = 0.5 * f[4] - S34 * f[2]
+    f = band_2_about_z(g, turns.tilt)
+    g[0] = -f[3]
+    g[1] = -f[1]
+    g[2] = -0.5 * f[2] - S34 * f[4]
+    g[3] = f[0]
+    g[4] = 0.5 * f[4] - S34 * f[2]
+    return band_2_about_z(g, turns.last)
+
+
+@wp.func
+def band_3_about_z(c: Mat73, t: wp.vec2) -> Mat73:
+    """As ``band_2_about_z``."""
+    t2 = doubled(t)
+    t3 = added(t2, t)
+    result = Mat73()
+    result[0] = t3[0] * c[0] + t3[1] * c[6]
+    result[1] = t2[0] * c[1] + t2[1] * c[5]
+    result[2] = t[0] * c[2] + t[1] * c[4]
+    result[3] = c[3]
+    result[4] = t[0] * c[4] - t[1] * c[2]
+    result[5] = t2[0] * c[5] - t2[1] * c[1]
+    result[6] = t3[0] * c[6] - t3[1] * c[0]
+    return result
+
+
+@wp.func
+def turned_band_3(c: Mat73, turns: Turns) -> Mat73:
+    """Coefficients 9 to 15, a row each, after the rotation; as ``turned_band_2``."""
+    f = band_3_about_z(c, turns.first)
+    g = Mat73()
+    g[0] = S38 * f[5] - S58 * f[3]
+    g[1] = -f[1]
+    g[2] = -S38 * f[3] - S58 * f[5]
+    g[3] = S58 * f[0] + S38 * f[2]
+    g[4] = -0.25 * f[4] - S1516 * f[6]
+    g[5] = S58 * f[2] - S38 * f[0]
+    g[6] = 0.25 * f[6] - S1516 * f[4]
+    f = band_3_about_z(g, turns.tilt)
+    g[0] = S58 * f[3] - S38 * f[5]
+    g[1] = -f[1]
+    g[2] = S38 * f[3] + S58 * f[5]
+    g[3] = -S58 * f[0] - S38 * f[2]
+    g[4] = -0.25 * f[4] - S1516 * f[6]
+    g[5] = S38 * f[0] - S58 * f[2]
+    g[6] = 0.25 * f[6] - S1516 * f[4]
+    return band_3_about_z(g, turns.last)
+
+
+@wp.func
+def turned_colour(c: Colour, q: wp.vec4, degree: wp.int32) -> Colour:
+    """Coefficients up to that degree after the rotation ``q`` (w, x, y, z); band 0 stays."""
+    result = c
+    turns = turns_of(q)
+    if degree >= 1:
+        first = wp.mat33()
+        for j in range(3):
+            first[j] = c[1 + j]
+        first = turned_band_1(first, wp.quat_to_matrix(wp.quat(q[1], q[2], q[3], q[0])))
+        for j in range(3):
+            result[1 + j] = first[j]
+    if degree >= 2:
+        second = Mat53()
+        for j in range(5):
+            second[j] = c[4 + j]
+        second = turned_band_2(second, turns)
+        for j in range(5):
+            result[4 + j] = second[j]
+    if degree >= 3:
+        third = Mat73()
+        for j in range(7):
+            third[j] = c[9 + j]
+        third = turned_band_3(third, turns)
+        for j in range(7):
+            result[9 + j] = third[j]
+    return result
 
 
 @wp.kernel
@@ -136,28 +183,13 @@ def rotate_sh_kernel(
 ):
     """Coefficients of each Gaussian's colour after the rotation ``turns`` (w, x, y, z); band 0 is left alone."""
     row = first_row + wp.tid()
-    q = turns[row]
-    turn = wp.quat_to_matrix(wp.quat(q[1], q[2], q[3], q[0]))
-    back = wp.transpose(turn)
+    count = (degree + 1) * (degree + 1)
     # Each coefficient is read once: a row is 192 bytes, and neighbouring threads share no cache line.
-    if degree >= 1:
-        first = wp.mat33()
-        for j in range(3):
-            first[j] = sh[row, 1 + j]
-        first = turned_band_1(first, turn)
-        for j in range(3):
-            sh_out[row, 1 + j] = first[j]
-    if degree >= 2:
-        second = Mat53()
-        for j in range(5):
-            second[j] = sh[row, 4 + j]
-        second = turned_band_2(second, back)
-        for j in range(5):
-            sh_out[row, 4 + j] = second[j]
-    if degree >= 3:
-        third = Mat73()
-        for j in range(7):
-            third[j] = sh[row, 9 + j]
-        third = turned_band_3(third, back)
-        for j in range(7):
-            sh_out[row, 9 + j] = third[j]
+    colour = Colour()
+    for j in range(1, 16):
+        if j < count:
+            colour[j] = sh[row, j]
+    colour = turned_colour(colour, turns[row], degree)
+    for j in range(1, 16):
+        if j < count:
+            sh_out[row, j] = colour[j]
