@@ -20,7 +20,6 @@ from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.tiles import TileLists
 
 
-
 @dataclass(frozen=True)
 class Scene:
     """Gaussians as every peer wants them: leaf tensors of activated values."""

@@ -16,7 +16,6 @@ from egs_warp.finetune import TrainingView
 from egs_warp.gaussians import SH_BAND_0, GaussianCloud
 
 
-
 def middle_of(cameras: Sequence[Camera]) -> np.ndarray:
     """(3,) the point nearest to all optical axes, in the least-squares sense."""
     centres = np.array([camera.centre for camera in cameras])
