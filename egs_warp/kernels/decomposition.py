@@ -38,6 +38,40 @@ def column(m: wp.mat33, k: wp.int32) -> wp.vec3:
 
 
 @wp.struct
+class Pair:
+    """Two columns of a 3x3 matrix, and of the rotation that has been applied to it from the right."""
+
+    a: wp.vec3
+    b: wp.vec3
+    va: wp.vec3
+    vb: wp.vec3
+    sine: wp.float32
+    """Of the angle they have turned by last."""
+
+
+@wp.func
+def orthogonal_pair(a: wp.vec3, b: wp.vec3, va: wp.vec3, vb: wp.vec3) -> Pair:
+    """The rotation that makes ``a`` and ``b`` orthogonal, applied to them and to ``va`` and ``vb``."""
+    aa = wp.dot(a, a)
+    bb = wp.dot(b, b)
+    ab = wp.dot(a, b)
+    cosine = wp.float32(1.0)
+    sine = wp.float32(0.0)
+    if ab * ab > ORTHOGONAL * ORTHOGONAL * aa * bb:
+        cot = (bb - aa) / (2.0 * ab)
+        tangent = wp.where(cot >= 0.0, 1.0, -1.0) / (wp.abs(cot) + wp.sqrt(1.0 + cot * cot))
+        cosine = 1.0 / wp.sqrt(1.0 + tangent * tangent)
+        sine = cosine * tangent
+    result = Pair()
+    result.a = cosine * a - sine * b
+    result.b = sine * a + cosine * b
+    result.va = cosine * va - sine * vb
+    result.vb = sine * va + cosine * vb
+    result.sine = sine
+    return result
+
+
+@wp.struct
 class Columns:
     """A 3x3 matrix by columns, and the rotation that has been applied to it from the right."""
 
@@ -47,20 +81,6 @@ class Columns:
     va: wp.vec3
     vb: wp.vec3
     vc: wp.vec3
-
-
-@wp.func
-def rotation_between(a: wp.vec3, b: wp.vec3) -> wp.vec2:
-    """Cosine and sine for which cos a - sin b and sin a + cos b are orthogonal."""
-    aa = wp.dot(a, a)
-    bb = wp.dot(b, b)
-    ab = wp.dot(a, b)
-    if ab * ab <= ORTHOGONAL * ORTHOGONAL * aa * bb:
-        return wp.vec2(1.0, 0.0)
-    cot = (bb - aa) / (2.0 * ab)
-    tangent = wp.where(cot >= 0.0, 1.0, -1.0) / (wp.abs(cot) + wp.sqrt(1.0 + cot * cot))
-    cosine = 1.0 / wp.sqrt(1.0 + tangent * tangent)
-    return wp.vec2(cosine, cosine * tangent)
 
 
 @wp.func
@@ -79,33 +99,17 @@ def orthogonal_columns(a: wp.vec3, b: wp.vec3, c: wp.vec3) -> Columns:
     m.vc = wp.vec3(0.0, 0.0, 1.0)
     sweep = wp.int32(0)
     while sweep < MAX_SWEEPS:
-        turned = wp.float32(0.0)
-        t = rotation_between(m.a, m.b)
-        turned += wp.abs(t[1])
-        p = t[0] * m.a - t[1] * m.b
-        m.b = t[1] * m.a + t[0] * m.b
-        m.a = p
-        p = t[0] * m.va - t[1] * m.vb
-        m.vb = t[1] * m.va + t[0] * m.vb
-        m.va = p
-        t = rotation_between(m.a, m.c)
-        turned += wp.abs(t[1])
-        p = t[0] * m.a - t[1] * m.c
-        m.c = t[1] * m.a + t[0] * m.c
-        m.a = p
-        p = t[0] * m.va - t[1] * m.vc
-        m.vc = t[1] * m.va + t[0] * m.vc
-        m.va = p
-        t = rotation_between(m.b, m.c)
-        turned += wp.abs(t[1])
-        p = t[0] * m.b - t[1] * m.c
-        m.c = t[1] * m.b + t[0] * m.c
-        m.b = p
-        p = t[0] * m.vb - t[1] * m.vc
-        m.vc = t[1] * m.vb + t[0] * m.vc
-        m.vb = p
+        ab = orthogonal_pair(m.a, m.b, m.va, m.vb)
+        ac = orthogonal_pair(ab.a, m.c, ab.va, m.vc)
+        bc = orthogonal_pair(ab.b, ac.b, ab.vb, ac.vb)
+        m.a = ac.a
+        m.b = bc.a
+        m.c = bc.b
+        m.va = ac.va
+        m.vb = bc.va
+        m.vc = bc.vb
         sweep += 1
-        if turned == 0.0:
+        if wp.abs(ab.sine) + wp.abs(ac.sine) + wp.abs(bc.sine) == 0.0:
             sweep = MAX_SWEEPS
     return m
 
