@@ -13,6 +13,7 @@ from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
 from egs_warp.bitmaps import connected_parts, depth_inside
+from egs_warp.rim_colours import RimColours
 
 _PIECES = (5, 10)
 """Radii, in pixels, of the pieces of the rim whose like is looked for, besides the whole rim."""
@@ -32,6 +33,10 @@ _SEAM = 0.03
 """Price of a seam that does not show, as a colour difference: it keeps copies in large pieces."""
 _SWEEPS = 3
 """Rounds of expansion over all offsets, at most."""
+_ATTEMPTS = 4
+"""At a picture without islands of colours that the rim does not have."""
+_ALIKE = 0.05
+"""Mean colour difference around a pixel below which an offset may bring any colour there: the picture repeats."""
 _FORBIDDEN = 50_000_000
 
 
@@ -62,8 +67,7 @@ def labelled_sources(
         if len(offsets.steps) == 0:
             continue
         domain = np.argwhere(here & (hole | known))
-        labels = _label(image, hole, known, is_source, domain, offsets)
-        sources[domain[:, 0], domain[:, 1]] = domain + offsets.steps[labels]
+        sources[domain[:, 0], domain[:, 1]] = domain + _label(image, hole, known, is_source, domain, offsets)
     return sources
 
 
@@ -131,20 +135,26 @@ def _label(
     domain: np.ndarray,
     offsets: Offsets,
 ) -> np.ndarray:
-    """(n,) label of each pixel (n, 2) of ``domain`` by expansion moves."""
-    place = domain[:, None] + offsets.steps[None]
-    bounded = np.clip(place, 0, np.array(hole.shape) - 1)
-    allowed = (place == bounded).all(axis=-1) & is_source[bounded[..., 0], bounded[..., 1]]
-    colour = image[bounded[..., 0], bounded[..., 1]] + offsets.shifts
+    """(n, 2) offset of each pixel (n, 2) of ``domain`` by expansion moves over ``offsets``, and such as these lack."""
     in_hole = hole[domain[:, 0], domain[:, 1]]
+    colours = RimColours(image, known & ~hole, domain)
+    place, allowed = _places(domain, offsets, is_source)
+    covered = (allowed & colours.common(place)).any(axis=1)
+    added = colours.offsets_for(in_hole & ~covered, is_source)
+    if added:
+        offsets = Offsets(
+            np.concatenate([offsets.steps, added]),
+            np.concatenate([offsets.shifts, np.zeros((len(added), 3), np.float32)]),
+        )
+        place, allowed = _places(domain, offsets, is_source)
+    colour = image[place[..., 0], place[..., 1]] + offsets.shifts
     misfit = np.linalg.norm(colour - image[domain[:, 0], domain[:, 1]][:, None], axis=-1)
-    data = _COST_UNIT * np.where(
-        in_hole[:, None], _PRIOR * _surround_misfit(image, hole, known, domain, offsets), misfit
-    )
+    within = _PRIOR * _surround_misfit(image, hole, known, domain, offsets)
+    data = _COST_UNIT * np.where(in_hole[:, None], within, misfit)
     data = np.where(allowed, data, _FORBIDDEN).astype(np.int64)
     ranked = np.argsort(data, axis=1, kind="stable")[:, :_BEST]
-    kept = np.unique(ranked)
-    data, colour = data[:, kept], colour[:, kept]
+    kept = np.unique(np.concatenate([ranked.ravel(), np.arange(len(offsets.steps) - len(added), len(offsets.steps))]))
+    data, colour, place = data[:, kept], colour[:, kept], place[:, kept]
     index = np.full(hole.shape, -1)
     index[domain[:, 0], domain[:, 1]] = np.arange(len(domain))
     pairs = []
@@ -156,14 +166,30 @@ def _label(
         pairs.append(np.stack([np.flatnonzero(other >= 0), other[other >= 0]], axis=1))
     p, q = np.concatenate(pairs).T
 
+    labels, every = np.argmin(data, axis=1), np.arange(len(domain))
+    common = colours.common(place)
+    for _ in range(_ATTEMPTS):
+        labels = _expanded(labels, data, colour, p, q)
+        islands = in_hole & colours.islands(place[every, labels]) & (common & (data < _FORBIDDEN)).any(axis=1)
+        islands &= data[every, labels] > _ALIKE * _PRIOR * _COST_UNIT
+        if not islands.any():
+            break
+        data[islands[:, None] & ~common] = _FORBIDDEN
+    return offsets.steps[kept[labels]]
+
+
+def _expanded(labels: np.ndarray, data: np.ndarray, colour: np.ndarray, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """``labels`` (n,) improved by expansion moves: ``data`` (n, k) is the price of each label, ``colour`` (n, k, 3) what it
+    paints; seams are between neighbours ``p`` and ``q`` (m,)."""
+
     def seam(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         cost = np.linalg.norm(colour[p, a] - colour[p, b], axis=-1) + np.linalg.norm(
             colour[q, a] - colour[q, b], axis=-1
         )
         return np.where(a == b, 0, np.rint(_COST_UNIT * (cost + _SEAM))).astype(np.int64)
 
-    labels = np.argmin(data, axis=1)
-    every = np.arange(len(domain))
+    count = len(labels)
+    every = np.arange(count)
 
     def energy(labels: np.ndarray) -> int:
         return int(data[every, labels].sum() + seam(labels[p], labels[q]).sum())
@@ -171,11 +197,11 @@ def _label(
     lowest = energy(labels)
     for _ in range(_SWEEPS):
         before = lowest
-        for label in range(len(kept)):
+        for label in range(data.shape[1]):
             new = np.full(len(p), label)
             e00, e01, e10 = seam(labels[p], labels[q]), seam(labels[p], new), seam(new, labels[q])
             unary = data[:, label] - data[every, labels]
-            unary = unary + np.bincount(p, e10 - e00, len(domain)) - np.bincount(q, e10, len(domain))
+            unary = unary + np.bincount(p, e10 - e00, count) - np.bincount(q, e10, count)
             moved = _cut(np.clip(unary, -_FORBIDDEN, _FORBIDDEN), p, q, np.maximum(e01 + e10 - e00, 0))
             candidate = np.where(moved, label, labels)
             value = energy(candidate)
@@ -183,7 +209,14 @@ def _label(
                 labels, lowest = candidate, value
         if lowest == before:
             break
-    return kept[labels]
+    return labels
+
+
+def _places(domain: np.ndarray, offsets: Offsets, is_source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(n, k, 2) where each offset leads from each pixel, kept inside the picture; and (n, k) bool whether to a source."""
+    place = domain[:, None] + offsets.steps[None]
+    bounded = np.clip(place, 0, np.array(is_source.shape) - 1)
+    return bounded, (place == bounded).all(axis=-1) & is_source[bounded[..., 0], bounded[..., 1]]
 
 
 def _surround_misfit(

@@ -91,6 +91,24 @@ def test_meld_takes_the_gradients_and_drops_the_step() -> None:
     assert np.abs(meld(image, hole, np.ones_like(hole), same) - image).max() < 1e-9
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_no_island_of_what_lies_far_from_the_hole(seed: int) -> None:
+    """A hole in an unevenly lit pale sheet on dark boards, with little of the sheet left around it, gets no dark patch; a
+    crack that runs through a hole in the boards goes on."""
+    random = np.random.default_rng(seed)
+    image = np.full((128, 128, 3), (0.42, 0.36, 0.33)) + random.normal(0.0, 0.02, (128, 128, 1))
+    image[:, 108:111] = 0.1
+    light = cv2.GaussianBlur(random.normal(0.0, 1.0, (128, 128, 1)), (0, 0), 6.0)[..., None]
+    sheet = np.zeros((128, 128), bool)
+    sheet[22:106, 20:96] = True
+    image[sheet] = ((0.8, 0.85, 0.95) + 0.3 * light)[sheet]
+    image = np.clip(image, 0.0, 1.0).astype(np.float32)
+    hole = round_hole(128, (62 + int(random.integers(-4, 5)), 56), 28) | round_hole(128, (64, 114), 7)
+    filled = PatchSynthesis(seed=seed).fill(np.where(hole[..., None], 0.0, image).astype(np.float32), hole, ~hole)
+    assert (filled[hole & sheet] > 0.6).all()
+    assert (filled[57:71, 109] < 0.25).all()
+
+
 def test_nothing_to_learn_from() -> None:
     """A picture that is all hole but a line."""
     hole = np.ones((40, 40), bool)
