@@ -22,6 +22,9 @@ from egs_warp.simulation import Simulation, simulate
 from egs_warp.terrain import Solid
 from egs_warp.trajectory import audit, measure
 
+LARGEST_SIZE = 4096
+LARGEST_FRICTION = 10.0
+
 
 @dataclass(frozen=True)
 class AnimateOptions:
@@ -53,9 +56,12 @@ class AnimateOptions:
             raise UserError(
                 f"--heading-degrees {turn}: give a number of degrees from -{LARGEST_TURN:g} to {LARGEST_TURN:g}"
             )
-        for name, value, least in (("frames", self.frames, 1), ("size", self.size, 16)):
-            if value is not None and value < least:
-                raise UserError(f"--{name} {value}: give a whole number of at least {least}")
+        if self.frames is not None and self.frames < 1:
+            raise UserError(f"--frames {self.frames}: give a whole number of at least 1")
+        if not 16 <= self.size <= LARGEST_SIZE:
+            raise UserError(f"--size {self.size}: give a number of pixels from 16 to {LARGEST_SIZE}")
+        if not 0.0 <= self.friction <= LARGEST_FRICTION:
+            raise UserError(f"--friction {self.friction}: give a Coulomb coefficient from 0 to {LARGEST_FRICTION:g}")
         if self.metres_per_unit is not None and not (np.isfinite(self.metres_per_unit) and self.metres_per_unit > 0.0):
             raise UserError(f"--metres-per-unit {self.metres_per_unit}: give a positive number")
 

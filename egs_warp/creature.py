@@ -24,6 +24,8 @@ from egs_warp.terrain import Solid
 
 SMALLEST_SAG = 0.004
 """A body is not made stiffer than this column's sag, whatever it bends."""
+STEEPEST_SLOPE = 45.0
+"""Degrees: nothing stands on a steeper one."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,8 @@ def make_creature(
         if up is None:
             raise UserError("animate: neither up nor a plane is known; give --up or --plane")
         plane = find_base_plane(cloud, up)
+    if gravity_up is not None:
+        _check_slope(plane, gravity_up)
     device = str(cloud.device)
     cage = build_cage(cloud, plane)
     scale = metres_per_unit or 1.0 / cage.height(plane)
@@ -93,6 +97,16 @@ def make_creature(
         if sag < SMALLEST_SAG or _stands(stepper, start):
             return Creature(cloud, plane, scale, cage, stepper, start, (Solid((plane,)), *solids))
         sag *= 0.5
+
+
+def _check_slope(plane: Plane, up: np.ndarray) -> None:
+    slope = float(np.degrees(np.arccos(np.clip(plane.normal @ up / np.linalg.norm(up), -1.0, 1.0))))
+    if slope > STEEPEST_SLOPE:
+        raise UserError(
+            f"--gravity-up {','.join(f'{x:g}' for x in up)}: that makes the ground a slope of {slope:.0f} degrees;"
+            f" give a direction at most {STEEPEST_SLOPE:g} degrees from the ground's normal"
+            f" {','.join(f'{x:.3g}' for x in plane.normal)}"
+        )
 
 
 def body_muscles(body: SoftBody, plane: Plane, file: Path | None, *, metres_per_unit: float) -> MuscleSet:

@@ -25,11 +25,18 @@ from egs_warp.scenes import pawn
         (["--height", "11"], "--height 11.0: give a number of body heights from 0 to 10"),
         (["--height", "0"], "--height 0: a jump needs a height above 0 body heights"),
         (["--frames", "0"], "--frames 0: give a whole number of at least 1"),
+        (["--size", "99999"], "--size 99999: give a number of pixels from 16 to 4096"),
+        (["--friction", "nan"], "--friction nan: give a Coulomb coefficient from 0 to 10"),
+        (["--friction", "-1"], "--friction -1.0: give a Coulomb coefficient from 0 to 10"),
         (["--metres-per-unit", "-2"], "--metres-per-unit -2.0: give a positive number"),
         (["--up", "w"], "--up w: give one of x, y, z, -x, -y, -z (write --up=-y)"),
         (["--plane", "0,0,0,1"], "give four finite numbers nx,ny,nz,d with a normal that is not zero"),
         (["--plane", "1,2"], "--plane 1,2: give four numbers nx,ny,nz,d"),
         (["--device", "tpu"], "--device tpu: this machine has cpu"),
+        (
+            ["--gravity-up", "1,2"],
+            "--gravity-up 1,2: give three numbers x,y,z or an axis as -y (write --gravity-up=-y)",
+        ),
         ([], "nothing.ply"),
     ],
 )

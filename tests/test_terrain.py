@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from egs_warp.creature import make_creature
 from egs_warp.errors import UserError
 from egs_warp.plane import Plane
+from egs_warp.scenes import pawn
 from egs_warp.terrain import Solid, read_terrain, step, surface_above
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -56,3 +58,13 @@ def test_mistakes_of_a_terrain_file(tmp_path: Path, text: str, message: str) -> 
     with pytest.raises(UserError) as error:
         read_terrain(path)
     assert str(error.value).startswith(str(path)) and message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_slope_that_nothing_stands_on_is_refused() -> None:
+    thing = pawn(device="cpu")
+    with pytest.raises(UserError) as error:
+        make_creature(thing.cloud, plane=thing.plane, gravity_up=np.array([1.0, 0.0, 0.5]))
+    assert str(error.value) == (
+        "--gravity-up 1,0,0.5: that makes the ground a slope of 63 degrees; give a direction at most 45 degrees from"
+        " the ground's normal 0,0,1"
+    )
