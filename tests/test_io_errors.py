@@ -7,8 +7,6 @@ import json
 import struct
 import tempfile
 import zipfile
-from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -17,53 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from egs_warp.errors import UserError
-from egs_warp.gaussians import GaussianCloud
-from egs_warp.io import read_capture, write_compressed_ply, write_ply, write_sog, write_splat, write_spz
-
-
-def small_cloud() -> GaussianCloud:
-    rng = np.random.default_rng(5)
-    return GaussianCloud.from_numpy(
-        rng.normal(size=(7, 3)),
-        rng.normal(size=(7, 4)),
-        rng.normal(size=(7, 3)) - 4.0,
-        rng.normal(size=7),
-        0.3 * rng.normal(size=(7, 4, 3)),
-        device="cpu",
-    )
-
-
-WRITERS: dict[str, Callable[..., None]] = {
-    "a.ply": write_ply,
-    "b.ply": write_compressed_ply,
-    "a.spz": write_spz,
-    "a.splat": write_splat,
-    "a.sog": write_sog,
-}
-
-
-@cache
-def good_bytes(name: str) -> bytes:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / name
-        WRITERS[name](path, small_cloud())
-        return path.read_bytes()
-
-
-def message(path: Path) -> str:
-    """The one line that reading ``path`` ends with, without the path it starts with."""
-    with pytest.raises(UserError) as caught:
-        read_capture(path, device="cpu")
-    text = str(caught.value)
-    assert "\n" not in text
-    assert text.startswith(f"{path}: ")
-    return text.removeprefix(f"{path}: ")
-
-
-def written(path: Path, data: bytes) -> Path:
-    path.write_bytes(data)
-    return path
-
+from egs_warp.io import read_capture, write_spz
+from tests.captures import WRITERS, good_bytes, message, small_cloud, written
 
 PLY_HEADER = b"ply\nformat binary_little_endian 1.0\n"
 
@@ -247,90 +200,6 @@ def test_bad_splat(tmp_path: Path) -> None:
     assert message(written(path, bytes(data))) == (
         "scale of 1 Gaussians is negative (first: number 3); if the file is a .splat, export it again"
     )
-
-
-# SOG -----------------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def sog_folder(tmp_path: Path) -> Path:
-    write_sog(tmp_path / "a.sog", small_cloud())
-    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
-        archive.extractall(tmp_path / "a")
-    return tmp_path / "a"
-
-
-def test_bad_zip(tmp_path: Path) -> None:
-    data = good_bytes("a.sog")
-    assert message(written(tmp_path / "a.sog", data[: len(data) // 2])).startswith("corrupted zip (")
-    with zipfile.ZipFile(tmp_path / "b.sog", "w") as archive:
-        archive.writestr("a.txt", "hello")
-    assert message(tmp_path / "b.sog").startswith("a zip without meta.json; give a .sog")
-    with zipfile.ZipFile(tmp_path / "c.sog", "w") as archive:
-        archive.writestr("inner/meta.json", json.dumps({"version": 2, "count": 1, "means": {"files": ["a", "b"]}}))
-    assert message(tmp_path / "c.sog") == "inner/a is missing from the zip; copy or export the file again"
-
-
-@pytest.mark.parametrize(
-    ("keys", "value", "expected"),
-    [
-        (("version",), 3, "SOG version 3, expected 1 or 2; export it as version 2 or as .ply"),
-        (("count",), 10, "truncated: 10 Gaussians, but means_l.webp has 9 pixels; export it again"),
-        (("count",), -1, "count in meta.json is not a whole number; export the capture again"),
-        (("means", "mins"), [0, 1], "means.mins in meta.json is not 3 finite numbers; export the capture again"),
-        (("means", "maxs"), [0, 1, float("nan")], "means.maxs in meta.json is not 3 finite numbers"),
-        (("means", "files"), ["../../x", "y"], "meta.json names '../../x', which lies outside the capture"),
-        (("quats", "files"), "quats.webp", "quats.files in meta.json is not 1 file names"),
-        (("scales", "codebook"), [1.0] * 255, "scales.codebook in meta.json is not 256 finite numbers"),
-        (("shN", "bands"), 2, "shN_centroids.webp is 192 pixels wide, expected 192, 512 or 960"),
-        (("sh0", "files"), ["meta.json"], "meta.json is not a readable image; export the capture again"),
-    ],
-)
-def test_bad_sog_meta(keys: tuple[str, ...], value: object, expected: str, sog_folder: Path) -> None:
-    path = sog_folder / "meta.json"
-    meta = json.loads(path.read_text())
-    entry = meta
-    for key in keys[:-1]:
-        entry = entry[key]
-    entry[keys[-1]] = value
-    path.write_text(json.dumps(meta))
-    with pytest.raises(UserError) as caught:
-        read_capture(sog_folder, device="cpu")
-    assert str(caught.value).startswith(f"{path}: {expected}")
-
-
-def test_sog_without_an_image_or_with_half_of_one(sog_folder: Path) -> None:
-    image = sog_folder / "quats.webp"
-    data = image.read_bytes()
-    image.write_bytes(data[: len(data) // 2])
-    with pytest.raises(UserError, match=r"meta\.json: quats\.webp is not a readable image; export the capture again"):
-        read_capture(sog_folder, device="cpu")
-    image.unlink()
-    with pytest.raises(UserError, match=r"quats\.webp: no such file or folder; check the path"):
-        read_capture(sog_folder, device="cpu")
-
-
-def test_bad_json(tmp_path: Path) -> None:
-    for text in ("{", "{" * 100, '{"a":' * 100_000, "{\xff"):
-        path = written(tmp_path / "meta.json", text.encode("latin-1"))
-        assert message(path) == "meta.json is not readable JSON; copy or export the capture again"
-
-
-@pytest.mark.parametrize(
-    ("tree", "expected"),
-    [
-        ({"lods": {"0": {"file": 4, "offset": 0, "count": 1}}}, "lod-meta.json points at file 4 of 1; export it again"),
-        ({"lods": {"0": {"file": 0, "offset": -1, "count": 1}}}, "malformed leaf in lod-meta.json"),
-        ({"children": 5}, "malformed tree in lod-meta.json"),
-        ({"children": [[]]}, "malformed tree in lod-meta.json"),
-        ({"lods": {"0": {"file": 0, "offset": 4, "count": 4}}}, "truncated: a/meta.json has 7 Gaussians"),
-        ({"lods": {}}, "it has no Gaussians"),
-    ],
-)
-def test_bad_streamed_sog(tree: dict, expected: str, sog_folder: Path) -> None:
-    path = sog_folder.parent / "lod-meta.json"
-    path.write_text(json.dumps({"lodLevels": 1, "filenames": ["a/meta.json"], "tree": tree}))
-    assert message(path).startswith(expected)
 
 
 # Whatever the bytes --------------------------------------------------------------------------------------------------
