@@ -46,19 +46,24 @@ def contact_sheet(frames: Sequence[np.ndarray], columns: int, labels: Sequence[s
     rows = -(-len(frames) // columns)
     sheet = np.full((rows * height, columns * width, 3), 255, dtype=np.uint8)
     size = max(0.35, height / 512 * 0.8)
+    rim = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * max(1, round(1.5 * size)) + 1,) * 2)
     for index, (frame, label) in enumerate(zip(frames, labels, strict=True)):
-        cell = np.ascontiguousarray(frame)
-        corner = (int(12 * size), int(30 * size))
+        letters = cv2.putText(
+            np.zeros((height, width), np.uint8),
+            label,
+            (int(12 * size), int(30 * size)),
+            cv2.FONT_HERSHEY_SIMPLEX,
+            size,
+            255,
+            max(1, round(1.4 * size)),
+            cv2.LINE_AA,
+        )
         # A light rim under dark letters reads on any background.
-        for colour, thickness in (
-            ((255, 255, 255), max(2, round(4 * size))),
-            ((20, 20, 20), max(1, round(1.4 * size))),
-        ):
-            cell = cv2.putText(
-                cell.copy(), label, corner, cv2.FONT_HERSHEY_SIMPLEX, size, colour, thickness, cv2.LINE_AA
-            )
+        cell = np.asarray(frame, dtype=np.float32)
+        for colour, mask in ((255.0, cv2.dilate(letters, rim)), (20.0, letters)):
+            cell = cell + mask[..., None] / 255.0 * (colour - cell)
         row, column = divmod(index, columns)
-        sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = cell
+        sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = np.rint(cell)
     return sheet
 
 
