@@ -60,6 +60,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
+    wp.config.log_level = wp.LOG_WARNING
     arguments.out.mkdir(parents=True, exist_ok=True)
 
     scene = pawn(device=arguments.device)
@@ -79,6 +80,7 @@ def main() -> None:
     for label, cloud in pictures.items():
         quality = np.mean([psnr(np.clip(render(cloud, v.camera).colour.numpy(), 0, 1), v.image) for v in views])
         print(f"{label:>18}: {quality:6.2f} dB")
+    print(f"wrote finetune.png into {arguments.out}")
 
 
 if __name__ == "__main__":

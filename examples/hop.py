@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+import warp as wp
 
 from egs_warp.animation import AnimateOptions, animate
 from egs_warp.report import summary
@@ -22,6 +23,7 @@ def main(arguments: list[str] | None = None) -> dict:
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)
+    wp.config.log_level = wp.LOG_WARNING
     chess = scene("pawn", device=chosen.device)
     report = animate(
         chess.object,
@@ -34,6 +36,7 @@ def main(arguments: list[str] | None = None) -> dict:
         source="pawn",
     )
     print(summary(report))
+    print(f"wrote the video, sheet.png, report.json, trajectory.npz into {chosen.out}")
     return report
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import warp as wp
+
 from egs_warp.animation import AnimateOptions, animate
 from egs_warp.report import summary
 from egs_warp.scenes import pawn
@@ -19,10 +21,12 @@ def main(arguments: list[str] | None = None) -> dict:
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)
+    wp.config.log_level = wp.LOG_WARNING
     thing = pawn(device=chosen.device)
     options = AnimateOptions(heading_degrees=chosen.degrees, frames=chosen.frames, size=chosen.size)
     report = animate(thing.cloud, chosen.out, motion="twist", plane=thing.plane, options=options, source="pawn")
     print(summary(report))
+    print(f"wrote the video, sheet.png, report.json, trajectory.npz into {chosen.out}")
     return report
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import warp as wp
+
 from egs_warp.animation import AnimateOptions, animate
 from egs_warp.report import summary
 from egs_warp.scenes import stool
@@ -20,11 +22,13 @@ def main(arguments: list[str] | None = None) -> dict:
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)
+    wp.config.log_level = wp.LOG_WARNING
     thing = stool(device=chosen.device)
     options = AnimateOptions(frames=chosen.frames, size=chosen.size)
     motion = f"walk {chosen.steps} {chosen.step_length}"
     report = animate(thing.cloud, chosen.out, motion=motion, plane=thing.plane, options=options, source="stool")
     print(summary(report))
+    print(f"wrote the video, sheet.png, report.json, trajectory.npz into {chosen.out}")
     return report
 
 
