@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -13,6 +14,8 @@ from egs_warp.deformation import Deformer, deform
 from egs_warp.embedding import CageLocator, embed_gaussians
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
+from egs_warp.kernels.spherical_harmonics import rotate_sh_kernel
+from egs_warp.launching import launch_rows
 from egs_warp.render import render
 from tests.carrying_scenes import bent, box, covariances, matrices, random_cloud
 
@@ -55,6 +58,34 @@ def test_a_turned_cage_turns_shape_and_colour_exactly(device: str, degree: int) 
     seen = colours(cloud.sh.numpy().astype(np.float64), views)
     turned = colours(result.cloud.sh.numpy().astype(np.float64), views @ turn.T)
     np.testing.assert_allclose(turned, seen, atol=2e-5)
+
+
+def test_colour_turns_exactly_where_euler_angles_are_arbitrary(device: str) -> None:
+    """Eq. (15): turns about z alone, by half a turn about axes across it, by nothing, and by nearly each of them."""
+    half = [np.pi * np.array([np.cos(a), np.sin(a), 0.0]) for a in (0.0, 0.5 * np.pi, 1.1)]
+    near = np.array([1e-9, -3e-5, 2e-4])
+    vectors = np.array(
+        [v + e for v in (np.zeros(3), np.array([0.0, 0.0, 2.3]), *half) for e in (0.0 * near, near, near[::-1])]
+    )
+    turns = Rotation.from_rotvec(vectors)
+    sh = np.random.default_rng(3).normal(size=(len(vectors), 16, 3))
+    result = wp.zeros((len(vectors), 16), dtype=wp.vec3, device=device)
+    launch_rows(
+        rotate_sh_kernel,
+        len(vectors),
+        inputs=[
+            wp.array(turns.as_quat(scalar_first=True), dtype=wp.vec4, device=device),
+            wp.array(sh, dtype=wp.vec3, device=device),
+            3,
+        ],
+        outputs=[result],
+        device=result.device,
+    )
+    turned = result.numpy().astype(np.float64)
+    turned[:, 0] = sh[:, 0]
+    for view in np.eye(3):
+        views = np.tile(view, (len(vectors), 1))
+        np.testing.assert_allclose(colours(turned, turns.apply(views)), colours(sh, views), atol=1e-5)
 
 
 def test_turning_the_object_is_turning_the_camera(device: str) -> None:
@@ -174,7 +205,7 @@ def test_no_spike_and_no_nan_whatever_the_cage_does(seed: int, noise: float, fla
         rng.normal(size=(count, 4)),
         rng.uniform(-16.0, np.log(0.25), (count, 3)),
         np.zeros(count),
-        rng.normal(size=(count, 4, 3)),
+        rng.normal(size=(count, 16, 3)),
         device="cpu",
     )
     cage = CageLocator(mesh, device="cpu")
