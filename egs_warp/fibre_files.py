@@ -28,6 +28,7 @@ from egs_warp.errors import UserError
 from egs_warp.fibres import Fibre, FibreKind
 from egs_warp.muscles import MuscleSet, attach_fibres
 from egs_warp.tetmesh import TetMesh
+from egs_warp.user_files import parse_json, read_text
 
 MAX_SEGMENTS = 400
 """The quadratic program of a step has one unknown for each segment: more would take seconds a frame."""
@@ -68,14 +69,7 @@ def read_muscles(path: Path | str, mesh: TetMesh, *, body_weight: float, metres_
 
 
 def _load(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"{path}: cannot read the muscles ({error.strerror}); give a JSON file") from None
-    except UnicodeDecodeError:
-        raise UserError(f"{path}: not a text file; give muscles as JSON") from None
-    except json.JSONDecodeError as error:
-        raise UserError(f"{path}: not JSON at line {error.lineno} ({error.msg}); correct that line") from None
+    content = parse_json(read_text(path), path)
     if not isinstance(content, dict):
         raise UserError(f'{path}: the file holds no object; write {{"fibres": [...]}}')
     return content

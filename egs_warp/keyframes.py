@@ -7,7 +7,6 @@ JSON: a list of keys, ``[{"time": 0.5, "part": "head", "quantity": "position", "
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from egs_warp.errors import UserError
+from egs_warp.user_files import parse_json, read_text
 
 
 class Quantity(Enum):
@@ -87,12 +87,7 @@ def read_keyframes(path: Path) -> tuple[Key, ...]:
     path = Path(path)
     if path.suffix.lower() not in (".json", ".csv"):
         raise UserError(f"{path}: key frames are read from .json or .csv")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise UserError(f"{path}: not UTF-8 text") from None
+    text = read_text(path)
     keys = _from_json(text, path) if path.suffix.lower() == ".json" else _from_csv(text, path)
     if not keys:
         raise UserError(f"{path}: no key frames; give at least one")
@@ -124,10 +119,7 @@ def channels(keys: Sequence[Key]) -> tuple[Channel, ...]:
 
 
 def _from_json(text: str, path: Path) -> list[Key]:
-    try:
-        entries = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise UserError(f"{path}: not JSON ({error})") from None
+    entries = parse_json(text, path)
     if not isinstance(entries, list):
         raise UserError(f"{path}: give a list of keys, each an object with {', '.join(_FIELDS[:4])}")
     keys = []

@@ -7,7 +7,6 @@ A line names motions, separated by commas, each with its numbers in their order,
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Mapping
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from egs_warp.errors import UserError
+from egs_warp.user_files import parse_json, read_text
 
 LARGEST_TARGET = 10.0
 """Body heights; a larger target is refused as a slip of the pen."""
@@ -116,12 +116,7 @@ def _from_words(piece: str, defaults: Mapping[str, float], where: str) -> Motion
 
 
 def _from_json(path: Path, defaults: Mapping[str, float]) -> list[MotionRequest]:
-    try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: not JSON ({error})") from None
+    entries = parse_json(read_text(path), path)
     if not isinstance(entries, list) or not entries:
         raise UserError(f'{path}: give a list of motions, as [{{"motion": "jump"}}]')
     requests = []

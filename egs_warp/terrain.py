@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.plane import Plane
+from egs_warp.user_files import parse_json, read_text
 
 MOST_FACES = 64
 
@@ -52,12 +52,7 @@ def read_terrain(path: Path) -> tuple[Solid, ...]:
 
     A point is inside where n.x + d < 0 for every face. Raises ``UserError`` for the first malformed entry, with its place.
     """
-    try:
-        entries = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: not JSON ({error})") from None
+    entries = parse_json(read_text(path), path)
     if not isinstance(entries, list) or not entries:
         raise UserError(f"{path}: give a list of solids, each a list of faces [nx, ny, nz, d]")
     solids = []

@@ -117,5 +117,5 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"none.csv: cannot be read \(No such file or directory\)"):
         read_keyframes(tmp_path / "none.csv")
     (tmp_path / "k.json").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(UserError, match="not UTF-8 text"):
+    with pytest.raises(UserError, match="not a text file"):
         read_keyframes(tmp_path / "k.json")

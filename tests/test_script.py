@@ -52,7 +52,7 @@ def test_a_json_script_is_the_same_as_its_line(tmp_path: Path) -> None:
         ("jump speed=2", "('jump speed=2'): 'speed' is unknown; jump takes distance, height"),
         ("trajectory", "('trajectory'): trajectory needs a file of key frames, as trajectory keys.json"),
         ("hop x60, hop x60", "--motion asks for 120 motions; at most 100 are done in a row"),
-        ("none.json", "none.json: cannot be read (No such file or directory)"),
+        ("none.json", "none.json: cannot be read (No such file or directory); check the path"),
     ],
 )
 def test_mistakes_of_a_line(line: str, message: str) -> None:
@@ -65,7 +65,8 @@ def test_mistakes_of_a_line(line: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[", "not JSON"),
+        ("[", "not JSON at line 1"),
+        ("[" * 100_000, "lists in lists in lists, too deep to read"),
         ("{}", 'give a list of motions, as [{"motion": "jump"}]'),
         ("[3]", ', motion 1: give an object with a "motion", one of jump, hop, twist, walk, trajectory'),
         ('[{"motion": "jump", "repeat": 1.5}]', ', motion 1: "repeat" is 1.5; give a whole number'),

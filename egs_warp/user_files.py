@@ -1,0 +1,29 @@
+"""Small files that users write by hand, read with one line for whatever is wrong."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from egs_warp.errors import UserError
+
+
+def read_text(path: Path | str) -> str:
+    """The text of a file. Raises ``UserError`` where there is none."""
+    try:
+        return Path(path).read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); check the path") from None
+    except UnicodeDecodeError:
+        raise UserError(f"{path}: not a text file (UTF-8)") from None
+
+
+def parse_json(text: str, path: Path | str) -> Any:
+    """What the ``text`` of ``path`` holds. Raises ``UserError`` where it is not JSON."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise UserError(f"{path}: not JSON at line {error.lineno} ({error.msg}); correct that line") from None
+    except RecursionError:
+        raise UserError(f"{path}: lists in lists in lists, too deep to read") from None
