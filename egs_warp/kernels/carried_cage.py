@@ -70,6 +70,7 @@ def carry_tets_kernel(
     # Out:
     cage_out: CarriedCage,
 ):
+    """Each tetrahedron's map and rotation for node ``positions``."""
     t = first_row + wp.tid()
     corners = tets[t]
     x0 = positions[corners[0]]
@@ -170,7 +171,7 @@ def plan_arms_kernel(
     """The motion is continuous and linear in each tetrahedron. So an arm that goes from the tetrahedron of the mean (gradient F)
     through a face into the next one (gradient G) is carried to (u F + (1 - u) G) r per length, u the share of it before
     the face: no difference of positions, which for a tiny arm would be mostly rounding. A longer arm that ends elsewhere
-    bridges a gap.
+    has a negative share.
     """
     row = first_row + wp.tid()
     mean_tet = point_tets[7 * row]
