@@ -27,6 +27,7 @@ from egs_warp.attachments import mean_edge_length
 from egs_warp.errors import UserError
 from egs_warp.fibres import Fibre, FibreKind
 from egs_warp.muscles import MuscleSet, attach_fibres
+from egs_warp.plane import square_to
 from egs_warp.tetmesh import TetMesh
 from egs_warp.user_files import parse_json, read_text
 
@@ -158,10 +159,8 @@ _SHAPES: dict[str, tuple[Callable[[str, dict[str, Any]], list[np.ndarray]], set[
 
 def _around(where: str, entry: dict[str, Any], angles: np.ndarray) -> np.ndarray:
     """Points at ``angles`` on the entry's circle."""
-    axis = _direction(where, entry, "axis")
-    first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-    first /= np.linalg.norm(first)
-    spokes = np.cos(angles)[:, None] * first + np.sin(angles)[:, None] * np.cross(axis, first)
+    first, second = square_to(_direction(where, entry, "axis"))
+    spokes = -np.cos(angles)[:, None] * first - np.sin(angles)[:, None] * second
     return _point(where, entry, "centre") + _positive(where, entry, "radius", None) * spokes
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from egs_warp.attachments import mean_edge_length
 from egs_warp.fibre_tube import Detail, Surface, Tube
 from egs_warp.fibres import Fibre, FibreKind
+from egs_warp.plane import square_to
 from egs_warp.skeleton import Branch, Skeleton
 from egs_warp.tetmesh import TetMesh
 
@@ -107,15 +108,12 @@ def _principal_horizontal(mesh: TetMesh, up: np.ndarray) -> np.ndarray:
 
     Its sign is fixed too: rounding must not choose between a direction and its opposite.
     """
-    helper = np.eye(3)[int(np.argmin(np.abs(up)))]
-    first = np.cross(helper, up)
-    first /= np.linalg.norm(first)
-    plane = np.stack([first, np.cross(up, first)])
+    plane = np.stack(square_to(up))
     flat = (mesh.nodes - _centre(mesh)) @ plane.T
     second_moments = (flat * mesh.lumped_masses(1.0)[:, None]).T @ flat
     values, vectors = np.linalg.eigh(second_moments)
     if values[1] < 1.1 * values[0]:
-        return first
+        return plane[0]
     widest = vectors[:, 1] @ plane
     return widest * (1.0 if widest[int(np.argmax(np.abs(widest)))] > 0 else -1.0)
 

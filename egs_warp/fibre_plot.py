@@ -10,6 +10,7 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.fibres import FibreKind
 from egs_warp.muscles import MuscleSet
+from egs_warp.plane import square_to
 from egs_warp.tetmesh import TetMesh
 
 _BGR = {
@@ -33,10 +34,8 @@ def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarra
     ``up`` (3,) points up in the first two views. Raises ``UserError`` if ``path`` cannot be written.
     """
     up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
-    helper = np.eye(3)[int(np.argmin(np.abs(up)))]
-    right = np.cross(up, helper)
-    right /= np.linalg.norm(right)
-    away = np.cross(up, right)
+    left, near = square_to(up)
+    right, away = -left, -near
     views = {"front": (right, up, away), "side": (away, up, -right), "above": (right, away, -up)}
     panels = [_panel(title, np.stack(axes), mesh, muscles) for title, axes in views.items()]
     image = np.concatenate([np.concatenate(panels, axis=1), _legend(muscles, 3 * _PANEL)])

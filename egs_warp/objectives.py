@@ -11,6 +11,7 @@ from scipy.spatial import ConvexHull
 
 from egs_warp.body import BodyState, SoftBody
 from egs_warp.contact import ContactSet
+from egs_warp.plane import square_to
 
 
 @dataclass(frozen=True)
@@ -208,9 +209,7 @@ def base_area(part: BodyPart, state: BodyState, up: np.ndarray, target: float, w
 
     Told in m/s: dA/dt over the hull's perimeter is the speed at which its sides move outwards.
     """
-    helper = np.eye(3)[int(np.argmin(np.abs(up)))]
-    first = np.cross(helper, up) / np.linalg.norm(np.cross(helper, up))
-    plane = np.stack([first, np.cross(up, first)])
+    plane = np.stack(square_to(up))
     hull = ConvexHull(state.positions[part.nodes] @ plane.T)
     corners = part.nodes[hull.vertices]  # anticlockwise in two dimensions
     flat = state.positions[corners] @ plane.T

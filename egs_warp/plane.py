@@ -39,7 +39,12 @@ class Plane:
 
     def tangents(self) -> tuple[np.ndarray, np.ndarray]:
         """Two unit vectors (3,) that span the plane; (t1, t2, N) is right-handed."""
-        helper = np.eye(3)[int(np.argmin(np.abs(self.normal)))]
-        first = np.cross(helper, self.normal)
-        first /= np.linalg.norm(first)
-        return first, np.cross(self.normal, first)
+        return square_to(self.normal)
+
+
+def square_to(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors (3,) square to the unit ``direction`` (3,), right-handed before it."""
+    helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    first = np.cross(helper, direction)
+    first /= np.linalg.norm(first)
+    return first, np.cross(direction, first)
