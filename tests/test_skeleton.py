@@ -7,10 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from egs_warp.ascent import ascent_field, base_nodes
 from egs_warp.attachments import mean_edge_length
 from egs_warp.fibres import FibreKind
 from egs_warp.muscles import automatic_muscles
-from egs_warp.skeleton import ascent_field, base_nodes, skeleton
+from egs_warp.skeleton import skeleton
 from egs_warp.tetmesh import TetMesh
 
 UP = np.array([0.0, 0.0, 1.0])
