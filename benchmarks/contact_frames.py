@@ -16,9 +16,11 @@ from egs_warp.complementarity import ContactLayout, states_from_prediction
 from egs_warp.contact import contact_geometry
 from egs_warp.contact_program import ContactProgram, CostScales, contact_program, linear_response
 from egs_warp.contact_step import contact_step
-from egs_warp.dynamics import Factorisation, ImplicitStep, conserve_angular_momentum
+from egs_warp.dynamics import ImplicitStep, conserve_angular_momentum
+from egs_warp.factorisation import Factorisation
 from egs_warp.io import read_capture
 from egs_warp.locomotion import LocomotionSettings, LocomotionStepper
+from egs_warp.muscle_tension import MuscleTension
 from egs_warp.muscles import MuscleColumns, MuscleSet, automatic_muscles
 from egs_warp.objectives import SpinObjective, centre_of_mass_velocity, node_velocities
 from egs_warp.prediction import predict
@@ -138,7 +140,10 @@ def animation_frames(
     known = known_activations(activations, frames, strength, seed)
     weight = body.node_mass[:, None] * body.gravity
     dt, cap = 1.0 / FRAME_RATE, settings.push_out_cap * stepper.speed_scale
-    scales = CostScales(stepper.speed_scale, settings.activation_weight, settings.activation_change_weight)
+    ones = np.ones(activations)
+    scales = CostScales(
+        stepper.speed_scale, settings.activation_weight * ones, settings.activation_change_weight * ones
+    )
     layout = ContactLayout(activations, contacts, directions)
     friction, weights = bench.stepper.geometry.friction, Weights()
     factorisation = Factorisation(body)
@@ -146,12 +151,15 @@ def animation_frames(
     made = []
     for previous, current in zip(known[:-1], known[1:], strict=True):
         step = ImplicitStep(body, state, dt, factorisation)
-        actuation = (columns.sparse(state.positions).multiply(bench.stepper.muscles.bounds)).tocsr() @ groups
+        before, now = (
+            MuscleTension.of(stepper.muscles, stepper.muscles.bounds * (groups @ a)) for a in (previous, current)
+        )
         result = contact_step(
             step,
             stepper.detector,
             points,
-            weight + (actuation @ current).reshape(-1, 3),
+            weight,
+            tension=now,
             start_velocities=state.velocities,
             start_forces=forces,
             push_out_cap=cap,
@@ -165,13 +173,15 @@ def animation_frames(
         prediction = predict(
             step,
             contact_set,
-            weight + (actuation @ previous).reshape(-1, 3),
+            weight,
             state.velocities,
+            tension=before,
             normal_forces=forces[:, 0],
             friction=friction,
             push_out_cap=cap,
         )
-        linear = linear_response(step, actuation, contact_set, prediction.velocities, layout)
+        pulls = columns.sparse(step.end_positions(prediction.velocities)).multiply(stepper.muscles.bounds)
+        linear = linear_response(step, pulls.tocsr() @ groups, contact_set, prediction.velocities, layout, before)
         objectives = [
             centre_of_mass_velocity(body, body.centre_of_mass(result.velocities), weights.com),
             SpinObjective(body.angular_momentum(end, velocities), weights.spin),

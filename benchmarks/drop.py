@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from egs_warp.body import GRAVITY, BodyState, SoftBody
 from egs_warp.contact import contact_geometry
 from egs_warp.contact_step import contact_step
-from egs_warp.dynamics import Factorisation, ImplicitStep, conserve_angular_momentum
+from egs_warp.dynamics import ImplicitStep, conserve_angular_momentum
 from egs_warp.elasticity import ElasticAssembly, Material
+from egs_warp.factorisation import Factorisation
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.locomotion import LocomotionStepper
 from egs_warp.muscles import automatic_muscles

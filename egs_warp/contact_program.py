@@ -10,6 +10,7 @@ import numpy as np
 from egs_warp.complementarity import ContactLayout
 from egs_warp.contact import ContactSet, push_out_speeds, tangent_directions
 from egs_warp.dynamics import ImplicitStep
+from egs_warp.muscle_tension import MuscleTension
 from egs_warp.objectives import Objective, SpinObjective
 
 
@@ -71,25 +72,32 @@ class CostScales:
 
     speed: float
     """sqrt(g H), m/s."""
-    activation: float
-    """Weight of a^2, a in its bounds."""
-    activation_change: float
-    """Weight of the change of a since the last step."""
+    activation: np.ndarray
+    """(M,) weights of a^2, a in its bounds."""
+    activation_change: np.ndarray
+    """(M,) weights of the squared change of a since the last step."""
 
 
 def linear_response(
-    step: ImplicitStep, actuation: np.ndarray, contacts: ContactSet, velocities: np.ndarray, layout: ContactLayout
+    step: ImplicitStep,
+    actuation: np.ndarray,
+    contacts: ContactSet,
+    velocities: np.ndarray,
+    layout: ContactLayout,
+    tension: MuscleTension,
 ) -> LinearResponse:
-    """S v = M v0 + dt (f + A a + W^T f_c) around p + dt ``velocities`` (N, 3), with the projected stiffness.
+    """(S + dt^2 K_a) v = M v0 + dt (f + A a + W^T f_c) around p + dt ``velocities`` (N, 3).
 
-    ``actuation`` (3N, M): newtons at full activation.
+    ``actuation`` (3N, M): newtons at full activation, in the directions at p + dt ``velocities``; K_a is the stiffness of the
+    muscles at the last step's ``tension``.
     """
     body, dt = step.body, step.dt
-    step.factor(velocities, projected=True)
+    solve = step.tangent(velocities, tension)
     residual = step.gradient(velocities, body.node_mass[:, None] * body.gravity)
-    base = (velocities - step.factorisation.solve(residual)).ravel()
-    sources = np.hstack([actuation, body.weight * contacts.frame.T.toarray()])
-    solved = dt * step.factorisation.solve(sources)
+    weights = body.weight * contacts.frame.T.toarray()
+    sources = np.hstack([dt * actuation, dt * weights, residual.reshape(-1, 1)])
+    solved = solve(sources)
+    base, solved = velocities.ravel() - solved[:, -1], solved[:, :-1]
     contact = solved[:, layout.activations :].reshape(len(base), contacts.count, 3)
     tangent = np.einsum("vnt,dt->vnd", contact[:, :, 1:], tangent_directions(layout.directions))
     response = np.concatenate(
@@ -143,7 +151,7 @@ def _quadratic_cost(
     moments = _moment_rows(step, contacts, layout)
     P = 1e-7 * np.eye(layout.variables)
     q = np.zeros(layout.variables)
-    constant = scales.activation_change * float(previous @ previous)
+    constant = float(scales.activation_change @ previous**2)
     for objective in objectives:
         if isinstance(objective, SpinObjective):
             gyration = np.sqrt(0.5 * np.trace(body.inertia(state.positions)) / body.mass)

@@ -9,6 +9,7 @@ import numpy as np
 from egs_warp.contact import ContactDetector, ContactSet, push_out_speeds
 from egs_warp.coulomb import coulomb_forces
 from egs_warp.dynamics import ImplicitStep, NewtonStatus
+from egs_warp.muscle_tension import MuscleTension
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,11 @@ def contact_step(
     start_forces: np.ndarray,
     push_out_cap: float,
     penetration_tolerance: float,
+    tension: MuscleTension | None = None,
     outer_limit: int = 20,
     round_limit: int = 6,
 ) -> ContactStepResult:
-    """Minimise Phi under ``force`` (N, 3) and the contact forces of ``points`` (n,), found with it.
+    """Minimise Phi under ``force`` (N, 3), the muscles' ``tension`` and the contact forces of ``points`` (n,), found with it.
 
     The forces are corrected with the Delassus operator of the current tangent until the end velocity obeys contact and friction; points
     of the body that would end deeper than ``penetration_tolerance`` metres join the set. ``start_forces`` (n, 3) newtons.
@@ -58,7 +60,7 @@ def contact_step(
         converged = False
         for iteration in range(outer_limit):
             nodal = (contacts.frame.T @ forces.ravel()).reshape(force.shape)
-            result = step.minimise(force + nodal, velocities)
+            result = step.minimise(force + nodal, velocities, tension=tension)
             status, velocities = result.status, result.velocities
             if status is not NewtonStatus.CONVERGED:
                 return ContactStepResult(velocities, contacts, forces, False, status)
@@ -66,8 +68,8 @@ def contact_step(
                 converged = True
                 break
             if iteration % 4 == 0:  # the tangent changes little between corrections
-                step.factor(velocities)
-                delassus = dt * (contacts.frame @ step.factorisation.solve(contacts.frame.T.toarray()))
+                solve = step.tangent(velocities, tension)
+                delassus = dt * (contacts.frame @ solve(contacts.frame.T.toarray()))
                 delassus = 0.5 * (delassus + np.transpose(delassus))
                 # More points than the cage can resolve leave it singular; this moves no velocity by more than 1e-7.
                 delassus[np.diag_indices_from(delassus)] += 1e-7 * delassus.diagonal().mean()

@@ -7,9 +7,13 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
-import qdldl
 
 from egs_warp.body import BodyState, SoftBody
+from egs_warp.factorisation import Factorisation
+from egs_warp.muscle_tension import MuscleTension, TensionStiffness
+
+_CG_LIMIT = 60
+_CG_TOLERANCE = 1e-5
 
 
 class NewtonStatus(Enum):
@@ -44,43 +48,12 @@ class PenaltyTerms:
     """(N, 3) end velocity, matrix entries to add to in place."""
 
 
-class Factorisation:
-    """Sparse LDL^T of S = M + dt C + dt^2 K; the symbolic analysis is done once a body."""
-
-    def __init__(self, body: SoftBody) -> None:
-        self._body = body
-        self._solver: qdldl.Solver | None = None
-
-    def update(self, entries: np.ndarray) -> bool:
-        """Factor the matrix with these upper entries; False if it is not positive definite."""
-        matrix = self._body.assembly.matrix(entries)
-        if not np.isfinite(entries).all():
-            return False
-        try:
-            if self._solver is None:
-                self._solver = qdldl.Solver(matrix, upper=True)
-            else:
-                self._solver.update(matrix, upper=True)
-        except RuntimeError:
-            self._solver = None
-            return False
-        assert self._solver is not None
-        pivots = self._solver.factors()[1]
-        return bool(np.all(pivots > 0.0) and np.isfinite(pivots).all())
-
-    def solve(self, right: np.ndarray) -> np.ndarray:
-        """Solve for (N, 3), or for each column of (3N, m)."""
-        assert self._solver is not None, "update() comes first"
-        if right.ndim == 2 and right.shape == self._body.mesh.nodes.shape:
-            return self._solver.solve(right.ravel()).reshape(right.shape)
-        return np.stack([self._solver.solve(np.ascontiguousarray(column)) for column in right.T], axis=1)
-
-
 @dataclass
 class ImplicitStep:
-    """The function Phi of one step (DESIGN 5) and its minimisation; forces are constant over the step.
+    """The function Phi of one step (DESIGN 5) and its minimisation; forces and muscle tensions are constant over the step.
 
-    Phi(v) = 1/2 (v-v0)^T M (v-v0) + Psi(p + dt v) + dt beta/2 sum V E':C:E' - dt v^T f, E' the mean strain rate of the step
+    Phi(v) = 1/2 (v-v0)^T M (v-v0) + Psi(p + dt v) + dt beta/2 sum V E':C:E' - dt v^T f, E' the mean strain rate of the step;
+    ``minimise`` adds the energy of the muscles, V(p + dt v).
     """
 
     body: SoftBody
@@ -126,15 +99,106 @@ class ImplicitStep:
         entries[assembly.diagonal_entries] += (1.0 + self.dt * self.drag) * np.repeat(self.body.node_mass, 3)
         return entries
 
-    def factor(self, velocities: np.ndarray, penalty: PenaltyTerms | None = None, *, projected: bool = False) -> None:
-        """Factor the true S at ``velocities``, or the projected one where the true one is not positive definite."""
+    def factor(
+        self, velocities: np.ndarray, penalty: PenaltyTerms | None = None, *, projected: bool = False
+    ) -> list[np.ndarray]:
+        """Factor the true S at ``velocities``, or the projected one where the true one is not positive definite.
+
+        Returns the entries of what was tried; the last were factored.
+        """
+        tried = []
         for project in (True,) if projected else (False, True):
             entries = self.matrix_entries(velocities, projected=project)
             if penalty is not None:
                 penalty.add_hessian(velocities, entries)
+            tried.append(entries)
             if self.factorisation.update(entries):
-                return
+                return tried
         raise FloatingPointError("the projected Hessian is not positive definite")
+
+    def _newton_direction(
+        self,
+        velocities: np.ndarray,
+        gradient: np.ndarray,
+        penalty: PenaltyTerms | None,
+        tension: MuscleTension | None,
+    ) -> np.ndarray:
+        """(N, 3) minus the gradient over the second derivative, or over a positive definite one near it."""
+        tried = self.factor(velocities, penalty)
+        if tension is None:
+            return -self.factorisation.solve(gradient)
+        end = self.end_positions(velocities)
+        for entries, pulling_only in ((tried[0], False), (tried[-1], True)):
+            stiffness = tension.stiffness(end, pulling_only=pulling_only)
+            direction = self._conjugate_gradients(entries, stiffness, -gradient)
+            if direction is not None:
+                return direction
+        return -self.factorisation.solve(gradient)
+
+    def tangent(self, velocities: np.ndarray, tension: MuscleTension | None) -> Callable[[np.ndarray], np.ndarray]:
+        """Inverse of the tangent S + dt^2 K at ``velocities``, K of the muscles: takes and gives columns (3N, m).
+
+        The elements that muscles compress lose of their stiffness what the tension adds, so S alone is often indefinite where the sum
+        is not; the sum is inverted from the indefinite factors (Woodbury). Where it is indefinite too, the projected S alone stands
+        for both.
+        """
+        definite = self.factorisation.update(self.matrix_entries(velocities, projected=False))
+        across, rates = np.zeros((0, 0)), np.zeros(0)
+        if tension is not None:
+            across, rates = tension.stiffness(self.end_positions(velocities)).factors()
+        if definite and len(rates) == 0:
+            return self.factorisation.solve
+        if self.factorisation.ready and len(rates) > 0:
+            through = self.factorisation.solve(across)
+            small = across.T @ through
+            small[np.diag_indices_from(small)] += 1.0 / (self.dt**2 * rates)
+            small = 0.5 * (small + small.T)
+            # Haynsworth: negative eigenvalues of the sum = those of S + positive ones of the small matrix - pulling directions.
+            positive = int((np.linalg.eigvalsh(small) > 0.0).sum())
+            if self.factorisation.negative_pivots + positive == int((rates > 0.0).sum()):
+
+                def solve(right: np.ndarray) -> np.ndarray:
+                    plain = self.factorisation.solve(right)
+                    return plain - through @ np.linalg.solve(small, across.T @ plain)
+
+                return solve
+        self.factor(velocities, projected=True)
+        return self.factorisation.solve
+
+    def _conjugate_gradients(
+        self, entries: np.ndarray, stiffness: TensionStiffness, right: np.ndarray
+    ) -> np.ndarray | None:
+        """x of (S + dt^2 K) x = ``right`` (N, 3), K of the muscles, with the factored S for a preconditioner; None if not definite.
+
+        K joins nodes far apart: added to the matrix it would fill the factor, so it is only ever multiplied with.
+        """
+        upper = self.body.assembly.matrix(entries)
+        diagonal = upper.diagonal()
+
+        def product(x: np.ndarray) -> np.ndarray:
+            flat = x.ravel()
+            elastic = upper @ flat + upper.T @ flat - diagonal * flat
+            return elastic.reshape(x.shape) + self.dt**2 * stiffness.product(x)
+
+        x = np.zeros_like(right)
+        residual = right.copy()
+        scaled = self.factorisation.solve(residual)
+        search, power = scaled.copy(), float((residual * scaled).sum())
+        first = power
+        for _ in range(_CG_LIMIT):
+            image = product(search)
+            curvature = float((search * image).sum())
+            if curvature <= 0.0:
+                return None
+            length = power / curvature
+            x += length * search
+            residual -= length * image
+            scaled = self.factorisation.solve(residual)
+            before, power = power, float((residual * scaled).sum())
+            if power <= _CG_TOLERANCE**2 * first:
+                break
+            search = scaled + (power / before) * search
+        return x
 
     def minimise(
         self,
@@ -142,6 +206,7 @@ class ImplicitStep:
         start: np.ndarray,
         penalty: PenaltyTerms | None = None,
         *,
+        tension: MuscleTension | None = None,
         tolerance: float | None = None,
     ) -> NewtonResult:
         """Newton with a line search that stays feasible (J > 0), from ``start`` (N, 3) under ``force`` (N, 3) newtons."""
@@ -149,10 +214,15 @@ class ImplicitStep:
 
         def phi(v: np.ndarray) -> float:
             value = self.energy(v, force)
-            return value + penalty.energy(v) if penalty is not None and np.isfinite(value) else value
+            if not np.isfinite(value):
+                return value
+            value += penalty.energy(v) if penalty is not None else 0.0
+            return value + tension.energy(self.end_positions(v)) if tension is not None else value
 
         def slope(v: np.ndarray) -> np.ndarray:
             value = self.gradient(v, force)
+            if tension is not None:
+                value -= self.dt * tension.forces(self.end_positions(v))
             return value + penalty.gradient(v) if penalty is not None else value
 
         unit = self.dt * self.body.weight
@@ -167,8 +237,7 @@ class ImplicitStep:
             if residual <= tolerance:
                 return NewtonResult(velocities, NewtonStatus.CONVERGED, iteration, residual)
             self.newton_iterations += 1
-            self.factor(velocities, penalty)
-            direction = -self.factorisation.solve(gradient)
+            direction = self._newton_direction(velocities, gradient, penalty, tension)
             descent = float((gradient * direction).sum())
             length = 1.0
             while True:

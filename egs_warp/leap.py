@@ -75,6 +75,7 @@ class Leap(Jump):
         stroke = crouch + self.plan.extension
         self.plan = replace(self.plan, crouch_depth=crouch, thrust_time=2.0 * stroke / self.plan.speed_up)
         self._calm_since: float | None = None
+        self._asked: np.ndarray | None = None
         self._pose_weight = self.weights.pose
         self._airborne_weight = max(AIRBORNE_POSE / place.body.stiffening**2, self._pose_weight)
         self._stance_follow = self._follow
@@ -97,9 +98,15 @@ class Leap(Jump):
         left = max((plan.speed_up - seen.velocity[2]) / plan.speed_up * plan.thrust_time, dt)
         goal = np.array([self._landing_com(position)[0], self._start_com[1]])
         needed = (goal - seen.com[:2] - 0.5 * left * seen.velocity[:2]) / (plan.flight_time + 0.5 * left)
-        # What the ground gives lags behind what is asked: the speed forward is asked for ahead of the speed up.
+        # What the ground gives lags behind what is asked: the speed forward is asked for ahead of the speed up, and with what the
+        # last step fell short by, at most twice over.
         change = (needed - seen.velocity[:2]) * dt / max(THRUST_LEAD * left, dt)
-        return self._balanced(seen, np.array([*(seen.velocity[:2] + change), velocity[2]]), dt)
+        short = self._asked - seen.velocity[:2] if self._asked is not None else np.zeros(2)
+        most = np.linalg.norm(change)
+        short *= min(1.0, most / max(float(np.linalg.norm(short)), 1e-12))
+        velocity = self._balanced(seen, np.array([*(seen.velocity[:2] + change + short), velocity[2]]), dt)
+        self._asked = velocity[:2]
+        return velocity
 
     def _risen(self, seen: Measurement, dt: float) -> bool:
         # A body in the air has thrust, however fast it goes; waiting for the asked speed there would lose the steering of the feet.

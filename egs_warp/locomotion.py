@@ -13,12 +13,17 @@ from egs_warp.complementarity import SEPARATE, ContactLayout, states_from_predic
 from egs_warp.contact import ContactDetector, ContactGeometry, ContactSet, independent_contacts
 from egs_warp.contact_program import CostScales, contact_program, linear_response
 from egs_warp.contact_step import ContactStepResult, contact_step
-from egs_warp.dynamics import Factorisation, ImplicitStep, conserve_angular_momentum
+from egs_warp.dynamics import ImplicitStep, conserve_angular_momentum
+from egs_warp.factorisation import Factorisation
+from egs_warp.muscle_tension import MuscleTension
 from egs_warp.muscles import MuscleColumns, MuscleSet
 from egs_warp.objectives import Objective, SpinObjective, lifted_contacts
 from egs_warp.prediction import Prediction, predict
 from egs_warp.qp import QpSolver
 from egs_warp.strategies import SearchResult, Strategy, find_states
+
+_ORDINARY_STRENGTH = 4.0
+"""Body weights, of the muscle that the weights of activations are given for."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +42,15 @@ class LocomotionSettings:
     penetration_tolerance: float = 5e-3
     push_out_cap: float = 0.05
     qp_limit: int = 3
-    """QPs a step at most."""
+    """QPs a step at most; ``strategies.PATIENCE`` times as many where the contact states are in doubt."""
     qp_solver: QpSolver = QpSolver.OSQP
     strategy: Strategy = Strategy.TWO_STAGE
     activation_weight: float = 2e-4
-    """For a step of sqrt(H / g) / 19. Shorter ones change speeds by less, so they weigh activations less: by the square of their share."""
+    """For a step of sqrt(H / g) / 19 and a muscle of 4 body weights. Shorter steps change speeds by less, so they weigh activations
+    less: by the square of their share. Stronger muscles weigh more, as their force."""
     activation_change_weight: float = 3e-4
-    """Likewise, by their share."""
+    """Likewise, by the step's share, and by the square of the force: the strong muscles of a stiff body would else play full
+    strokes against each other from step to step, further than the linearised program knows the way."""
     drag: float = 0.0
     """alpha, 1/s."""
 
@@ -144,27 +151,29 @@ class LocomotionStepper:
         """Predict, optimise, correct, audit."""
         clock = _Clock()
         step = ImplicitStep(self.body, state, dt, self._factorisation, drag=self.settings.drag)
-        columns = self._columns.sparse(state.positions)
         points = self.choose_contacts(step, memory)
         clock.lap("detect")
         contacts = self.detector.contact_set(points, state.positions)
-        passive = self._gravity_force + (columns @ memory.activations).reshape(-1, 3)
+        before = MuscleTension.of(self.muscles, memory.activations)
         prediction = predict(
             step,
             contacts,
-            passive,
+            self._gravity_force,
             state.velocities,
+            tension=before,
             normal_forces=self.matched_forces(memory, points)[:, 0],
             friction=self.geometry.friction,
             push_out_cap=self.settings.push_out_cap * self.speed_scale,
         )
         clock.lap("predict")
-        plan = self._optimise(step, columns, contacts, prediction, memory, objectives, clock)
+        columns = self._columns.sparse(step.end_positions(prediction.velocities))
+        plan = self._optimise(step, before, columns, contacts, prediction, memory, objectives, clock)
         result = contact_step(
             step,
             self.detector,
             points,
-            self._gravity_force + (columns @ plan.activations).reshape(-1, 3),
+            self._gravity_force,
+            tension=MuscleTension.of(self.muscles, plan.activations),
             start_velocities=plan.velocities,
             start_forces=plan.forces,
             push_out_cap=self.settings.push_out_cap * self.speed_scale,
@@ -191,16 +200,17 @@ class LocomotionStepper:
         return candidates[chosen]
 
     def _optimise(
-        self, step, columns, contacts: ContactSet, prediction: Prediction, memory, objectives, clock
+        self, step, before, columns, contacts: ContactSet, prediction: Prediction, memory, objectives, clock
     ) -> _Plan:
         body, settings = self.body, self.settings
         all_contacts = contacts.count
         contacts = contacts.head(settings.qp_contact_limit)
         layout = ContactLayout(self.muscles.segment_count, contacts.count, settings.directions)
         actuation = columns.toarray() * self.muscles.bounds
-        linear = linear_response(step, actuation, contacts, prediction.velocities, layout)
+        linear = linear_response(step, actuation, contacts, prediction.velocities, layout, before)
         clock.lap("linearise")
         share = step.dt / (np.sqrt(body.height / np.linalg.norm(body.gravity)) / 19.0)
+        strength = self.muscles.max_forces / (_ORDINARY_STRENGTH * body.weight)
         program = contact_program(
             step,
             linear,
@@ -212,8 +222,8 @@ class LocomotionStepper:
             push_out_cap=settings.push_out_cap * self.speed_scale,
             scales=CostScales(
                 self.speed_scale,
-                settings.activation_weight * share**2,
-                settings.activation_change_weight * share,
+                settings.activation_weight * share**2 * strength,
+                settings.activation_change_weight * share * strength**2,
             ),
         )
         states = states_from_prediction(

@@ -8,6 +8,7 @@ import numpy as np
 
 from egs_warp.contact import ContactSet, push_out_speeds
 from egs_warp.dynamics import ImplicitStep, NewtonResult
+from egs_warp.muscle_tension import MuscleTension
 
 
 @dataclass(frozen=True)
@@ -105,8 +106,9 @@ def predict(
     normal_forces: np.ndarray,
     friction: float,
     push_out_cap: float,
+    tension: MuscleTension | None = None,
 ) -> Prediction:
-    """Minimise Phi with penalty contact under ``force`` (N, 3).
+    """Minimise Phi with penalty contact under ``force`` (N, 3) and the muscles' ``tension``.
 
     The friction cap is lagged: it comes from last step's ``normal_forces`` (n,), newtons, 0 for a new contact.
     """
@@ -116,7 +118,7 @@ def predict(
     shift = push_out_speeds(contacts.gaps, step.dt, push_out_cap)
     share = body.weight / max(contacts.count, 1)
     penalty = PenaltyContact(contacts, step, stiffness, shift, friction * np.maximum(normal_forces, 0.5 * share))
-    result = step.minimise(force, start, penalty if contacts.count else None, tolerance=1e-3)
+    result = step.minimise(force, start, penalty if contacts.count else None, tension=tension, tolerance=1e-3)
     velocities = result.velocities
     forces = penalty.forces(velocities)
     tangent = (contacts.frame @ velocities.ravel()).reshape(-1, 3)[:, 1:]

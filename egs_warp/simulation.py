@@ -11,7 +11,8 @@ import numpy as np
 from egs_warp.body import BodyState, SoftBody
 from egs_warp.contact import ContactGeometry
 from egs_warp.contact_step import contact_step
-from egs_warp.dynamics import Factorisation, ImplicitStep
+from egs_warp.dynamics import ImplicitStep
+from egs_warp.factorisation import Factorisation
 from egs_warp.locomotion import LocomotionStepper, StepReport
 from egs_warp.objectives import Objective, SpinObjective
 from egs_warp.trajectory import Trajectory, record

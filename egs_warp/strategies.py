@@ -18,6 +18,8 @@ GOOD_ENOUGH = 1.005
 """A search ends when the objective is within this factor of its bound."""
 DOUBTFUL = 2.0
 """A search that ends further than this from its bound is done again from the predicted states."""
+PATIENCE = 3
+"""So many times as many QPs are allowed while the best is doubtful: feet that slide have many states that are nearly as likely."""
 
 
 class Strategy(Enum):
@@ -71,7 +73,8 @@ class _Search:
 
     def attempt(self, states: np.ndarray) -> bool:
         """Solve for ``states`` unless that was done before; whether it is the best so far."""
-        if self.count >= self.limit or states.tobytes() in self.visited:
+        limit = self.limit if self.within(DOUBTFUL) else PATIENCE * self.limit
+        if self.count >= limit or states.tobytes() in self.visited:
             return False
         self.visited.add(states.tobytes())
         self.count += 1

@@ -10,8 +10,9 @@ import pytest
 from egs_warp.body import BodyState, SoftBody, make_body
 from egs_warp.contact import ContactDetector, ContactGeometry, independent_contacts
 from egs_warp.contact_step import ContactStepResult, contact_step
-from egs_warp.dynamics import Factorisation, ImplicitStep, NewtonStatus, conserve_angular_momentum
+from egs_warp.dynamics import ImplicitStep, NewtonStatus, conserve_angular_momentum
 from egs_warp.embedding import embed_points
+from egs_warp.factorisation import Factorisation
 from egs_warp.plane import Plane
 from egs_warp.tetmesh import TetMesh
 from tests.meshes import block_mesh

@@ -8,13 +8,8 @@ import scipy.sparse as sparse
 from scipy.spatial.transform import Rotation
 
 from egs_warp.body import BodyState, SoftBody, make_body
-from egs_warp.dynamics import (
-    Factorisation,
-    ImplicitStep,
-    NewtonStatus,
-    PenaltyTerms,
-    conserve_angular_momentum,
-)
+from egs_warp.dynamics import ImplicitStep, NewtonStatus, PenaltyTerms, conserve_angular_momentum
+from egs_warp.factorisation import Factorisation
 from egs_warp.plane import Plane
 from tests.meshes import block_mesh
 

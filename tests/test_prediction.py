@@ -10,8 +10,9 @@ import scipy.sparse as sparse
 
 from egs_warp.body import BodyState, SoftBody, make_body
 from egs_warp.contact import ContactDetector, ContactGeometry, ContactSet, push_out_speeds
-from egs_warp.dynamics import Factorisation, ImplicitStep, NewtonStatus
+from egs_warp.dynamics import ImplicitStep, NewtonStatus
 from egs_warp.embedding import embed_points
+from egs_warp.factorisation import Factorisation
 from egs_warp.plane import Plane
 from egs_warp.prediction import PenaltyContact, predict
 from tests.meshes import block_mesh

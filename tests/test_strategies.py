@@ -10,7 +10,7 @@ import pytest
 from egs_warp.complementarity import STATIC
 from egs_warp.contact_program import ContactProgram
 from egs_warp.qp import QpSolver
-from egs_warp.strategies import SearchResult, Strategy, contact_under, find_states
+from egs_warp.strategies import PATIENCE, SearchResult, Strategy, contact_under, find_states
 from tests.contact_programs import optimum_of_each, small_problem
 
 
@@ -65,13 +65,13 @@ def test_order_of_the_strategies() -> None:
 
 
 def test_the_limit_is_kept_and_more_qps_are_never_worse() -> None:
-    """One more QP never raises the objective; at the limit the best point so far is returned."""
+    """One more QP never raises the objective; at the limit, thrice that where the best is in doubt, the best so far is returned."""
     for seed in range(8):
         program = small_problem(seed, contacts=3).program
         last = np.inf
         for limit in (2, 3, 4, 8):
             found = search(program, Strategy.TWO_STAGE, limit=limit)
-            assert found.qp_count <= limit and found.objective <= last + 1e-9
+            assert found.qp_count <= PATIENCE * limit and found.objective <= last + 1e-9
             last = found.objective
 
 
