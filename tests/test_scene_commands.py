@@ -173,6 +173,33 @@ def test_the_shadow_falls_where_the_floor_is_seen() -> None:
     np.testing.assert_allclose(shaded, plain, atol=0.02)
 
 
+def test_the_shadow_lies_on_an_uneven_floor_without_an_edge() -> None:
+    """Half of a floor that stands 3 % of the reach above the fitted plane, as sheets do, bears nearly the same shadow; at a
+    terrace too high for it the shadow ends, but not from one pixel to the next."""
+    cloud, truth = ball_on_floor()
+    camera = Camera.look_at(np.array([0.0, -4.0, 2.5]), np.zeros(3), np.eye(3)[2], width=120, height=120)
+    fields = ("rotations", "log_scales", "opacity_logits", "sh")
+
+    def placed(source: GaussianCloud, means: np.ndarray) -> GaussianCloud:
+        return GaussianCloud.from_numpy(means, *(getattr(source, name).numpy() for name in fields))
+
+    flat = cloud.subset(~truth)
+    body = placed(cloud.subset(truth), cloud.subset(truth).means.numpy() * [1.0, 1.0, 0.1])
+    darkness = []
+    for step in (0.0, 0.06, 0.4):
+        floor = placed(flat, flat.means.numpy() + np.outer(flat.means.numpy()[:, 0] > 0.0, [0.0, 0.0, step]))
+        bare, dark = (
+            CapturedScene(floor, camera, FLOOR, centre=np.zeros(3), reach=2.0, shadow=one).background(body, height=1.0)
+            for one in (False, True)
+        )
+        darkness.append(1.0 - dark.mean(axis=2) / np.maximum(bare.mean(axis=2), 1e-3))
+    even, uneven, terrace = darkness
+    right = np.s_[:, 62:]
+    assert uneven[right].sum() > 0.8 * even[right].sum()
+    assert terrace[right].sum() < 0.3 * even[right].sum()
+    assert np.abs(np.diff(terrace, axis=1)).max() < 1.5 * np.abs(np.diff(even, axis=1)).max()
+
+
 def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:
     cloud, _ = ball_on_floor()
     stages: list[str] = []

@@ -19,6 +19,13 @@ _SHADOW_LAYERS = ((0.0, 0.08, 0.02), (0.08, 0.3, 0.06), (0.3, 2.0, 0.13))
 """From and to this height over the plane, and the width of the blur, all in body heights."""
 
 
+_BUMP = 0.06
+"""Of the shadow's reach: what is this high above the plane still takes its shadow, at half strength; of what lies below
+it, twice as deep, for through thin spots of a floor one sees deeper."""
+_SOFTENED = 0.25
+"""Of the window of the median: blur of the edge of what takes the shadow."""
+
+
 class Behind(Protocol):
     """What an animation is drawn over."""
 
@@ -30,8 +37,11 @@ class Behind(Protocol):
 class ContactShadow:
     """The soft shadow that Gaussians cast straight down on a plane, as one camera sees it."""
 
-    def __init__(self, camera: Camera, plane: Plane, *, centre: np.ndarray, reach: float) -> None:
-        """``centre`` (3,) and ``reach`` (world units) bound the part of the plane that can be in shadow."""
+    def __init__(
+        self, camera: Camera, plane: Plane, *, centre: np.ndarray, reach: float, depth: np.ndarray | None = None
+    ) -> None:
+        """``centre`` (3,) and ``reach`` (world units) bound the part of the plane that can be in shadow; ``depth`` (H, W) is
+        the z-depth of the uneven ground that it falls on, 0 where that is the plane."""
         self._plane, self._centre, self._reach = plane, centre, reach
         self._tangents = np.stack(plane.tangents())
         u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
@@ -45,10 +55,15 @@ class ContactShadow:
         points = camera.centre + np.where(self.hit, self.depth, 0.0)[..., None] * rays
         self.flat = (points - centre) @ self._tangents.T
         """(H, W, 2) place on the plane, world units from the centre."""
+        seen = np.zeros_like(self.depth) if depth is None else depth
+        ground = np.where((seen > 0.0)[..., None], camera.centre + seen[..., None] * rays, points)
+        self.lift = plane.heights(ground)
+        """(H, W) height of the ground over the plane, world units."""
         sine = np.maximum(-slope / np.linalg.norm(rays, axis=-1), 0.05)
         self.pixel = np.maximum(self.depth / camera.fx / sine, 1e-9)
         """(H, W) size of a pixel on the plane, world units."""
-        self._uv = ((self.flat / reach + 1.0) * 0.5 * _SHADOW_TEXELS - 0.5).astype(np.float32)
+        under = (ground - centre) @ self._tangents.T
+        self._uv = ((under / reach + 1.0) * 0.5 * _SHADOW_TEXELS - 0.5).astype(np.float32)
 
     def darkness(self, body: GaussianCloud, *, height: float) -> np.ndarray:
         """(H, W) float32, 0 to about 0.5: how much light the Gaussians of ``body`` take from the plane.
@@ -129,14 +144,15 @@ class CapturedScene:
 
         image = render(scene, camera)
         self._image = np.clip(image.colour.numpy(), 0.0, 1.0)
-        self._shadow = ContactShadow(camera, plane, centre=centre, reach=reach)
-        # How far what is seen lies behind the plane, over the plane's distance. Splats of a floor scatter by a few
-        # hundredths of that, and through thin spots of it one sees deeper.
-        behind = image.depth.numpy() / np.where(self._shadow.hit, self._shadow.depth, np.inf) - 1.0
-        on_plane = np.clip(2.0 - np.where(behind < 0.0, -behind / 0.03, behind / 0.1), 0.0, 1.0) * self._shadow.hit
-        # Specks in the air before the floor would shine in the shadow.
+        depth = np.where(image.alpha.numpy() > 0.5, image.depth.numpy(), 0.0).astype(np.float32)
+        depth = cv2.medianBlur(depth, 5)
+        self._shadow = ContactShadow(camera, plane, centre=centre, reach=reach, depth=depth)
+        lift = self._shadow.lift / (_BUMP * reach)
+        on_plane = np.clip(1.5 - np.where(lift > 0.0, lift, -0.5 * lift), 0.0, 1.0) * self._shadow.hit
+        # Specks in the air before the floor would shine in the shadow, and hard edges look cut out.
         kernel = 2 * (max(camera.width, camera.height) // 40) + 1
         on_plane = cv2.medianBlur(np.rint(255.0 * on_plane).astype(np.uint8), kernel) / 255.0
+        on_plane = cv2.GaussianBlur(on_plane, (0, 0), _SOFTENED * kernel)
         fade = np.clip(1.6 - 1.6 * np.linalg.norm(self._shadow.flat, axis=-1) / reach, 0.0, 1.0)
         strength = on_plane * fade * image.alpha.numpy() if shadow else np.zeros_like(fade)
         self._fade = strength.astype(np.float32)[..., None]
