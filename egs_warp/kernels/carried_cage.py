@@ -121,8 +121,8 @@ RIGID = wp.constant(wp.float32(3.0))
 """Share of the first arm that marks a Gaussian far outside the cage, which is not stretched but only turned and moved."""
 
 
-Six = wp.types.vector(length=6, dtype=wp.int32)
-SixReal = wp.types.vector(length=6, dtype=wp.float32)
+SixTets = wp.types.vector(length=6, dtype=wp.int32)
+SixShares = wp.types.vector(length=6, dtype=wp.float32)
 
 
 @wp.func
@@ -275,8 +275,8 @@ def carried_arms(
     result.tet = wp.where(code < 0, -1 - code, code)
     result.straddles = code < 0
     around = affine_of(cage, result.tet)
-    ends = Six()
-    shares = SixReal()
+    ends = SixTets()
+    shares = SixShares()
     if result.straddles:
         # All at once: on a GPU, loads that wait for each other take most of the time.
         for k in range(6):

@@ -29,26 +29,36 @@ def warp_space() -> wp.uint64:
     const int lane = threadIdx.x & 31;
     const float4* source = reinterpret_cast<const float4*>(sh.data) + 12 * static_cast<size_t>(row - lane);
     const int limit = 12 * (count - (row - lane));
-    const unsigned space = static_cast<unsigned>(__cvta_generic_to_shared(reinterpret_cast<float4*>(address)));
+    float4* space = reinterpret_cast<float4*>(address);
+#if __CUDA_ARCH__ >= 800
+    const unsigned first = static_cast<unsigned>(__cvta_generic_to_shared(space));
+#endif
     // 96 pieces are 8 rows: the place of piece e, e + e / 12, is that of e - 96 and 104.
     const int at[3] = {lane + lane / 12, lane + 32 + (lane + 32) / 12, lane + 64 + (lane + 64) / 12};
     #pragma unroll
     for (int i = 0; i < 12; ++i) {
-        const unsigned to = space + 16 * (at[i % 3] + 104 * (i / 3));
-        if (32 * i + lane < limit)
-            asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" :: "r"(to), "l"(source + 32 * i + lane));
+        const int to = at[i % 3] + 104 * (i / 3);
+        if (32 * i + lane < limit) {
+#if __CUDA_ARCH__ >= 800
+            asm volatile("cp.async.cg.shared.global [%0], [%1], 16;"
+                         :: "r"(first + 16 * to), "l"(source + 32 * i + lane) : "memory");
+#else
+            space[to] = __ldcs(source + 32 * i + lane);
+#endif
+        }
     }
-    asm volatile("cp.async.commit_group;");
 """)
 def fetch_colour(address: wp.uint64, sh: wp.array2d[wp.vec3], row: wp.int32, count: wp.int32):
-    """Begin to read the rows of the warp."""
+    """Begin to read the rows of the warp; since Ampere, without waiting for them."""
     ...
 
 
 @wp.func_native("""
     const int lane = threadIdx.x & 31;
     float4* space = reinterpret_cast<float4*>(address);
+#if __CUDA_ARCH__ >= 800
     asm volatile("cp.async.wait_all;" ::: "memory");
+#endif
     __syncwarp();
     wp::mat_t<16, 3, float> result;
     float* values = &result.data[0][0];

@@ -32,7 +32,7 @@ def turned_band_1(c: wp.mat33, turn: wp.mat33) -> wp.mat33:
 
 @wp.struct
 class Turns:
-    """A rotation as three about z, y and z again: cosine and sine of each, the last one first."""
+    """A rotation as three, about z, y and z, in the order in which they are made: cosine and sine of each."""
 
     first: wp.vec2
     tilt: wp.vec2
