@@ -72,8 +72,7 @@ class SoftBody:
         """(3, 3) rotation that best carries the rest shape to ``positions`` (Kabsch, mass-weighted)."""
         rest = self.mesh.nodes - self.centre_of_mass(self.mesh.nodes)
         arms = positions - self.centre_of_mass(positions)
-        u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", self.node_mass, arms, rest))
-        return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+        return best_turn(self.node_mass, rest, arms)
 
     def mechanical_energy(self, positions: np.ndarray, velocities: np.ndarray) -> float:
         """Kinetic + elastic + gravitational energy, joules."""
@@ -152,3 +151,9 @@ def _first_frequency(assembly: ElasticAssembly, node_mass: np.ndarray, free: np.
     start = np.ones(len(kept))
     value = sparse_linalg.eigsh(stiffness, k=1, M=mass, sigma=0.0, v0=start, return_eigenvectors=False)[0]
     return float(np.sqrt(value))
+
+
+def best_turn(masses: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation that best carries the arms ``before`` (n, 3) to those ``after``, by ``masses`` (n,) (Kabsch)."""
+    u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", masses, after, before))
+    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt

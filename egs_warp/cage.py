@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.kernels.cage import inside_mesh_kernel
-from egs_warp.occupancy import Solid, solid_from_gaussians
+from egs_warp.occupancy import LatticeSolid, solid_from_gaussians
 from egs_warp.plane import Plane
 from egs_warp.stuffing import stuff
 from egs_warp.surface_mesher import tetwild
@@ -57,20 +57,8 @@ class Cage:
     """Share, by opacity, of all Gaussians that hang in the air apart from the object."""
     below_plane_opacity_mass: float
     """Share, by opacity, of all Gaussians whose mean lies below the plane."""
-    components: int
-    """Pieces connected through faces; 1."""
     dilation: float
     """How far the cage was grown around the occupied space, scene units."""
-
-    @property
-    def nodes(self) -> int:
-        """Node count."""
-        return len(self.mesh.nodes)
-
-    @property
-    def tets(self) -> int:
-        """Tetrahedron count."""
-        return len(self.mesh.tets)
 
     def height(self, plane: Plane) -> float:
         """Body height H above ``plane``, in the mesh's units."""
@@ -128,7 +116,6 @@ def build_cage(
         enclosed_opacity_mass=_enclosed_share(cloud, mesh, weights, np.arange(cloud.count)),
         floater_opacity_mass=_share(cloud, ~solid.belongs & ~solid.below_plane),
         below_plane_opacity_mass=_share(cloud, solid.below_plane),
-        components=1,
         dilation=grown * solid.longest_side,
     )
 
@@ -138,7 +125,7 @@ def _share(cloud: GaussianCloud, chosen: np.ndarray) -> float:
     return float(np.sum(opacities[chosen]) / np.sum(opacities))
 
 
-def _refuse_flat(solid: Solid) -> None:
+def _refuse_flat(solid: LatticeSolid) -> None:
     """A sheet is at most the lattice's own blur thick, wherever one looks."""
     thickest = float(_edt(np.pad(solid.inside, 1)[:, :, 1:]).max())
     size = np.ptp(np.argwhere(solid.inside), axis=0) + 1
@@ -150,7 +137,7 @@ def _refuse_flat(solid: Solid) -> None:
 
 
 def _mesh(
-    solid: Solid, distance: _Distance, target_nodes: int, dilation: float, method: CageMethod, cell: float
+    solid: LatticeSolid, distance: _Distance, target_nodes: int, dilation: float, method: CageMethod, cell: float
 ) -> tuple[TetMesh, CageMethod, float]:
     """The mesh, who made it, and the lattice cell that gives the asked node count (``cell`` if no lattice was made)."""
     if method is CageMethod.TETWILD:
@@ -191,7 +178,7 @@ def _stuffed(
 class _Distance:
     """Distances of the solid and its mirror image below the plane, which no dilation changes."""
 
-    def __init__(self, solid: Solid) -> None:
+    def __init__(self, solid: LatticeSolid) -> None:
         self.pad = int(np.ceil(0.25 * solid.longest_side / solid.spacing))
         mirrored = np.pad(np.concatenate([solid.inside[:, :, :0:-1], solid.inside], axis=2), self.pad)
         sharp = _edt(~mirrored) - _edt(mirrored)

@@ -8,7 +8,7 @@ from enum import Enum
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from egs_warp.body import BodyState
+from egs_warp.body import BodyState, best_turn
 from egs_warp.keyframes import Channel, Key, Quantity, channels
 from egs_warp.locomotion import StepReport
 from egs_warp.objectives import (
@@ -149,8 +149,7 @@ class Follow:
             return axes @ part.centre(state.velocities) / height
         if quantity is Quantity.ORIENTATION:
             before, after = (x[part.nodes] - part.centre(x) for x in (self._standing, state.positions))
-            u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", part.masses, after, before))
-            turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+            turn = best_turn(part.masses, before, after)
             return axes @ Rotation.from_matrix(turn).as_rotvec(degrees=True)
         arms = state.positions[part.nodes] - part.centre(state.positions)
         spin = (part.masses[:, None] * np.cross(arms, state.velocities[part.nodes])).sum(axis=0)

@@ -22,7 +22,7 @@ _MAX_BRIDGE = 4
 
 
 @dataclass(frozen=True)
-class Solid:
+class LatticeSolid:
     """The object as a set of lattice points; layer 0 of the last axis lies in the plane."""
 
     inside: np.ndarray
@@ -54,7 +54,7 @@ class Solid:
         return (np.asarray(world_points, float) @ self.frame.T - self.origin) / self.spacing
 
 
-def solid_from_gaussians(cloud: GaussianCloud, plane: Plane, *, resolution: int = 64) -> Solid:
+def solid_from_gaussians(cloud: GaussianCloud, plane: Plane, *, resolution: int = 64) -> LatticeSolid:
     """Occupied and enclosed space above ``plane``: the connected piece that holds most of the opacity mass.
 
     ``resolution`` lattice spacings span the object's longest side. Raises ``UserError`` if nothing opaque stands on
@@ -96,7 +96,7 @@ def _one_look(
     low: np.ndarray,
     high: np.ndarray,
     resolution: int,
-) -> Solid:
+) -> LatticeSolid:
     extent = float(np.max(high - low))
     if not extent > 0.0:
         raise UserError(
@@ -150,7 +150,7 @@ def _one_look(
     piece = np.asarray(labels == main if main else whole)
     inside = _fill(piece, cloud.device)
     belongs = in_lattice & ndimage.binary_dilation(piece)[at] & (means[:, 2] >= 0.0)
-    return Solid(inside, frame, origin, spacing, belongs, means[:, 2] < 0.0, bridged)
+    return LatticeSolid(inside, frame, origin, spacing, belongs, means[:, 2] < 0.0, bridged)
 
 
 def _bridge(occupied: np.ndarray, radius: int) -> np.ndarray:

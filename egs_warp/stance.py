@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from egs_warp.body import BodyState, SoftBody
+from egs_warp.body import BodyState, SoftBody, best_turn
 from egs_warp.locomotion import StepReport
 from egs_warp.objectives import Objective, SpinObjective, centre_of_mass_velocity, node_velocities
 from egs_warp.plane import Plane
@@ -132,8 +132,7 @@ class PoseFamily:
     def rotation(self, positions: np.ndarray) -> np.ndarray:
         """(3, 3) best-fit rotation from the standing pose, world axes."""
         arms = positions - self.body.centre_of_mass(positions)
-        u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", self.body.node_mass, arms, self._arms))
-        return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+        return best_turn(self.body.node_mass, self._arms, arms)
 
     def sole_heading(self, positions: np.ndarray) -> float:
         """Radians about the ground's normal by which the feet alone are turned from the standing pose."""
@@ -185,9 +184,7 @@ class PoseFamily:
 
     def turn_towards(self, state: BodyState, pose: np.ndarray) -> np.ndarray:
         """(3,) rotation vector, world axes, from the measured best-fit rotation to that of ``pose``."""
-        spread = np.einsum("n,ni,nj->ij", self.body.node_mass, self._arms @ pose.T, self._arms)
-        u, _, vt = np.linalg.svd(spread)
-        wanted = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+        wanted = best_turn(self.body.node_mass, self._arms, self._arms @ pose.T)
         return Rotation.from_matrix(wanted @ self.rotation(state.positions).T).as_rotvec()
 
 

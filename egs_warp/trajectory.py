@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from egs_warp.body import BodyState, SoftBody
+from egs_warp.body import BodyState, SoftBody, best_turn
 from egs_warp.contact import ContactGeometry
 from egs_warp.io.atomic import atomic_write
 from egs_warp.locomotion import StepReport
@@ -209,8 +209,7 @@ def measure(trajectory: Trajectory, *, first: int = 0, last: int = -1) -> Reache
 def _best_fit(t: Trajectory, positions: np.ndarray) -> np.ndarray:
     rest = t.rest_positions - t.node_mass @ t.rest_positions / t.node_mass.sum()
     arms = positions - t.node_mass @ positions / t.node_mass.sum()
-    u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", t.node_mass, arms, rest))
-    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return best_turn(t.node_mass, rest, arms)
 
 
 def _headings(t: Trajectory, first: int, last: int, up: np.ndarray) -> np.ndarray:

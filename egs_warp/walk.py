@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from egs_warp.body import BodyState
+from egs_warp.body import BodyState, best_turn
 from egs_warp.feet import feet_around, find_feet, foot_loads
 from egs_warp.footfalls import Footfalls, footfalls
 from egs_warp.gait import Gait, Passage, nearest_in_hull
@@ -257,5 +257,4 @@ class Walk:
     def _turn(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """(3,) rotation vector that best carries ``before`` (N, 3) to ``after`` (N, 3)."""
         arms, aims = (x - self.body.centre_of_mass(x) for x in (before, after))
-        u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", self.body.node_mass, aims, arms))
-        return Rotation.from_matrix(u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt).as_rotvec()
+        return Rotation.from_matrix(best_turn(self.body.node_mass, arms, aims)).as_rotvec()

@@ -59,7 +59,7 @@ def test_object_has_a_cage(make) -> None:
     cage = build_cage(thing.cloud, thing.plane)
     assert cage.enclosed_opacity_mass >= 0.999
     assert cage.min_dihedral_degrees >= 8.0
-    assert 300 <= cage.nodes <= 1500
+    assert 300 <= len(cage.mesh.nodes) <= 1500
 
 
 def test_stool_stands_on_four_feet() -> None:
