@@ -17,6 +17,8 @@ from egs_warp.locomotion import StepReport
 from egs_warp.trajectory import Audit, Reached
 
 SCHEMA_VERSION = 1
+MECHANICS = ("warp-lang", "numpy", "scipy", "osqp", "qdldl", "pytetwild")
+"""Packages that decide how a body moves."""
 
 
 def motion_entry(
@@ -55,9 +57,8 @@ def timing_summary(reports: Sequence[StepReport], frames: np.ndarray, drawing: d
     }
 
 
-def versions() -> dict[str, str]:
-    """Of the package, Python and what the numbers depend on."""
-    names = ("warp-lang", "numpy", "scipy", "osqp", "qdldl", "pytetwild")
+def versions(names: Sequence[str] = MECHANICS) -> dict[str, str]:
+    """Of the package, Python and the packages ``names``, which the numbers depend on."""
     return {
         "egs-warp": egs_warp.__version__,
         "python": platform.python_version(),

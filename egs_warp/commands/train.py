@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from dataclasses import asdict
@@ -57,6 +56,7 @@ def _train(chosen: argparse.Namespace) -> int:
     except ImportError as error:
         raise UserError("train: PyTorch is not installed; pip install 'egs-warp[torch]'") from error
     from egs_warp.io import read_cameras, writable_folder
+    from egs_warp.report import write_report
 
     # Poses that cannot be read must not leave a new folder behind.
     read_cameras(chosen.posed)
@@ -81,7 +81,7 @@ def _train(chosen: argparse.Namespace) -> int:
     stem = chosen.out.name.split(".")[0]
     write(chosen.out, result.cloud)
     report = _report(chosen, result, progress, time.perf_counter() - began)
-    _write_text(folder / f"{stem}.report.json", json.dumps(report, indent=1))
+    write_report(folder / f"{stem}.report.json", report)
     _write_sheet(folder / f"{stem}.sheet.png", result)
     for which, scores in report["mean"].items():
         if scores:
@@ -151,12 +151,7 @@ def _writer(out: Path):
 
 
 def _report(chosen: argparse.Namespace, result, progress: _Progress, seconds: float) -> dict:
-    import platform
-
-    import torch
-    import warp as wp
-
-    import egs_warp
+    from egs_warp.report import versions
 
     photo = result.views[0].camera
     means = {
@@ -180,13 +175,7 @@ def _report(chosen: argparse.Namespace, result, progress: _Progress, seconds: fl
         "device": chosen.device,
         "seed": chosen.seed,
         "sh_degree": chosen.sh_degree,
-        "versions": {
-            "egs-warp": egs_warp.__version__,
-            "python": platform.python_version(),
-            "warp-lang": wp.__version__,
-            "numpy": np.__version__,
-            "torch": torch.__version__,
-        },
+        "versions": versions(("warp-lang", "numpy", "torch")),
     }
 
 
@@ -212,10 +201,3 @@ def _write_sheet(path: Path, result) -> None:
             frames.append(frame)
             labels.append(kind)
     write_png(path, contact_sheet(frames, 4 if len(picked) > 2 else 2, labels))
-
-
-def _write_text(path: Path, text: str) -> None:
-    from egs_warp.io import atomic_write
-
-    with atomic_write(path) as temporary:
-        temporary.write_text(text)
