@@ -6,11 +6,11 @@ python benchmarks/examples.py [--quick] [--device cpu] [--json PATH] [--plot PAT
 from __future__ import annotations
 
 import argparse
-import importlib
+import importlib.util
 import json
-import sys
 import tempfile
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 
@@ -24,25 +24,39 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="six frames of each")
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--seed", type=int, default=0, help="not used: nothing here is random")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--plot", type=Path)
     arguments = parser.parse_args()
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
     rows = []
     for name in EXAMPLES:
         with tempfile.TemporaryDirectory() as folder:
             flags = ["--out", folder, "--device", arguments.device, *(["--frames", "6"] if arguments.quick else [])]
-            report = importlib.import_module(f"examples.{name}").main(flags)
+            report = example(name).main(flags)
             with np.load(Path(folder) / "trajectory.npz") as trajectory:
                 steps = len(trajectory["time"]) - 1
                 contacts = np.bincount(trajectory["contact_step"], minlength=steps)
         rows.append(row_of(name, report, contacts))
     print(table(rows))
-    result = {"rows": rows, "environment": {"device": arguments.device, **versions()}, "aims": {}}
+    result = {
+        "rows": rows,
+        "environment": {"device": arguments.device, "seed": arguments.seed, **versions()},
+        "aims": {},
+    }
     if arguments.json:
         arguments.json.write_text(json.dumps(result, indent=2) + "\n")
     if arguments.plot:
         plot(rows, arguments.plot)
+
+
+def example(name: str) -> ModuleType:
+    """A script of ``examples/``, which is no package."""
+    path = Path(__file__).resolve().parents[1] / "examples" / f"{name}.py"
+    spec = importlib.util.spec_from_file_location(f"example_{name}", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def row_of(name: str, report: dict, contacts: np.ndarray) -> dict:
