@@ -106,10 +106,15 @@ def footprint(thing: GaussianCloud, plane: Plane) -> Hole:
 def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
     """The floor that stands behind the object in every view that has it in sight, which more than half of them must.
 
-    Raises ``UserError`` for masks that do not fit their cameras, are empty, or between them hide no common floor.
+    Raises ``UserError`` for masks that do not fit their cameras, are all empty, or between them hide no common floor.
     """
     for view in views:
         check_size(view)
+    name = views[0].name
+    # Where the object is out of sight its mask is empty, and says nothing.
+    views = [view for view in views if view.mask.any()]
+    if not views:
+        raise UserError(f"{name}: the mask is empty; mark the object in it")
     shadows = [_on_plane(plane, view.camera, view.mask) for view in views]
     if any(len(shadow) == 0 for shadow in shadows):
         raise UserError("inpaint: the floor is not in sight inside a mask; the hole is off the plane, check the plane")

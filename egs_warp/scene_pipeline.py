@@ -25,8 +25,7 @@ from egs_warp.plane_file import write_planes
 from egs_warp.plane_fit import PlaneFit
 from egs_warp.plane_search import find_planes, plane_under, refine_plane
 from egs_warp.rectified import PlaneWindow
-from egs_warp.segmentation import CELLS, ObjectSpec, Segmentation, segment
-from egs_warp.votes import blending_votes
+from egs_warp.segmentation import CELLS, ObjectSpec, Segmentation, segment, votes_of_masks
 
 if TYPE_CHECKING:
     from egs_warp.finetune import TrainingView
@@ -298,8 +297,7 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> Pla
 
 def _low_point(cloud: GaussianCloud, spec: ObjectSpec, means: np.ndarray, up: np.ndarray) -> np.ndarray:
     """(3,) a place in the lower third of what the masks show; never below the object's foot."""
-    marked = [view for view in spec.masks if view.mask.any()]
-    votes = blending_votes(cloud, marked)
+    votes = votes_of_masks(cloud, spec.masks)
     inside = votes.inside * (votes.share_inside() > 0.5) * (votes.share_seen() > 0.02)
     if inside.sum() <= 0.0:
         raise UserError("object: nothing of the capture shows inside the masks; check masks and cameras")

@@ -222,17 +222,26 @@ def _floor_top(scene: _Scene, chosen: np.ndarray, size: float) -> float:
     return float(np.clip(level + 3.0 * spread, 0.0, _ROUGHEST * size))
 
 
-def _voted(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> tuple[np.ndarray, np.ndarray]:
-    """Gaussians that the masks claim, and those that they do not show."""
+def votes_of_masks(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> Votes:
+    """Votes of the masks that mark anything: where the object is out of sight its mask is empty, and says nothing.
+
+    Raises ``UserError`` for masks of another size than their cameras', where all are empty, and where their cameras see
+    nothing.
+    """
     for view in masks:
         check_size(view)
-    # Where the object is out of sight its mask is empty, and says nothing.
     marked = [view for view in masks if view.mask.any()]
     if not marked:
         raise UserError(f"{masks[0].name}: the mask is empty; mark the object in it")
-    votes: Votes = blending_votes(cloud, marked)
+    votes = blending_votes(cloud, marked)
     if not (votes.inside + votes.outside > 0.0).any():
         raise UserError("object: the masks' cameras see nothing of the capture; check that both share one frame")
+    return votes
+
+
+def _voted(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> tuple[np.ndarray, np.ndarray]:
+    """Gaussians that the masks claim, and those that they do not show."""
+    votes = votes_of_masks(cloud, masks)
     seen = votes.share_seen() >= _SEEN
     wanted = seen & (votes.share_inside() > 0.5)
     if not wanted.any():

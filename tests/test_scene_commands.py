@@ -34,6 +34,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_cameras(path / "cameras.json", cameras, [f"photo{k}.png" for k in range(6)])
     mask = masks_from_selection(cloud, truth, cameras[1:2])[0].mask
     Image.fromarray(mask.astype(np.uint8) * 255).save(path / "photo1.png")
+    corner = np.zeros_like(mask)
+    corner[:6, :6] = True
+    for name, wrong in (("empty", mask & False), ("sky", corner), ("short", mask[:50])):
+        (path / name).mkdir()
+        Image.fromarray(wrong.astype(np.uint8) * 255).save(path / name / "photo1.png")
     away = Camera.look_at(np.array([0.0, 0.0, 9.0]), np.array([0.0, 1.0, 20.0]), np.eye(3)[1], width=96, height=96)
     write_cameras(path / "away.json", [away], ["photo1.png"])
     return path
@@ -75,7 +80,16 @@ def test_without_cameras_a_ring_is_used_and_written(folder: Path, tmp_path: Path
         (["--object", "0,0,0.5", "--plane", "0,0,1,-5"], "nothing of it lies above the plane"),
         (["--object", "0,0,0.5", "--plane", "0,0,1,0.9"], "it touches no plane: its lowest part is"),
         (["--object", "0,0,0.5", "--cameras", "{folder}/away.json"], "no camera sees it around the object"),
-        (["--object", "{folder}/photo1.png", "--cameras", "{folder}/away.json"], "the masks"),
+        (["--object", "{folder}/photo1.png", "--cameras", "{folder}/away.json"], "the masks' cameras see nothing"),
+        (
+            ["--object", "{folder}/empty/photo1.png", "--cameras", "{folder}/cameras.json"],
+            "the mask is empty; mark the",
+        ),
+        (["--object", "{folder}/sky/photo1.png", "--cameras", "{folder}/cameras.json"], "nothing of the capture shows"),
+        (
+            ["--object", "{folder}/short/photo1.png", "--cameras", "{folder}/cameras.json"],
+            "make it at the photo's size",
+        ),
         (["--object", "5,5,5,6,6,6"], "the box holds nothing of the capture"),
     ],
 )
