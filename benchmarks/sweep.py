@@ -1,6 +1,6 @@
 """Robustness: bodies x motions x friction x sag x solver step, each run judged by its targets and by every bound of the audit.
 
-python benchmarks/sweep.py [--quick] [--workers 2] [--json PATH] [--plot PATH]
+python benchmarks/sweep.py [--quick] [--workers 2] [--json PATH] [--join PATH] [--plot PATH]
 
 A run succeeds if the motion reaches what was asked (distance and height within 15 %, a twist's heading within 10 degrees and
 its drift within 0.1 body heights, a walk's distance within 10 %), the body ends upright (tilt under 10 degrees) and the audit
@@ -173,9 +173,12 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="three runs")
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--join", type=Path, help="JSON of an earlier run of the same code: its rows are not run again")
     parser.add_argument("--plot", type=Path)
     arguments = parser.parse_args()
-    runs, rows = cases(arguments.quick), []
+    rows = json.loads(arguments.join.read_text())["rows"] if arguments.join else []
+    known = [Case(**{name: row[name] for name in Case.__dataclass_fields__}) for row in rows]
+    runs = [case for case in cases(arguments.quick) if case not in known]
     # Kernels compile once, here, not in every worker.
     run(Case("pawn", "jump", 0.6, 0.05, 1.0))
     context = multiprocessing.get_context("spawn")
@@ -185,7 +188,8 @@ def main() -> None:
             row = rows[-1]
             what = f"{row['body']} {row['motion']} mu {row['friction']} sag {row['sag']} step 1/{1 / row['step']:.0f}"
             print(
-                f"{len(rows):>4}/{len(runs)} {what}: {row['reason'] or 'success'} ({row['seconds']:.0f} s)", flush=True
+                f"{len(rows):>4}/{len(runs) + len(known)} {what}: {row['reason'] or 'success'} ({row['seconds']:.0f} s)",
+                flush=True,
             )
             result = summary(rows)
             if arguments.json:
@@ -211,7 +215,9 @@ def summary(rows: list[dict]) -> dict:
         "rows": rows,
         "success_rate": rate,
         "successes_of_runs": rates,
-        "worst_audit_of_successes": {name: max((row["audit"][name] for row in good), default=None) for name in BOUNDS},
+        "worst_audit_of_successes": {
+            name: max((row["audit"][name] for row in good if "audit" in row), default=None) for name in BOUNDS
+        },
         "failures": [
             {key: row[key] for key in (*Case.__dataclass_fields__, "reason")} for row in rows if not row["success"]
         ],
