@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from egs_warp.camera import Camera
 from egs_warp.connectivity import close_to, connected_parts, enclosed
 from egs_warp.errors import UserError
-from egs_warp.gaussians import GaussianCloud
+from egs_warp.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.plane import Plane
 from egs_warp.votes import MaskedView, Votes, blending_votes, check_size
 
@@ -32,6 +33,10 @@ FOOTPRINT_HEIGHT = 0.08
 """Of the object's size: what it has below this height hides the floor."""
 _HALO = 0.1
 """Of the object's size: floaters this near to it are its halo."""
+_WISP, _WISP_HEIGHT = 0.015, 0.1
+"""Of the object's size: standard deviation from which, and height up to which, a Gaussian may be a shred of the floor."""
+_NEIGHBOURS = 16
+"""Gaussians whose median colour is that of a place."""
 _FOOT = 0.015
 """Of the object's size: within this height above the plane, floor and object cannot be told apart by connection."""
 
@@ -117,6 +122,10 @@ def segment(cloud: GaussianCloud, plane: Plane, spec: ObjectSpec) -> Segmentatio
     # What lies below the object's foot is hidden, so nobody can tell whose it is; inpainting makes new floor there.
     buried = ~object_mask & ~above & (scene.heights > -0.25 * size) & (outline | claimed)
     halo = (small | ~scene.solid) & above & close_to(scene.means, scene.means[chosen], _HALO * size)
+    if not spec.masks:
+        wisps = _wisps(scene, object_mask, size)
+        object_mask &= ~wisps
+        halo |= wisps
     floaters = (halo | (claimed & above)) & ~object_mask & ~buried
     return Segmentation(object_mask, buried, floaters, size)
 
@@ -192,6 +201,29 @@ def _body(
     chosen |= enclosed(scene.means, np.concatenate([shell, mirrored]), 2.0 * size / CELLS) & (scene.heights > foot)
     chosen |= lying & scene.under(chosen, 0.1 * size, size)
     return chosen, small
+
+
+def _wisps(scene: _Scene, chosen: np.ndarray, size: float) -> np.ndarray:
+    """(n,) bool: wide Gaussians at the object's foot in the floor's colour, which would go along as shreds of the floor."""
+    low = scene.heights < _WISP_HEIGHT * size
+    length = np.exp(scene.cloud.log_scales.numpy().max(axis=1))
+    wide = length > max(_WISP * size, 2.0 * float(np.median(length[chosen])))
+    suspects = np.flatnonzero(chosen & low & wide)
+    own = np.flatnonzero(chosen & low & ~wide & scene.solid)
+    floor = np.flatnonzero(~chosen & low & scene.level & scene.solid & (np.abs(scene.heights) < 0.05 * size))
+    found = np.zeros(len(chosen), bool)
+    if min(len(suspects), len(own), len(floor)) < 1:
+        return found
+    colours = scene.cloud.sh.numpy()[:, 0].astype(np.float64) * SH_BAND_0
+
+    def apart(others: np.ndarray) -> np.ndarray:
+        tree = cKDTree(scene.means[others])
+        _, nearest = tree.query(scene.means[suspects], k=min(_NEIGHBOURS, len(others)))
+        nearest = np.reshape(nearest, (len(suspects), -1))
+        return np.linalg.norm(np.median(colours[others[nearest]], axis=1) - colours[suspects], axis=1)
+
+    found[suspects[apart(floor) < 0.5 * apart(own)]] = True
+    return found
 
 
 def _first_size(scene: _Scene, wanted: np.ndarray, spec: ObjectSpec) -> float:

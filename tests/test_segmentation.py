@@ -61,6 +61,26 @@ def check(cloud: GaussianCloud, truth: np.ndarray, spec: ObjectSpec) -> None:
     assert 1.2 < found.size < 1.8
 
 
+def test_shreds_of_the_floor_do_not_go_along() -> None:
+    """Wide floor-coloured Gaussians at the foot of a dark ball belong to neither; a dark one as wide stays the ball's."""
+    cloud, truth = ball_on_floor()
+    random = np.random.default_rng(5)
+    angles = np.arange(6)
+    shreds = np.column_stack([0.3 * np.cos(angles), 0.3 * np.sin(angles), np.full(6, 0.09)])
+    tone = np.concatenate([np.where(truth, -1.0, 1.0), np.ones(5), [-1.0]])
+    whole = GaussianCloud.from_numpy(
+        np.concatenate([cloud.means.numpy(), shreds]),
+        np.tile([1.0, 0.0, 0.0, 0.0], (cloud.count + 6, 1)),
+        np.concatenate([cloud.log_scales.numpy(), np.tile(np.log([0.1, 0.01, 0.01]), (6, 1))]),
+        np.full(cloud.count + 6, 3.0),
+        tone[:, None, None] + random.normal(0.0, 0.05, (cloud.count + 6, 1, 3)),
+    )
+    found = segment(whole, FLOOR, ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
+    assert found.floater_mask[cloud.count :].tolist() == [True] * 5 + [False]
+    assert found.object_mask[-1]
+    assert (truth & (cloud.means.numpy()[:, 2] > 0.05) & ~found.object_mask[: cloud.count]).sum() == 0
+
+
 @pytest.mark.parametrize("views", [1, 3])
 def test_masks_of_one_view_or_several(views: int) -> None:
     cloud, truth = ball_on_floor()
