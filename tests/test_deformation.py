@@ -100,7 +100,7 @@ def test_turning_the_object_is_turning_the_camera(device: str) -> None:
         for each, r in ((cloud, np.eye(3)), (turned, turn))
     ]
     difference = np.abs(pictures[0] - pictures[1])
-    assert np.ptp(pictures[0]) > 0.5
+    assert pictures[0].max() - pictures[0].min() > 0.5
     # A splat that is cut at 1/255 in one picture and just not in the other differs by more; it is one in ten thousand.
     assert np.percentile(difference, 99.9) < 1e-4
     assert difference.max() < 4e-3 * np.abs(pictures[0]).max()
