@@ -223,7 +223,9 @@ def summary(rows: list[dict]) -> dict:
         ],
         "aims": {
             "ninety_percent_succeed": rate >= 0.9 if enough else None,
-            "every_success_meets_the_audit": bool(good),
+            "every_success_meets_the_audit": all(
+                row["audit"][name] <= bound for row in good if "audit" in row for name, bound in BOUNDS.items()
+            ),
         },
         "why_null": {} if enough else {"ninety_percent_succeed": f"{len(rows)} runs, not 100"},
     }
