@@ -190,10 +190,11 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
     cut_out[..., 3] = 255 * mask
     Image.fromarray(cut_out).save(tmp_path / "other.png")
     np.testing.assert_array_equal(read_mask(tmp_path / "other.png"), mask > 0)
-    assert read_object("1,2,3", cloud, []).point.tolist() == [1.0, 2.0, 3.0]
+    np.testing.assert_array_equal(read_object("1,2,3", cloud, []).point, [1.0, 2.0, 3.0])
     box = read_object("1,2,3,0,5,1", cloud, []).box
     assert box is not None and box.low.tolist() == [0.0, 2.0, 1.0] and box.high.tolist() == [1.0, 5.0, 3.0]
     clicked = read_object("32,32", cloud, posed, view="0").point
+    assert clicked is not None
     np.testing.assert_allclose(np.linalg.norm(clicked - [0.0, 0.0, 0.5]), 0.5, atol=0.04)
     for text, given, view, message in (
         ("nothing.png", posed, None, "--object nothing.png: no such file, nor numbers"),
