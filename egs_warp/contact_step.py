@@ -57,8 +57,8 @@ def contact_step(
         contacts = detector.contact_set(points, step.state.positions)
         shift = push_out_speeds(contacts.gaps, dt, push_out_cap)
         delassus = np.zeros((0, 0))
-        converged = False
-        for iteration in range(outer_limit):
+        converged, stale, last, share = False, True, np.inf, 1.0
+        for _ in range(outer_limit):
             nodal = (contacts.frame.T @ forces.ravel()).reshape(force.shape)
             result = step.minimise(force + nodal, velocities, tension=tension)
             status, velocities = result.status, result.velocities
@@ -67,7 +67,7 @@ def contact_step(
             if contacts.count == 0:
                 converged = True
                 break
-            if iteration % 4 == 0:  # the tangent changes little between corrections
+            if stale:
                 solve = step.tangent(velocities, tension)
                 delassus = dt * (contacts.frame @ solve(contacts.frame.T.toarray()))
                 delassus = 0.5 * (delassus + np.transpose(delassus))
@@ -77,11 +77,15 @@ def contact_step(
             corrected, _ = coulomb_forces(
                 delassus, speed - delassus @ forces.ravel(), shift, detector.geometry.friction, forces
             )
-            change = delassus @ (corrected - forces).ravel()
-            if np.abs(change).max() < 1e-6 * scale:
+            change = float(np.abs(delassus @ (corrected - forces).ravel()).max())
+            if change < 1e-6 * scale:
                 converged = True
                 break
-            forces = corrected
+            # Where corrections hardly shrink the tangent is stale; where they do not they go round in circles, and a part leads out.
+            stale = change > 0.1 * last
+            share = max(0.5 * share, 0.125) if change > 0.5 * last else min(2.0 * share, 1.0)
+            forces = forces + share * (corrected - forces)
+            last = change
         gaps, _ = detector.gaps(step.end_positions(velocities))
         deep = np.setdiff1d(np.flatnonzero(gaps < -penetration_tolerance), points)
         if not converged or len(deep) == 0 or round_number == round_limit - 1:
