@@ -11,6 +11,9 @@ from egs_warp.coulomb import coulomb_forces
 from egs_warp.dynamics import ImplicitStep, NewtonStatus
 from egs_warp.muscle_tension import MuscleTension
 
+_PATIENCE = 12
+"""Corrections after which they are taken to go round in circles."""
+
 
 @dataclass(frozen=True)
 class ContactStepResult:
@@ -41,7 +44,7 @@ def contact_step(
     push_out_cap: float,
     penetration_tolerance: float,
     tension: MuscleTension | None = None,
-    outer_limit: int = 20,
+    outer_limit: int = 40,
     round_limit: int = 6,
 ) -> ContactStepResult:
     """Minimise Phi under ``force`` (N, 3), the muscles' ``tension`` and the contact forces of ``points`` (n,), found with it.
@@ -57,8 +60,8 @@ def contact_step(
         contacts = detector.contact_set(points, step.state.positions)
         shift = push_out_speeds(contacts.gaps, dt, push_out_cap)
         delassus = np.zeros((0, 0))
-        converged, stale, last, share = False, True, np.inf, 1.0
-        for _ in range(outer_limit):
+        converged, last, share = False, np.inf, 1.0
+        for iteration in range(outer_limit):
             nodal = (contacts.frame.T @ forces.ravel()).reshape(force.shape)
             result = step.minimise(force + nodal, velocities, tension=tension)
             status, velocities = result.status, result.velocities
@@ -67,7 +70,8 @@ def contact_step(
             if contacts.count == 0:
                 converged = True
                 break
-            if stale:
+            circling = iteration >= _PATIENCE
+            if iteration % 4 == 0 or circling:  # the tangent changes little between corrections that shrink
                 solve = step.tangent(velocities, tension)
                 delassus = dt * (contacts.frame @ solve(contacts.frame.T.toarray()))
                 delassus = 0.5 * (delassus + np.transpose(delassus))
@@ -81,9 +85,9 @@ def contact_step(
             if change < 1e-6 * scale:
                 converged = True
                 break
-            # Where corrections hardly shrink the tangent is stale; where they do not they go round in circles, and a part leads out.
-            stale = change > 0.1 * last
-            share = max(0.5 * share, 0.125) if change > 0.5 * last else min(2.0 * share, 1.0)
+            # Corrections that do not shrink go round in circles; a part of one leads out.
+            if circling:
+                share = max(0.5 * share, 0.125) if change > 0.5 * last else min(2.0 * share, 1.0)
             forces = forces + share * (corrected - forces)
             last = change
         gaps, _ = detector.gaps(step.end_positions(velocities))
