@@ -14,6 +14,8 @@ from egs_warp.stance import Ground, Measurement, PoseFamily, Weights
 
 RISE = 0.92
 """A thrust ends when the centre of mass would reach this share of the asked height in free flight: one step more is too much."""
+CARRIED = 2.0
+"""Speed ahead at the end of a crouch, in leans over its time: 2 is a steady acceleration, 0 a stop."""
 FULL_RISE = 0.99
 """What a thrust aims at, clear of ``RISE``, so that a speed that is nearly followed ends it."""
 
@@ -224,12 +226,16 @@ class Jump:
         if self.phase is JumpPhase.SETTLE:
             return start, np.zeros(3)
         down = np.array([plan.lean, 0.0, -plan.crouch_depth])
+        # The crouch ends at rest over the ground but already on the way ahead: friction has little left to give during the thrust.
+        onset = np.array([min(CARRIED * plan.lean / plan.crouch_time, plan.speed_forward), 0.0, 0.0])
         if self.phase is JumpPhase.CROUCH:
             s = min(elapsed / plan.crouch_time, 1.0)
             blend, slope = s * s * (3 - 2 * s), 6 * s * (1 - s) / plan.crouch_time
-            return start + blend * down, slope * down
+            carried, rate = s * s * (s - 1) * plan.crouch_time, s * (3 * s - 2)
+            return start + blend * down + carried * onset, slope * down + rate * onset
         take_off = np.array([plan.speed_forward, 0.0, plan.speed_up])
-        return start + down + 0.5 * take_off * elapsed**2 / plan.thrust_time, take_off * elapsed / plan.thrust_time
+        position = start + down + onset * elapsed + 0.5 * (take_off - onset) * elapsed**2 / plan.thrust_time
+        return position, onset + (take_off - onset) * elapsed / plan.thrust_time
 
     def _stand(self, state: BodyState, com_velocity, position, base, dt: float) -> list[Objective | SpinObjective]:
         pose = self.pose.over_base(position, base)

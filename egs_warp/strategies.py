@@ -16,10 +16,12 @@ from egs_warp.qp import QpSolution, QpSolver, QpStatus, QuadraticProgram, quadra
 
 GOOD_ENOUGH = 1.005
 """A search ends when the objective is within this factor of its bound."""
-DOUBTFUL = 2.0
+DOUBTFUL = 1.2
+"""While the best is further than this from its bound, ``PATIENCE`` times as many QPs are allowed."""
+LOST = 2.0
 """A search that ends further than this from its bound is done again from the predicted states."""
 PATIENCE = 3
-"""So many times as many QPs are allowed while the best is doubtful: feet that slide have many states that are nearly as likely."""
+"""Feet that slide have many states that are nearly as likely."""
 
 
 class Strategy(Enum):
@@ -148,7 +150,7 @@ def find_states(
     if strategy is Strategy.TWO_STAGE:
         _start_relaxed(search, predicted, activations)
         _move(search, together=True)
-        if search.within(DOUBTFUL):
+        if search.within(LOST):
             return search.result()
         kept = search.best, search.states
         search.best = None

@@ -120,11 +120,12 @@ def _snap(
     ends = edges[cut]
     at = _roots(field, points[ends[:, 0]], points[ends[:, 1]], np.where(value[ends[:, 0]] < 0.0, 1, -1))
     length = np.linalg.norm(points[ends[:, 1]] - points[ends[:, 0]], axis=1)
-    limit = np.where(edge_is_long[cut], _SNAP_LONG, _SNAP_SHORT)
+    # From a floor point straight up it is half a long edge.
+    limit = np.where(edge_is_long[cut], _SNAP_LONG * length.max(initial=0.0), _SNAP_SHORT * length)
     moved, on_surface = points.copy(), value.copy()
     end = ends.T.ravel()
     target = np.concatenate([at, at])
-    travel = np.linalg.norm(target - points[end], axis=1) / np.concatenate([length, length])
+    travel = np.linalg.norm(target - points[end], axis=1)
     close = travel < np.concatenate([limit, limit])
     end, target, travel = end[close], target[close], travel[close]
     # Last write wins: farthest first, and cuts along the floor after all others for its points.

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 import warp as wp
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from egs_warp.base_plane import find_base_plane
@@ -197,13 +197,11 @@ def test_tetwild() -> None:
     _check(build_cage(thing.cloud, thing.plane, method=CageMethod.TETWILD), thing.plane)
 
 
-@settings(max_examples=25, deadline=None, derandomize=True)
+@settings(max_examples=25, deadline=None)
+@example(325082, 0.098)
 @given(st.integers(0, 10**6), st.floats(0.08, 0.16))
 def test_stuffing_quality(seed: int, cell: float) -> None:
-    """Smooth solids: closed surface, flat floor, no angle below 8 degrees, volume that of the level set.
-
-    The same solids in every run: of 400 random ones three had an angle of 7.6 to 8 degrees (seed 325082 with cell 0.098 is one).
-    """
+    """Any smooth solid: closed surface, flat floor, no angle below 8 degrees, volume that of the level set."""
     random = np.random.default_rng(seed)
     axes, centre = random.uniform(0.3, 0.5, 3), np.array([0.0, 0.0, 0.31]) + random.uniform(-0.05, 0.05, 3)
     wave = random.uniform(6.0, 12.0, 3)
