@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
 
-from egs_warp.complementarity import STATIC, Pivot, plain_pivots, proposed_pivots, states_of_pairs
+from egs_warp.complementarity import SEPARATE, STATIC, Pivot, plain_pivots, proposed_pivots, states_of_pairs
 from egs_warp.contact_program import ContactProgram
 from egs_warp.exact import exact_states
 from egs_warp.lcp import lemke
@@ -17,9 +17,11 @@ from egs_warp.qp import QpSolution, QpSolver, QpStatus, QuadraticProgram, quadra
 GOOD_ENOUGH = 1.005
 """A search ends when the objective is within this factor of its bound."""
 DOUBTFUL = 1.2
-"""While the best is further than this from its bound, ``PATIENCE`` times as many QPs are allowed."""
-LOST = 2.0
-"""A search that ends further than this from its bound is done again from the predicted states."""
+"""A search that ends further than this factor from its bound is done again from other states, with ``PATIENCE`` times as many QPs."""
+IMMATERIAL = 0.01
+"""Unless there is no more to gain than this share of what it costs to do nothing, to fall without muscles and ground."""
+PRESSED = 1e-3
+"""Body weights, of a contact that holds."""
 PATIENCE = 3
 """Feet that slide have many states that are nearly as likely."""
 
@@ -75,7 +77,7 @@ class _Search:
 
     def attempt(self, states: np.ndarray) -> bool:
         """Solve for ``states`` unless that was done before; whether it is the best so far."""
-        limit = self.limit if self.within(DOUBTFUL) else PATIENCE * self.limit
+        limit = self.limit if self.settled else PATIENCE * self.limit
         if self.count >= limit or states.tobytes() in self.visited:
             return False
         self.visited.add(states.tobytes())
@@ -102,12 +104,18 @@ class _Search:
             self.attempt(states)
         return True
 
-    def within(self, factor: float) -> bool:
-        """Whether no states can be better by more than ``factor``."""
+    def within(self, factor: float, share: float = 0.0) -> bool:
+        """Whether no states can be better by more than ``factor``, or by more than a ``share`` of the cost of doing nothing."""
         if self.best is None or self.relaxed is None:
             return False
         constant = self.program.constant
-        return self.best.objective + constant <= factor * (self.relaxed.objective + constant)
+        bound = self.relaxed.objective + constant
+        return self.best.objective + constant <= max(factor * bound, bound + share * constant)
+
+    @property
+    def settled(self) -> bool:
+        """Whether the best is good enough to stop looking elsewhere."""
+        return self.within(DOUBTFUL, IMMATERIAL)
 
     def pivots(self) -> list[Pivot]:
         """Of the best point."""
@@ -150,14 +158,15 @@ def find_states(
     if strategy is Strategy.TWO_STAGE:
         _start_relaxed(search, predicted, activations)
         _move(search, together=True)
-        if search.within(LOST):
-            return search.result()
-        kept = search.best, search.states
-        search.best = None
-        search.attempt(predicted)
-        _move(search, together=True)
-        if kept[0] is not None and (search.best is None or search.best.objective > kept[0].objective):
-            search.best, search.states = kept
+        for start in _other_starts(search, predicted):
+            if search.settled:
+                break
+            kept = search.best, search.states
+            search.best = None
+            search.attempt(start)
+            _move(search, together=True)
+            if kept[0] is not None and (search.best is None or search.best.objective > kept[0].objective):
+                search.best, search.states = kept
         return search.result()
     search.attempt(np.full(program.layout.contacts, STATIC))
     if search.best is None:
@@ -194,6 +203,17 @@ def _start_relaxed(search: _Search, predicted: np.ndarray, activations: np.ndarr
         activations = np.clip(relaxed.x[: layout.activations], -1.0, 1.0)
     if not search.attempt_contact(activations):
         search.attempt(predicted)
+
+
+def _other_starts(search: _Search, predicted: np.ndarray) -> Iterator[np.ndarray]:
+    """States (n,) worth another search: feet that hold where the best point without complementarity presses, or where the prediction
+    does, and the predicted states themselves."""
+    if search.relaxed is not None:
+        layout = search.program.layout
+        pressed = search.relaxed.x[layout.normal] > PRESSED
+        yield np.where(pressed, STATIC, SEPARATE)
+    yield np.where(predicted == SEPARATE, SEPARATE, STATIC)
+    yield predicted
 
 
 def _move(search: _Search, *, together: bool) -> None:
