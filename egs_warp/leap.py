@@ -73,7 +73,8 @@ class Leap(Jump):
         )
         crouch = min(self.plan.crouch_depth, DEEPEST_CROUCH * self.pose.standing_height)
         stroke = crouch + self.plan.extension
-        self.plan = replace(self.plan, crouch_depth=crouch, thrust_time=2.0 * stroke / self.plan.speed_up)
+        thrust_time = max(2.0 * stroke / self.plan.speed_up - place.step, 2.0 * place.step)
+        self.plan = replace(self.plan, crouch_depth=crouch, thrust_time=thrust_time)
         self._calm_since: float | None = None
         self._asked: np.ndarray | None = None
         self._pose_weight = self.weights.pose

@@ -82,6 +82,8 @@ def plan_jump(
     acceleration = 1.6 * gravity
     stroke = max(speed_up**2 / (2.0 * acceleration), extension + 0.02 * height)
     thrust_time = 2.0 * stroke / speed_up
+    # Every step goes its whole way at the speed of its end: half a step's way more than steady acceleration takes.
+    stroke += 0.5 * speed_up * step
     flight_time = np.sqrt(2.0 * rise / gravity) + np.sqrt(2.0 * max(rise - target.rise, 0.0) / gravity)
     if lean is None:
         lean = min(0.3 * support_ahead, 0.05 * height, 0.2 * target.distance)
