@@ -64,7 +64,7 @@ def find_feet(mesh: TetMesh, heights: np.ndarray, body_height: float) -> tuple[F
 def feet_around(feet: Sequence[Foot], positions: np.ndarray, up: np.ndarray) -> tuple[int, int, int, int]:
     """Indices of the feet of a four-legged body at ``positions`` (N, 3), anticlockwise seen against ``up`` (3,), unit."""
     if len(feet) != 4:
-        raise UserError(f"walk: the body has {len(feet)} separate feet; a walk needs four")
+        raise UserError(f"walk: a walk needs four separate feet, the body has {len(feet)}")
     centres = np.array([positions[foot.sole].mean(axis=0) for foot in feet])
     arms = centres - centres.mean(axis=0)
     side = arms[0] - (arms[0] @ up) * up

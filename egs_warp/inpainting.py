@@ -17,12 +17,12 @@ from scipy import ndimage
 
 from egs_warp.bitmaps import connected_parts, depth_inside, distance_to
 from egs_warp.errors import UserError
-from egs_warp.gaussians import GaussianCloud
+from egs_warp.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.holes import Hole
 from egs_warp.inpainters import Inpainter
 from egs_warp.new_floor import flat_gaussians, rim_heights, with_gloss
 from egs_warp.patch_synthesis import PatchSynthesis
-from egs_warp.rectified import SH_BAND_0, PlaneWindow, RectifiedImage, matte, near_plane, rectify
+from egs_warp.rectified import PlaneWindow, RectifiedImage, matte, near_plane, rectify
 from egs_warp.scenes.rooms import joined
 
 _MARGIN = 0.04

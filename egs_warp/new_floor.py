@@ -10,8 +10,8 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from egs_warp.gaussians import GaussianCloud
-from egs_warp.rectified import SH_BAND_0, PlaneWindow, RectifiedImage, mean_colours
+from egs_warp.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.rectified import PlaneWindow, RectifiedImage, mean_colours
 from egs_warp.soap_film import soap_film
 
 _WIDTH = 0.62

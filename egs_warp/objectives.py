@@ -112,7 +112,6 @@ class Coordinates:
 
 
 WORLD = Coordinates(np.eye(3), False)
-CENTRE_OF_MASS = Coordinates(np.eye(3), True)
 
 
 def part_velocity(

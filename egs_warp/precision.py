@@ -3,7 +3,6 @@
 import warp as wp
 
 real = wp.float64
-Vec2 = wp.vec2d
 Vec3 = wp.vec3d
 Vec4 = wp.vec4d
 Mat33 = wp.mat33d

@@ -8,12 +8,11 @@ import numpy as np
 import warp as wp
 
 from egs_warp.camera import Camera
-from egs_warp.gaussians import GaussianCloud
+from egs_warp.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.kernels.rectified import mean_colour_kernel
 from egs_warp.plane import Plane
 from egs_warp.render import render
 
-SH_BAND_0 = 0.28209479177387814
 _SEEN_FROM = 40.0
 """Degrees above the plane, from all around: the directions that a floor is looked at from. Straight down, few captures
 have seen it."""

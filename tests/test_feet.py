@@ -46,7 +46,7 @@ def test_feet_are_named_around_the_body() -> None:
 def test_other_bodies_have_other_numbers_of_feet_and_do_not_walk(mesh, height: float, count: int) -> None:
     feet = find_feet(mesh, mesh.nodes[:, 2], height)
     assert len(feet) == count
-    with pytest.raises(UserError, match=f"walk: the body has {count} separate feet; a walk needs four"):
+    with pytest.raises(UserError, match=f"walk: a walk needs four separate feet, the body has {count}"):
         feet_around(feet, mesh.nodes, np.array([0.0, 0.0, 1.0]))
 
 

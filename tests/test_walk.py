@@ -58,7 +58,7 @@ def test_a_walk_goes_along_its_feet_and_refuses_other_bodies() -> None:
     assert strides_out.gait.step_length == pytest.approx(0.5 * min(foot.length for foot in strides_out.feet))
     assert strides_out.notes()[0].startswith("steps of 1.00 body heights were asked; the legs are long enough for 0.3")
     _, place, _ = standing(figure(), forward=np.array([1.0, 0.0, 0.0]), settled=False)
-    with pytest.raises(UserError, match="walk: the body has 2 separate feet; a walk needs four"):
+    with pytest.raises(UserError, match="walk: a walk needs four separate feet, the body has 2"):
         Walk(place, 4, 0.1)
 
 
