@@ -1,20 +1,21 @@
 # Plain venv + pip; constraints.txt pins every package.
 PYTHON ?= python3
 VENV := .venv
-FRAMES ?= 120
+# Frames of each example; as many as its motion takes where this is empty.
+FRAMES ?=
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .PHONY: demo test setup lint types examples clean
 
 demo: $(VENV)/demo.stamp
-	$(BIN)/python examples/jump.py --out out/jump --frames $(FRAMES)
+	$(BIN)/python examples/jump.py --out out/jump $(FRAMES:%=--frames %)
 
 examples: setup
 	for motion in jump twist hop walk; do \
-		$(BIN)/python examples/$$motion.py --out out/$$motion --frames $(FRAMES) || exit 1; \
+		$(BIN)/python examples/$$motion.py --out out/$$motion $(FRAMES:%=--frames %) || exit 1; \
 	done
-	$(BIN)/python examples/finetune.py --out out/finetune --steps $(FRAMES)
+	$(BIN)/python examples/finetune.py --out out/finetune $(FRAMES:%=--steps %)
 
 test: setup
 	$(BIN)/python -m pytest

@@ -1,6 +1,6 @@
 """Robustness: bodies x motions x friction x sag x solver step, each run judged by its targets and by every bound of the audit.
 
-python benchmarks/sweep.py [--quick] [--workers 2] [--json PATH] [--join PATH] [--plot PATH]
+python benchmarks/sweep.py [--quick] [--workers 2] [--device cpu] [--seed 0] [--json PATH] [--join PATH] [--plot PATH]
 
 A run succeeds if the motion reaches what was asked (distance and height within 15 %, a twist's heading within 10 degrees and
 its drift within 0.1 body heights, a walk's distance within 10 % and its feet slipping less than 2 % of a stride), the body
@@ -18,6 +18,7 @@ import time
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import product
 from pathlib import Path
 
@@ -71,8 +72,8 @@ def cases(quick: bool) -> list[Case]:
     return runs
 
 
-def run(case: Case, frames: int | None = None) -> dict:
-    """Simulate one case, ``frames`` of it, and judge it."""
+def run(case: Case, *, device: str, seed: int, frames: int | None = None) -> dict:
+    """Simulate one case, ``frames`` of it, and judge it; ``seed`` is of the built-in bodies' Gaussians."""
     os.environ["OMP_NUM_THREADS"] = "1"
     import numpy as np
     import warp as wp
@@ -91,9 +92,9 @@ def run(case: Case, frames: int | None = None) -> dict:
     started = time.perf_counter()
     if case.body in CAPTURES:
         file, up = CAPTURES[case.body]
-        subject = {"cloud": read_capture(data_folder() / file).cloud, "up": np.array(up)}
+        subject = {"cloud": read_capture(data_folder() / file, device=device).cloud, "up": np.array(up)}
     else:
-        built_in = {"pawn": pawn, "figurine": figurine, "stool": stool}[case.body]()
+        built_in = {"pawn": pawn, "figurine": figurine, "stool": stool}[case.body](seed=seed, device=device)
         subject = {"cloud": built_in.cloud, "plane": built_in.plane}
     try:
         creature = make_creature(**subject, friction=case.friction, sag=case.sag)
@@ -176,6 +177,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="three runs")
     parser.add_argument("--workers", type=int, default=os.cpu_count())
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--seed", type=int, default=0, help="of the Gaussians of the built-in bodies")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--join", type=Path, help="JSON of an earlier run of the same code: its rows are not run again")
     parser.add_argument("--plot", type=Path)
@@ -184,10 +187,11 @@ def main() -> None:
     known = [Case(**{name: row[name] for name in Case.__dataclass_fields__}) for row in rows]
     runs = [case for case in cases(arguments.quick) if case not in known]
     # Kernels compile once, here, not in every worker.
-    run(Case("pawn", "jump", 0.6, 0.05, 1 / 60), frames=3)
+    one = partial(run, device=arguments.device, seed=arguments.seed)
+    one(Case("pawn", "jump", 0.6, 0.05, 1 / 60), frames=3)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(arguments.workers, mp_context=context) as pool:
-        for future in as_completed([pool.submit(run, case) for case in runs]):
+        for future in as_completed([pool.submit(one, case) for case in runs]):
             rows.append(future.result())
             row = rows[-1]
             what = f"{row['body']} {row['motion']} mu {row['friction']} sag {row['sag']} step 1/{1 / row['step']:.0f}"
@@ -195,7 +199,7 @@ def main() -> None:
                 f"{len(rows):>4}/{len(runs) + len(known)} {what}: {row['reason'] or 'success'} ({row['seconds']:.0f} s)",
                 flush=True,
             )
-            result = summary(rows)
+            result = summary(rows, device=arguments.device, seed=arguments.seed)
             if arguments.json:
                 arguments.json.write_text(json.dumps(result, indent=2) + "\n")
     print(table(result))
@@ -203,7 +207,7 @@ def main() -> None:
         plot(rows, arguments.plot)
 
 
-def summary(rows: list[dict]) -> dict:
+def summary(rows: list[dict], *, device: str, seed: int) -> dict:
     """Rates of success by every factor, worst audits of the successes, and the aims."""
     good = [row for row in rows if row["success"]]
     rates = {
@@ -234,7 +238,7 @@ def summary(rows: list[dict]) -> dict:
             ),
         },
         "why_null": {} if enough else {"ninety_percent_succeed": f"{len(rows)} runs, not 100"},
-        "environment": {"device": "cpu", **versions()},
+        "environment": {"device": device, "seed": seed, **versions()},
     }
 
 

@@ -28,6 +28,7 @@ import warp as wp
 sys.path.insert(0, str(Path(__file__).parent))
 import mesh_scenes as scenes
 from drop import Drop, simulated_drop
+from perceptual import lpips_distance
 
 from egs_warp.cage import build_cage
 from egs_warp.camera import Camera
@@ -124,6 +125,7 @@ def object_rows(mesh: scenes.PaintedMesh, options: argparse.Namespace) -> tuple[
         f"{np.mean(at_rest):.2f} dB",
         flush=True,
     )
+    distance, _ = lpips_distance()
     for motion_name in MOTIONS:
         nodes = motions[motion_name](cage.nodes)
         vertices = scenes.carried_vertices(mesh, cage, nodes, options.device)
@@ -147,7 +149,9 @@ def object_rows(mesh: scenes.PaintedMesh, options: argparse.Namespace) -> tuple[
                 image = render(carried, camera)
                 picture = np.clip(image.colour.numpy(), 0.0, 1.0)
                 similarity = float(ssim(torch.as_tensor(picture).float(), torch.as_tensor(target).float()))
-                scores.append((psnr(picture, target), similarity, scenes.outside(image.alpha.numpy(), coverage)))
+                perceptual = distance(picture, target) if distance else np.nan
+                outside = scenes.outside(image.alpha.numpy(), coverage)
+                scores.append((psnr(picture, target), similarity, outside, perceptual))
                 if index == 0:
                     strip.append(picture)
             mean = np.mean(scores, axis=0)
@@ -158,7 +162,7 @@ def object_rows(mesh: scenes.PaintedMesh, options: argparse.Namespace) -> tuple[
                     "method": method.value,
                     "psnr": float(mean[0]),
                     "ssim": float(mean[1]),
-                    "lpips": None,
+                    "lpips": float(mean[3]) if distance else None,
                     "outside_silhouette": float(mean[2]),
                     "gaussians": carried.count,
                     "psnr_at_rest": float(np.mean(at_rest)),
@@ -254,11 +258,12 @@ def main() -> None:
             f"{method.value:26}" + "".join(f"{table[m, method][0]:10.2f} /{table[m, method][1]:.4f}" for m in MOTIONS)
         )
     print(json.dumps({"aims": aims, "why_null": why_null}, indent=1))
+    _, no_lpips = lpips_distance()
     result = {
         "rows": rows,
         "environment": {**scenes.environment(options.device, options.seed), "torch": torch.__version__},
         "aims": aims,
-        "why_null": {**why_null, "lpips": "its weights are not installed"},
+        "why_null": {**why_null, **({"lpips": no_lpips} if no_lpips else {})},
     }
     if options.json:
         options.json.write_text(json.dumps(result, indent=1))

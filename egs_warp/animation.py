@@ -13,8 +13,9 @@ from egs_warp.errors import UserError
 from egs_warp.film import Film, draw_film
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.io.atomic import writable_folder
+from egs_warp.locomotion import LocomotionSettings
 from egs_warp.plane import Plane
-from egs_warp.repertoire import also_reached, longest, parts_of
+from egs_warp.repertoire import also_reached, check_possible, longest, parts_of
 from egs_warp.report import build_report, motion_entry, qp_summary, timing_summary, write_report
 from egs_warp.script import LARGEST_TARGET, LARGEST_TURN, parse_script
 from egs_warp.sequence import MotionSequence
@@ -79,6 +80,7 @@ def animate(
     solids: tuple[Solid, ...] = (),
     gravity_up: np.ndarray | None = None,
     forward: np.ndarray | None = None,
+    settings: LocomotionSettings | None = None,
     options: AnimateOptions | None = None,
     source: str = "capture",
     notes: tuple[str, ...] = (),
@@ -88,8 +90,8 @@ def animate(
 
     ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.script``). ``background`` (scene
     units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from the object to the camera.
-    ``muscles_file``, ``solids`` and ``gravity_up``: see ``make_creature``; ``forward`` (3,): see ``first_place``. Returns the report
-    (docs/report.md). Raises ``UserError`` for bad input, before any file of an earlier run is touched.
+    ``muscles_file``, ``solids``, ``gravity_up`` and ``settings``: see ``make_creature``; ``forward`` (3,): see ``first_place``.
+    Returns the report (docs/report.md). Raises ``UserError`` for bad input, before any file of an earlier run is touched.
     """
     options = options or AnimateOptions()
     flags = {"distance": options.distance, "height": options.height, "heading_degrees": options.heading_degrees}
@@ -106,10 +108,13 @@ def animate(
             muscles_file=muscles_file,
             solids=solids,
             gravity_up=gravity_up,
+            settings=settings,
         )
         bar.update()
     place = first_place(creature, forward)
-    sequence = MotionSequence(place, parts_of(requests, creature.body.height))
+    parts = parts_of(requests, creature.body.height)
+    check_possible(parts, place)
+    sequence = MotionSequence(place, parts)
     frames = options.frames or cut_off
     with tqdm(total=frames, desc="simulate", unit="frame", disable=quiet) as bar:
         simulation = simulate(
@@ -133,7 +138,9 @@ def animate(
         shadow=options.shadow,
         quiet=quiet,
     )
-    report = _report(creature, simulation, sequence, film, seed=options.seed, source=source, notes=notes)
+    report = _report(
+        creature, simulation, sequence, film, seed=options.seed, source=source, notes=(*notes, *sequence.cut_short())
+    )
     simulation.trajectory.save(folder / "trajectory.npz")
     creature.cage.mesh.write_vtu(folder / "cage.vtu")
     write_report(folder / "report.json", report)

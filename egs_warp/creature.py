@@ -14,7 +14,7 @@ from egs_warp.contact import ContactGeometry, contact_geometry
 from egs_warp.errors import UserError
 from egs_warp.fibre_files import read_muscles
 from egs_warp.gaussians import GaussianCloud
-from egs_warp.locomotion import LocomotionStepper
+from egs_warp.locomotion import LocomotionSettings, LocomotionStepper
 from egs_warp.muscles import MuscleSet, automatic_muscles
 from egs_warp.plane import Plane
 from egs_warp.sequence import Place
@@ -70,11 +70,12 @@ def make_creature(
     muscles_file: Path | None = None,
     solids: tuple[Solid, ...] = (),
     gravity_up: np.ndarray | None = None,
+    settings: LocomotionSettings | None = None,
 ) -> Creature:
     """Give a capture (scene units) a body that stands on ``plane``, or on its own base, square to ``up`` (3,).
 
     ``muscles_file``: see ``body_muscles``. ``solids`` (scene units) are steps and walls beside the ground; ``gravity_up`` (3,) is
-    against gravity if the ground is a slope.
+    against gravity if the ground is a slope. ``settings`` of its stepper choose the strategy for the contact states and the QP solver.
     The body is as stiff as makes it sag by ``sag`` of its height; one that its weight would bend out of shape is made stiffer.
     """
     if plane is None:
@@ -92,7 +93,7 @@ def make_creature(
     while True:
         body = make_body(cage.mesh, plane, up=gravity_up, sag=sag, device=device)
         muscles = body_muscles(body, plane, muscles_file, metres_per_unit=scale)
-        stepper = LocomotionStepper(body, muscles, geometry, device=device)
+        stepper = LocomotionStepper(body, muscles, geometry, settings=settings, device=device)
         start = settle(stepper)
         if sag < SMALLEST_SAG or _stands(stepper, start):
             return Creature(cloud, plane, scale, cage, stepper, start, (Solid((plane,)), *solids))

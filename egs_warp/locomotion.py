@@ -43,8 +43,8 @@ class LocomotionSettings:
     push_out_cap: float = 0.05
     qp_limit: int = 3
     """QPs a step at most; ``strategies.PATIENCE`` times as many where the contact states are in doubt."""
-    qp_solver: QpSolver = QpSolver.OSQP
-    strategy: Strategy = Strategy.TWO_STAGE
+    qp_solver: QpSolver | str = QpSolver.OSQP
+    strategy: Strategy | str = Strategy.TWO_STAGE
     activation_weight: float = 2e-4
     """For a step of sqrt(H / g) / 19 and a muscle of 4 body weights. Shorter steps change speeds by less, so they weigh activations
     less: by the square of their share. Stronger muscles weigh more, as their force."""
@@ -53,6 +53,11 @@ class LocomotionSettings:
     strokes against each other from step to step, further than the linearised program knows the way."""
     drag: float = 0.0
     """alpha, 1/s."""
+
+    def __post_init__(self) -> None:
+        # Names that are not known are refused here, not in the first step.
+        QpSolver(self.qp_solver)
+        Strategy(self.strategy)
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,10 @@ class QpSolver(Enum):
     DAQP = "daqp"
     """Dual active set: to rounding."""
 
+    @classmethod
+    def _missing_(cls, value: object) -> QpSolver:
+        raise UserError(f"QP solver {value!r} is not known; give one of {', '.join(one.value for one in cls)}")
+
 
 @dataclass(frozen=True)
 class QpSolution:
@@ -62,10 +66,10 @@ class QuadraticProgram(Protocol):
 
 
 def quadratic_program(
-    P: np.ndarray, q: np.ndarray, A: np.ndarray, *, solver: QpSolver = QpSolver.OSQP, accuracy: float = 3e-5
+    P: np.ndarray, q: np.ndarray, A: np.ndarray, *, solver: QpSolver | str = QpSolver.OSQP, accuracy: float = 3e-5
 ) -> QuadraticProgram:
-    """The program with P (n, n), q (n,) and A (m, n) for ``solver``; ``accuracy`` is that of OSQP."""
-    return OsqpProgram(P, q, A, accuracy=accuracy) if solver is QpSolver.OSQP else DaqpProgram(P, q, A)
+    """The program with P (n, n), q (n,) and A (m, n) for ``solver`` (or its name); ``accuracy`` is that of OSQP."""
+    return OsqpProgram(P, q, A, accuracy=accuracy) if QpSolver(solver) is QpSolver.OSQP else DaqpProgram(P, q, A)
 
 
 class OsqpProgram:

@@ -104,6 +104,7 @@ class MotionSequence:
     def __init__(self, place: Place, parts: Sequence[Part]) -> None:
         self._place = place
         self._parts = list(parts)
+        self._count = len(self._parts)
         self.done: list[Done] = []
         self._rested_since: float | None = None
 
@@ -123,6 +124,16 @@ class MotionSequence:
             part = self._parts.pop(0)
             self.done.append(Done(part.name, part.asked, part.begin(place), state.time))
         return self.done[-1].motion.objectives(state, report, dt)
+
+    def cut_short(self) -> list[str]:
+        """What the last frame kept from its end, for the user."""
+        notes = []
+        if self.done and not self._resting:
+            notes.append(f"{self.done[-1].name} was cut off before it came to rest; give more --frames")
+        if self._parts:
+            names = ", ".join(part.name for part in self._parts)
+            notes.append(f"{len(self._parts)} of {self._count} motions did not begin: {names}")
+        return notes
 
     def spans(self, time: np.ndarray) -> list[tuple[int, int]]:
         """First and last index into ``time`` (F+1,) of each motion that was begun."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from egs_warp.complementarity import SEPARATE, STATIC, Pivot, plain_pivots, proposed_pivots, states_of_pairs
 from egs_warp.contact_program import ContactProgram
+from egs_warp.errors import UserError
 from egs_warp.exact import exact_states
 from egs_warp.lcp import lemke
 from egs_warp.qp import QpSolution, QpSolver, QpStatus, QuadraticProgram, quadratic_program
@@ -39,6 +40,10 @@ class Strategy(Enum):
     """From the states that stage 1 predicts, several contacts at a time (the paper's Eq. 12 and 13)."""
     EXACT = "exact"
     """The global optimum by branch and bound: for small problems."""
+
+    @classmethod
+    def _missing_(cls, value: object) -> Strategy:
+        raise UserError(f"strategy {value!r} is not known; give one of {', '.join(one.value for one in cls)}")
 
 
 @dataclass(frozen=True)
@@ -136,18 +141,19 @@ class _Search:
 
 def find_states(
     program: ContactProgram,
-    strategy: Strategy,
+    strategy: Strategy | str,
     predicted: np.ndarray,
     activations: np.ndarray,
     *,
     qp_limit: int,
-    solver: QpSolver = QpSolver.OSQP,
+    solver: QpSolver | str = QpSolver.OSQP,
 ) -> SearchResult:
-    """Contact states and the optimum for them by ``strategy``.
+    """Contact states and the optimum for them by ``strategy`` (or its name).
 
     ``predicted`` (n,) states of stage 1 (Eq. 12); ``activations`` (M,) of the last step, in their bounds. Where a strategy's own
     first states have no solution, it starts from those that follow from ``activations``, which always have one.
     """
+    strategy = Strategy(strategy)
     if strategy is Strategy.EXACT:
         found = exact_states(program, starts=(predicted,))
         if found is None:

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from egs_warp.body import BodyState, make_body
+from egs_warp.errors import UserError
 from egs_warp.hop import Hop, Squares
 from egs_warp.leap import Leap
 from egs_warp.motions import JumpPhase, JumpTarget
 from egs_warp.plane import Plane
-from egs_warp.repertoire import longest, parts_of
+from egs_warp.repertoire import check_possible, longest, parts_of
 from egs_warp.script import parse_script
 from egs_warp.sequence import MotionSequence, Part, Place
 from egs_warp.stance import Ground, sole_shares
@@ -96,6 +97,28 @@ def test_motions_follow_each_other_from_where_the_body_is(place: Place) -> None:
     assert first.motion.place is place
     assert np.allclose(second.motion.place.ground.axes[0], [np.cos(0.3), np.sin(0.3), 0.0])
     assert sequence.spans(np.array(times)) == [(0, 3), (3, 8)]
+
+
+def test_what_the_last_frame_cut_off_is_told(place: Place) -> None:
+    sequence = MotionSequence(place, [Part("a", {}, Waits), Part("b", {}, Waits), Part("c", {}, Waits)])
+    positions = moved(place, 0.0, np.zeros(3))
+    told = []
+    for k in range(9):
+        sequence.objectives(BodyState(positions, 0 * positions, k * DT), None, DT)
+        told.append(sequence.cut_short())
+    assert told[3] == [
+        "b was cut off before it came to rest; give more --frames",
+        "1 of 3 motions did not begin: c",
+    ]
+    assert told[2] == ["2 of 3 motions did not begin: b, c"]
+    assert told[8] == []
+
+
+def test_a_motion_that_cannot_be_is_refused_before_the_first(place: Place) -> None:
+    parts = parts_of(parse_script("hop x2, jump, walk"), place.body.height)
+    with pytest.raises(UserError, match="walk: a walk needs four separate feet"):
+        check_possible(parts, place)
+    check_possible(parts[:-1], place)
 
 
 def test_a_script_becomes_parts(place: Place) -> None:

@@ -9,6 +9,8 @@ import pytest
 
 from egs_warp.complementarity import STATIC
 from egs_warp.contact_program import ContactProgram
+from egs_warp.errors import UserError
+from egs_warp.locomotion import LocomotionSettings
 from egs_warp.qp import QpSolver
 from egs_warp.strategies import PATIENCE, SearchResult, Strategy, contact_under, find_states
 from tests.contact_programs import optimum_of_each, small_problem
@@ -16,7 +18,7 @@ from tests.contact_programs import optimum_of_each, small_problem
 
 def search(
     program: ContactProgram,
-    strategy: Strategy,
+    strategy: Strategy | str,
     *,
     limit: int = 100,
     solver: QpSolver = QpSolver.DAQP,
@@ -129,3 +131,15 @@ def test_states_that_contradict_each_other_are_replaced() -> None:
     assert is_complementary(program, static.y, 1e-5)
     two_stage = search(program, Strategy.TWO_STAGE)
     assert not two_stage.relaxed and two_stage.objective <= static.objective + 1e-9
+
+
+def test_strategies_and_solvers_are_chosen_by_name() -> None:
+    program = small_problem(3).program
+    found = [search(program, strategy) for strategy in ("exact", Strategy.EXACT)]
+    assert found[0].objective == found[1].objective and found[0].qp_count == found[1].qp_count > 2
+    settings = LocomotionSettings(strategy="static", qp_solver="daqp")
+    assert Strategy(settings.strategy) is Strategy.STATIC and QpSolver(settings.qp_solver) is QpSolver.DAQP
+    with pytest.raises(UserError, match="strategy 'nonsense' is not known; give one of static, qpcc"):
+        LocomotionSettings(strategy="nonsense")
+    with pytest.raises(UserError, match="QP solver 'nonsense' is not known; give one of osqp, daqp"):
+        LocomotionSettings(qp_solver="nonsense")
