@@ -13,7 +13,7 @@ def parse_up(text: str) -> np.ndarray:
     """(3,) unit vector of an axis name such as ``-y``. Raises ``UserError`` otherwise."""
     name = text.strip().lower().lstrip("+-")
     if name not in _AXES:
-        raise UserError(f"--up {text}: give one of x, y, z, -x, -y, -z (write --up=-y)")
+        raise UserError(f"--up {text}: give one of x, y, z, -x, -y, -z")
     up = np.zeros(3)
     up[_AXES[name]] = -1.0 if text.strip().startswith("-") else 1.0
     return up
@@ -29,7 +29,7 @@ def parse_direction(flag: str, text: str) -> np.ndarray:
         direction = np.zeros(0)
     length = float(np.linalg.norm(direction))
     if len(direction) != 3 or not np.isfinite(length) or length == 0.0:
-        raise UserError(f"--{flag} {text}: give three numbers x,y,z or an axis as -y (write --{flag}=-y)")
+        raise UserError(f"--{flag} {text}: give three numbers x,y,z or an axis as -y")
     return direction / length
 
 

@@ -29,13 +29,13 @@ from egs_warp.scenes import pawn
         (["--friction", "nan"], "--friction nan: give a Coulomb coefficient from 0 to 10"),
         (["--friction", "-1"], "--friction -1.0: give a Coulomb coefficient from 0 to 10"),
         (["--metres-per-unit", "-2"], "--metres-per-unit -2.0: give a positive number"),
-        (["--up", "w"], "--up w: give one of x, y, z, -x, -y, -z (write --up=-y)"),
+        (["--up", "w"], "--up w: give one of x, y, z, -x, -y, -z"),
         (["--plane", "0,0,0,1"], "give four finite numbers nx,ny,nz,d with a normal that is not zero"),
         (["--plane", "1,2"], "--plane 1,2: give four numbers nx,ny,nz,d"),
         (["--device", "tpu"], "--device tpu: this machine has cpu"),
         (
             ["--gravity-up", "1,2"],
-            "--gravity-up 1,2: give three numbers x,y,z or an axis as -y (write --gravity-up=-y)",
+            "--gravity-up 1,2: give three numbers x,y,z or an axis as -y",
         ),
         ([], "nothing.ply"),
     ],
@@ -48,6 +48,30 @@ def test_bad_input_is_one_line(
     assert status == 2
     assert message in error
     assert error.startswith("egs-warp: ") and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--object", "-1,-2.5,.5"], "nothing.ply: no such file"),
+        (["--object", "-.1,0,0,-.05,1,2"], "nothing.ply: no such file"),
+        (["--up", "-y", "--view-from", "-1,0,.5", "--plane", "-8e-05,0,1,-0.2"], "nothing.ply: no such file"),
+        (["--up", "-w"], "argument --up: expected one argument"),
+        (["--frames", "many"], "argument --frames: invalid int value: 'many'; see egs-warp animate --help"),
+        (["--nonsense"], "unrecognized arguments: --nonsense"),
+    ],
+)
+def test_values_may_begin_with_a_minus_and_wrong_flags_take_one_line(
+    flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        status = main(["animate", str(tmp_path / "nothing.ply"), "--out", str(tmp_path / "out"), *flags])
+    except SystemExit as stop:
+        status = stop.code
+    error = capsys.readouterr().err
+    assert status == 2
+    assert message in error
+    assert error.startswith("egs-warp") and error.count("\n") == 1
 
 
 def test_flat_object_leaves_an_earlier_result_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
