@@ -49,6 +49,9 @@ def test_a_terrain_file(tmp_path: Path) -> None:
         ("[[[0, 0, 1]]]", "solid 1: give a list of faces, each four numbers [nx, ny, nz, d]"),
         ('[[[0, 0, 1, "a"]]]', "solid 1: give a list of faces, each four numbers [nx, ny, nz, d]"),
         ("[[[0, 0, 1, 0]], [[0, 0, 0, 1]]]", "solid 2: plane 0,0,0,1: give four finite numbers"),
+        (f"[[[0, 0, 1, {401 * '1'}]]]", "solid 1: plane 0,0,1,inf: give four finite numbers"),
+        (f"[[[0, 0, 1, {5000 * '1'}]]]", "solid 1: plane 0,0,1,inf: give four finite numbers"),
+        ("[[[1e300, 1e300, 1, 0]]]", "solid 1: plane 1e+300,1e+300,1,0: give four finite numbers"),
         (str([[[0, 0, 1, 0]]] * 65), "65 faces; at most 64 are handled"),
     ],
 )
