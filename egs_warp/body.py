@@ -9,6 +9,7 @@ import scipy.sparse as sparse
 import scipy.sparse.linalg as sparse_linalg
 
 from egs_warp.elasticity import ElasticAssembly, Material
+from egs_warp.errors import UserError
 from egs_warp.plane import Plane
 from egs_warp.tetmesh import TetMesh
 
@@ -16,6 +17,8 @@ GRAVITY = 9.81
 """m/s^2."""
 DEFAULT_SAG = 0.05
 """rho g H / E of a column."""
+SMALLEST_HEIGHT, LARGEST_HEIGHT = 0.001, 1000.0
+"""Metres; smaller and larger bodies are refused as a slip of the pen."""
 LARGEST_SINK = 0.02
 """Body heights by which the centre of mass may sink from the unloaded to the standing body."""
 
@@ -109,13 +112,18 @@ def make_body(
     A body on thin legs would sink further into them than a column does; it is stiffened until its centre of mass sinks by no
     more than ``LARGEST_SINK`` H under its weight.
 
-    ``up`` (3,) is against gravity where the ground is a slope.
+    ``up`` (3,) is against gravity where the ground is a slope. Raises ``UserError`` for a height that no body has.
 
     ``damping_ratio`` is that of the first mode of the body held at its base (nodes within 5 % of H above the plane); it sets the
     Rayleigh coefficient beta.
     """
     heights = plane.heights(mesh.nodes)
     height = float(heights.max() - heights.min())
+    if not SMALLEST_HEIGHT <= height <= LARGEST_HEIGHT:
+        raise UserError(
+            f"--metres-per-unit: the body is {height:.3g} m high; choose it so that this is from {SMALLEST_HEIGHT:g}"
+            f" to {LARGEST_HEIGHT:g} m"
+        )
     young = density * GRAVITY * height / sag
     node_mass = mesh.lumped_masses(density)
     free = heights > heights.min() + 0.05 * height

@@ -11,12 +11,16 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from egs_warp.embedding import embed_points
+from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
 from egs_warp.kernels import contact as kernels
 from egs_warp.plane import Plane
 from egs_warp.precision import Vec3, Vec4, real
 from egs_warp.terrain import Solid
 from egs_warp.tetmesh import TetMesh
+
+LEAST_OUTSIDE = 0.1
+"""Share of the Gaussians above the ground that are outside of all solids at rest."""
 
 
 @dataclass(frozen=True)
@@ -97,14 +101,23 @@ def contact_geometry(
     ``planes`` bound half spaces, the first of them the ground; ``solids`` stand on it.
     Only vertices of the convex hull of each tetrahedron's points are kept: a deformation is affine inside a tetrahedron, so
     the deepest point of it is always one of those.
+
+    Raises ``UserError`` for a solid that holds the body.
     """
     means = cloud.means.numpy().astype(np.float64)
     quaternions = cloud.rotations.numpy().astype(np.float64)
     axes = Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix()
     arms = gamma * np.exp(cloud.log_scales.numpy().astype(np.float64))[:, None, :] * axes
     obstacles = [Solid((plane,)) for plane in planes] + list(solids)
-    heights = np.min([np.max([face.heights(means) for face in solid.faces], axis=0) for solid in obstacles], axis=0)
-    above = heights >= 0.0
+    above = np.all([plane.heights(means) >= 0.0 for plane in planes], axis=0)
+    least = LEAST_OUTSIDE * np.count_nonzero(above)
+    for number, solid in enumerate(solids, start=1):
+        above &= np.any([face.heights(means) >= 0.0 for face in solid.faces], axis=0)
+        if np.count_nonzero(above) < least:
+            raise UserError(
+                f"--terrain, solid {number}: the body is inside it; inside is where n.x + d < 0 for every face [nx, ny, nz, d]:"
+                " turn the signs of a face, or move the solid"
+            )
     opacities = cloud.opacities()
     points = [means[above]]
     for sign in (1.0, -1.0):

@@ -21,6 +21,7 @@ _BGR = {
     FibreKind.OBLIQUE_RIGHT: (30, 150, 240),
     FibreKind.USER: (90, 90, 90),
 }
+_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 _PANEL = 640
 _MARGIN = 40
 _SHARPNESS = 2
@@ -28,21 +29,28 @@ _SHARPNESS = 2
 _SUBPIXEL_BITS = 4
 
 
+def check_picture_name(path: Path) -> None:
+    """Raises ``UserError`` where the ending is not that of a picture."""
+    if path.suffix.lower() not in _ENDINGS:
+        raise UserError(f"{path}: not the name of a picture; let it end in one of {', '.join(_ENDINGS)}")
+
+
 def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarray) -> None:
-    """Write a PNG with the body from the front, from the side and from above, its fibres coloured by kind.
+    """Write a picture with the body from the front, from the side and from above, its fibres coloured by kind.
 
     ``up`` (3,) points up in the first two views. Raises ``UserError`` if ``path`` cannot be written.
     """
+    check_picture_name(path)
     up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
     left, near = square_to(up)
     right, away = -left, -near
     views = {"front": (right, up, away), "side": (away, up, -right), "above": (right, away, -up)}
     panels = [_panel(title, np.stack(axes), mesh, muscles) for title, axes in views.items()]
     image = np.concatenate([np.concatenate(panels, axis=1), _legend(muscles, 3 * _PANEL)])
-    written, data = cv2.imencode(".png", image)
+    written, data = cv2.imencode(path.suffix, image)
     try:
         if not written:
-            raise OSError("PNG encoding failed")
+            raise OSError("encoding failed")
         path.write_bytes(data.tobytes())
     except OSError as error:
         raise UserError(f"{path}: cannot write the picture ({error.strerror or error}); choose another place") from None

@@ -38,6 +38,8 @@ PARTS = ("body", "base", "head")
 """Parts that a key may name: the whole body (of which the position is that of the centre of mass), what stands on the ground, the top."""
 LONGEST_TIME = 60.0
 """Seconds."""
+SHORTEST_GAP = 0.001
+"""Seconds between two keys of a channel, and before the first."""
 LARGEST: Mapping[Quantity, float] = {
     Quantity.POSITION: 10.0,
     Quantity.VELOCITY: 20.0,
@@ -96,14 +98,15 @@ def read_keyframes(path: Path) -> tuple[Key, ...]:
 
 
 def channels(keys: Sequence[Key]) -> tuple[Channel, ...]:
-    """Keys by part and quantity; raises ``UserError`` if two of a channel have the same time, or times go back."""
+    """Keys by part and quantity; raises ``UserError`` if two of a channel are nearly at the same time, or times go back."""
     found: dict[tuple[str, Quantity], list[Key]] = {}
     for key in keys:
         group = found.setdefault((key.part, key.quantity), [])
-        if group and key.time <= group[-1].time:
+        before, what = (group[-1].time, "the key before") if group else (0.0, "the start")
+        if round(key.time - before, 9) < SHORTEST_GAP:
             raise UserError(
-                f"{key.where}: time {key.time:g} is not after {group[-1].time:g}, the key before of "
-                f"{key.part} {key.quantity.value}; give keys in the order of their times"
+                f"{key.where}: time {key.time:g} is not {SHORTEST_GAP:g} s after {before:g}, {what} of "
+                f"{key.part} {key.quantity.value}; give keys in the order of their times, so far apart"
             )
         group.append(key)
     return tuple(
@@ -132,7 +135,10 @@ def _from_json(text: str, path: Path) -> list[Key]:
 
 
 def _from_csv(text: str, path: Path) -> list[Key]:
-    rows = [row for row in csv.reader(text.splitlines())]
+    try:
+        rows = list(csv.reader(text.splitlines()))
+    except csv.Error as error:
+        raise UserError(f"{path}: not CSV ({error}); correct the file") from None
     if not rows:
         return []
     header = [name.strip().lower() for name in rows[0]]

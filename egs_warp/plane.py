@@ -22,8 +22,9 @@ class Plane:
     def from_coefficients(cls, nx: float, ny: float, nz: float, d: float) -> Plane:
         """Plane nx x + ny y + nz z + d = 0, scaled to a unit normal. Raises ``UserError`` for a zero or non-finite one."""
         normal = np.array([nx, ny, nz], dtype=np.float64)
-        length = float(np.linalg.norm(normal))
-        if not np.isfinite([nx, ny, nz, d]).all() or length == 0.0:
+        with np.errstate(over="ignore", invalid="ignore"):
+            length = float(np.linalg.norm(normal))
+        if not np.isfinite([length, d]).all() or length == 0.0:
             raise UserError(
                 f"plane {nx},{ny},{nz},{d}: give four finite numbers nx,ny,nz,d with a normal that is not zero"
             )

@@ -11,6 +11,7 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.io.atomic import atomic_write
 from egs_warp.plane import Plane
+from egs_warp.user_files import whole_number
 
 
 def write_planes(path: Path | str, planes: Sequence[Plane], *, facts: Sequence[Mapping[str, object]] = ()) -> None:
@@ -29,7 +30,7 @@ def write_planes(path: Path | str, planes: Sequence[Plane], *, facts: Sequence[M
 def read_planes(path: Path | str) -> list[Plane]:
     """The planes of a ``plane.json``. Raises ``UserError`` for anything else."""
     try:
-        tree = json.loads(Path(path).read_bytes())
+        tree = json.loads(Path(path).read_bytes(), parse_int=whole_number)
     except FileNotFoundError as error:
         raise UserError(f"{path}: no such file; make it with egs-warp plane, or give nx,ny,nz,d") from error
     except (OSError, ValueError, RecursionError) as error:

@@ -7,6 +7,7 @@ A line names motions, separated by commas, each with its numbers in their order,
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Mapping
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from egs_warp.errors import UserError
-from egs_warp.user_files import parse_json, read_text
+from egs_warp.user_files import parse_json, read_text, whole_number
 
 LARGEST_TARGET = 10.0
 """Body heights; a larger target is refused as a slip of the pen."""
@@ -96,14 +97,18 @@ def _from_words(piece: str, defaults: Mapping[str, float], where: str) -> Motion
     words = piece.split()
     if not words:
         raise UserError(f"{where}: nothing between two commas; name a motion: {', '.join(MOTIONS)}")
-    name, repeat, values, file = words[0].lower(), 1, {}, None
+    name, repeat, values, file = words[0].lower(), None, {}, None
     known = _values_of(name, where)
     order = [value.name for value in known]
     for word in words[1:]:
         if re.fullmatch(r"[xX]\d+", word):
-            repeat = int(word[1:])
+            if repeat is not None:
+                raise UserError(f"{where} ({piece!r}): {word!r} is a second number of repeats; give one")
+            repeat = whole_number(word[1:])
         elif "=" in word:
             key, _, number = word.partition("=")
+            if key in values:
+                raise UserError(f"{where} ({piece!r}): {key} is given twice; give it once")
             values[key] = number
         elif name == "trajectory" and file is None:
             file = Path(word)
@@ -112,7 +117,7 @@ def _from_words(piece: str, defaults: Mapping[str, float], where: str) -> Motion
             if not free:
                 raise UserError(f"{where} ({piece!r}): {word!r} is one value too many; {_takes(name)}")
             values[free[0]] = word
-    return _request(name, values, repeat, file, defaults, f"{where} ({piece!r})")
+    return _request(name, values, 1 if repeat is None else repeat, file, defaults, f"{where} ({piece!r})")
 
 
 def _from_json(path: Path, defaults: Mapping[str, float]) -> list[MotionRequest]:
@@ -132,6 +137,9 @@ def _from_json(path: Path, defaults: Mapping[str, float]) -> list[MotionRequest]
             raise UserError(f'{where}: "repeat" is {repeat!r}; give a whole number')
         if file is not None and not isinstance(file, str):
             raise UserError(f'{where}: "file" is {file!r}; give the name of a file')
+        for key, value in values.items():
+            if isinstance(value, str):
+                raise UserError(f'{where}: "{key}" is the text {json.dumps(value)}; give a number without quotes')
         keyframes = path.parent / file if file is not None else None
         requests.append(_request(name, values, repeat, keyframes, defaults, where))
     return requests
@@ -149,7 +157,7 @@ def _takes(name: str) -> str:
 
 
 def _request(
-    name: str, values: Mapping[str, Any], repeat: int, file: Path | None, defaults: Mapping[str, float], where: str
+    name: str, values: Mapping[str, Any], repeat: float, file: Path | None, defaults: Mapping[str, float], where: str
 ) -> MotionRequest:
     known = {value.name: value for value in _values_of(name, where)}
     for key in values:
@@ -163,7 +171,7 @@ def _request(
     asked = {
         key: _number(values.get(key, defaults.get(key, value.default)), value, where) for key, value in known.items()
     }
-    return MotionRequest(name, asked, repeat, file)
+    return MotionRequest(name, asked, int(repeat), file)
 
 
 def _number(given: Any, value: Value, where: str) -> float:

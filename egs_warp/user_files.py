@@ -8,6 +8,9 @@ from typing import Any
 
 from egs_warp.errors import UserError
 
+_EXACT_DIGITS = 15
+"""Whole numbers of so many digits are exact as floats, too."""
+
 
 def read_text(path: Path | str) -> str:
     """The text of a file. Raises ``UserError`` where there is none."""
@@ -17,12 +20,19 @@ def read_text(path: Path | str) -> str:
         raise UserError(f"{path}: cannot be read ({error.strerror}); check the path") from None
     except UnicodeDecodeError:
         raise UserError(f"{path}: not a text file (UTF-8)") from None
+    except ValueError:
+        raise UserError(f"{path}: no file can have this name; check the path") from None
+
+
+def whole_number(digits: str) -> int | float:
+    """The number that ``digits`` write; one of many digits as a float, infinite if need be, which every check of a range refuses."""
+    return int(digits) if len(digits) <= _EXACT_DIGITS else float(digits)
 
 
 def parse_json(text: str, path: Path | str) -> Any:
     """What the ``text`` of ``path`` holds. Raises ``UserError`` where it is not JSON."""
     try:
-        return json.loads(text)
+        return json.loads(text, parse_int=whole_number)
     except json.JSONDecodeError as error:
         raise UserError(f"{path}: not JSON at line {error.lineno} ({error.msg}); correct that line") from None
     except RecursionError:

@@ -14,8 +14,11 @@ import torch
 import warp as wp
 
 from egs_warp.camera import Camera
+from egs_warp.cli_input import check_device
+from egs_warp.errors import UserError, one_line_errors
 from egs_warp.finetune import FinetuneOptions, Rates, finetune, psnr, views_of_capture
 from egs_warp.gaussians import GaussianCloud
+from egs_warp.io.atomic import writable_folder
 from egs_warp.render import contact_sheet, render, write_png
 from egs_warp.render.autograd import render_torch
 from egs_warp.scenes import pawn
@@ -61,7 +64,10 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    check_device(arguments.device)
+    if arguments.steps < 1 or not 16 <= arguments.size <= 4096:
+        raise UserError("give --steps of at least 1 and a --size from 16 to 4096 pixels")
+    writable_folder(arguments.out)
 
     scene = pawn(device=arguments.device)
     cameras = ring_of_cameras(scene.cloud, scene.plane.normal, count=8, size=arguments.size)
@@ -84,4 +90,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors("finetune.py"):
+        main()

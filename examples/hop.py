@@ -9,6 +9,8 @@ import numpy as np
 import warp as wp
 
 from egs_warp.animation import AnimateOptions, animate
+from egs_warp.cli_input import check_device
+from egs_warp.errors import one_line_errors
 from egs_warp.report import summary
 from egs_warp.scenes import scene
 from egs_warp.scenes.rooms import SQUARE
@@ -24,6 +26,7 @@ def main(arguments: list[str] | None = None) -> dict:
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
+    check_device(chosen.device)
     chess = scene("pawn", device=chosen.device)
     report = animate(
         chess.object,
@@ -41,4 +44,5 @@ def main(arguments: list[str] | None = None) -> dict:
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors("hop.py"):
+        main()

@@ -8,6 +8,8 @@ from pathlib import Path
 import warp as wp
 
 from egs_warp.animation import AnimateOptions, animate
+from egs_warp.cli_input import check_device
+from egs_warp.errors import one_line_errors
 from egs_warp.report import summary
 from egs_warp.scenes import pawn
 
@@ -21,6 +23,7 @@ def main(arguments: list[str] | None = None) -> dict:
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
+    check_device(chosen.device)
     thing = pawn(device=chosen.device)
     options = AnimateOptions(distance=0.5, height=0.2, frames=chosen.frames, size=chosen.size)
     report = animate(thing.cloud, chosen.out, plane=thing.plane, options=options, source="pawn")
@@ -30,4 +33,5 @@ def main(arguments: list[str] | None = None) -> dict:
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors("jump.py"):
+        main()

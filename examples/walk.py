@@ -8,6 +8,8 @@ from pathlib import Path
 import warp as wp
 
 from egs_warp.animation import AnimateOptions, animate
+from egs_warp.cli_input import check_device
+from egs_warp.errors import one_line_errors
 from egs_warp.report import summary
 from egs_warp.scenes import stool
 
@@ -23,6 +25,7 @@ def main(arguments: list[str] | None = None) -> dict:
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
+    check_device(chosen.device)
     thing = stool(device=chosen.device)
     options = AnimateOptions(frames=chosen.frames, size=chosen.size)
     motion = f"walk {chosen.steps} {chosen.step_length}"
@@ -33,4 +36,5 @@ def main(arguments: list[str] | None = None) -> dict:
 
 
 if __name__ == "__main__":
-    main()
+    with one_line_errors("walk.py"):
+        main()

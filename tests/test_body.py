@@ -9,7 +9,9 @@ import scipy.sparse as sparse
 from scipy.spatial.transform import Rotation
 
 from egs_warp.body import GRAVITY, SoftBody, make_body
+from egs_warp.errors import UserError
 from egs_warp.plane import Plane
+from egs_warp.tetmesh import TetMesh
 from tests.meshes import block_mesh
 
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
@@ -70,3 +72,12 @@ def test_best_fit_rotation_recovers_a_turn(body: SoftBody) -> None:
     assert np.allclose(body.best_fit_rotation(centred @ (turn @ stretch).T), turn, atol=1e-10)
     mirrored = body.best_fit_rotation(centred * [-1.0, 1.0, 1.0])
     assert np.linalg.det(mirrored) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-4, 1e5])
+def test_a_height_that_no_body_has_is_refused(scale: float) -> None:
+    mesh = block_mesh()
+    with pytest.raises(
+        UserError, match=r"--metres-per-unit: the body is .* m high; choose it so that this is from 0.001"
+    ):
+        make_body(TetMesh(mesh.nodes * scale, mesh.tets), FLOOR, device="cpu")

@@ -30,6 +30,8 @@ from egs_warp.scenes import pawn
         (["--friction", "-1"], "--friction -1.0: give a Coulomb coefficient from 0 to 10"),
         (["--metres-per-unit", "-2"], "--metres-per-unit -2.0: give a positive number"),
         (["--up", "w"], "--up w: give one of x, y, z, -x, -y, -z"),
+        (["--metres-per-unit", "1e-300"], "--metres-per-unit 1e-300: give a number from 1e-9 to 1e9"),
+        (["--metres-per-unit", "1e300"], "--metres-per-unit 1e+300: give a number from 1e-9 to 1e9"),
         (["--plane", "0,0,0,1"], "give four finite numbers nx,ny,nz,d with a normal that is not zero"),
         (["--plane", "1,2"], "--plane 1,2: give four numbers nx,ny,nz,d"),
         (["--device", "tpu"], "--device tpu: this machine has cpu"),
@@ -105,6 +107,13 @@ def test_own_muscles_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str
     said = capsys.readouterr()
     assert "1 fibres, 4 segments" in said.out and 'fibre "spine"' in said.err
     assert cv2.imread(str(tmp_path / "muscles.png")) is not None
+
+
+@pytest.mark.parametrize("name", ["a.xyz", "a", ".png"])
+def test_a_plot_needs_the_name_of_a_picture(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["muscles", str(tmp_path / "nothing.ply"), "--plot", str(tmp_path / name)]) == 2
+    error = capsys.readouterr().err
+    assert f"{name}: not the name of a picture; let it end in one of .png, .jpg" in error and error.count("\n") == 1
 
 
 def test_axes_and_planes_are_read() -> None:

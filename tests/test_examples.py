@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import runpy
+import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -42,3 +44,29 @@ def test_example_writes_its_files(tmp_path: Path, name: str, asked: dict[str, fl
     trajectory = Trajectory.load(tmp_path / "trajectory.npz")
     assert len(trajectory.time) == 4 and np.isfinite(trajectory.positions).all()
     assert (tmp_path / f"{name}.mp4").stat().st_size > 0 and (tmp_path / "sheet.png").stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    ("name", "flags", "message"),
+    [
+        ("walk", ["--steps", "0"], "walk.py: --motion, motion 1 ('walk 0 0.1'): steps 0: give a whole number of steps"),
+        ("jump", ["--size", "0"], "jump.py: --size 0: give a number of pixels from 16 to 4096"),
+        ("twist", ["--device", "tpu"], "twist.py: --device tpu: this machine has cpu"),
+        ("hop", ["--hops", "0"], "hop.py: --motion, motion 1 ('hop x0'): repeat 0; give a whole number"),
+        ("finetune", ["--steps", "0"], "finetune.py: give --steps of at least 1"),
+    ],
+)
+def test_bad_flags_are_one_line(
+    tmp_path: Path,
+    name: str,
+    flags: list[str],
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    path = EXAMPLES / f"{name}.py"
+    monkeypatch.setattr(sys, "argv", [str(path), *flags, "--out", str(tmp_path)])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(path), run_name="__main__")
+    error = capsys.readouterr().err
+    assert end.value.code == 2 and error.startswith(message) and error.count("\n") == 1

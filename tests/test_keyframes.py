@@ -72,10 +72,14 @@ def test_curve_passes_through_keys_starts_at_rest_and_never_overshoots(tmp_path:
         ([{**GOOD, "time": 0}], "key 1: time 0: give seconds above 0, at most 60"),
         ([{**GOOD, "value": [1, 2]}], "key 1: value [1, 2]: give three numbers: forward, left, up"),
         ([{**GOOD, "value": [1, 2, None]}], "key 1: value [1, 2, None]: give three numbers: forward, left, up"),
+        ([{**GOOD, "time": 10**401}], "key 1: time inf: give seconds above 0, at most 60"),
+        ([{**GOOD, "time": 1e-320}], "key 1: time 9.99989e-321 is not 0.001 s after 0, the start of head position"),
+        ([{**GOOD, "value": [0, 10**401, 0]}], "key 1: value [0, inf, 0]: give three numbers"),
+        (f'[{{"time": {5000 * "9"}}}]', 'key 1: "part" is missing'),
         ([{**GOOD, "value": 4}], "key 1: value 4: give three numbers: forward, left, up"),
         ([{**GOOD, "value": [0, 30, 40]}], "value [0, 30, 40] has the length 50; at most 10 is done"),
         ([{**GOOD, "weight": 0}], "key 1: weight 0: give a number above 0, at most 1000"),
-        ([GOOD, GOOD], "key 2: time 0.5 is not after 0.5, the key before of head position"),
+        ([GOOD, GOOD], "key 2: time 0.5 is not 0.001 s after 0.5, the key before of head position"),
     ],
 )
 def test_malformed_json(tmp_path: Path, content: object, message: str) -> None:
@@ -101,6 +105,8 @@ def test_malformed_json(tmp_path: Path, content: object, message: str) -> None:
             "line 2: value [1.0, 2.0, 'up']: give three numbers: forward, left, up",
         ),
         (HEADER + "now,head,position,0,0,0\n", "line 2: time 'now': give seconds above 0, at most 60"),
+        (HEADER + f"1,head,position,0,0,{401 * '1'}\n", "line 2: value [0.0, 0.0, inf]: give three numbers"),
+        (HEADER + 131073 * "1", "not CSV (field larger than field limit (131072)); correct the file"),
         (HEADER + "1,head,position,0,0,nan\n", "line 2: value [0.0, 0.0, nan]: give three numbers"),
     ],
 )
@@ -116,6 +122,8 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         read_keyframes(tmp_path / "k.txt")
     with pytest.raises(UserError, match=r"none.csv: cannot be read \(No such file or directory\)"):
         read_keyframes(tmp_path / "none.csv")
+    with pytest.raises(UserError, match=r"a\\x00.json: no file can have this name"):
+        read_keyframes(Path("a\0.json"))
     (tmp_path / "k.json").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(UserError, match="not a text file"):
         read_keyframes(tmp_path / "k.json")

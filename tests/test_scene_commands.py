@@ -157,6 +157,7 @@ def test_plane_files_are_checked(tmp_path: Path) -> None:
         ("[]", "it has no planes"),
         ('{"planes": [{"normal": [1, 2]}]}', "plane 0 needs normal"),
         ('{"planes": [{"normal": [0, 0, 0], "offset": 1}]}', "a normal that is not zero"),
+        (f'{{"planes": [{{"normal": [0, 0, {401 * "1"}], "offset": 1}}]}}', "give four finite numbers"),
     ):
         path.write_text(text)
         with pytest.raises(UserError, match=message):

@@ -52,6 +52,10 @@ def test_a_json_script_is_the_same_as_its_line(tmp_path: Path) -> None:
         ("jump speed=2", "('jump speed=2'): 'speed' is unknown; jump takes distance, height"),
         ("trajectory", "('trajectory'): trajectory needs a file of key frames, as trajectory keys.json"),
         ("hop x60, hop x60", "--motion asks for 120 motions; at most 100 are done in a row"),
+        ("jump x2 x3", "('jump x2 x3'): 'x3' is a second number of repeats; give one"),
+        ("jump x" + 5000 * "9", "repeat inf; give a whole number from 1 to 100"),
+        ("jump distance=1 distance=2", "distance is given twice; give it once"),
+        ("jump 1 distance=2", "distance is given twice; give it once"),
         ("none.json", "none.json: cannot be read (No such file or directory); check the path"),
     ],
 )
@@ -73,6 +77,12 @@ def test_mistakes_of_a_line(line: str, message: str) -> None:
         ('[{"motion": "jump", "distance": true}]', "distance True: give a number of body heights from 0 to 10"),
         ('[{"motion": "trajectory", "file": 3}]', '"file" is 3; give the name of a file'),
         ('[{"motion": "jump", "file": "a.csv"}]', "jump takes distance, height"),
+        ('[{"motion": "jump", "distance": "0.5"}]', '"distance" is the text "0.5"; give a number without quotes'),
+        (
+            f'[{{"motion": "jump", "distance": {401 * "1"}}}]',
+            "distance inf: give a number of body heights from 0 to 10",
+        ),
+        (f'[{{"motion": "jump", "repeat": {5000 * "1"}}}]', '"repeat" is inf; give a whole number'),
     ],
 )
 def test_mistakes_of_a_file(tmp_path: Path, text: str, message: str) -> None:

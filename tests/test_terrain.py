@@ -49,6 +49,9 @@ def test_a_terrain_file(tmp_path: Path) -> None:
         ("[[[0, 0, 1]]]", "solid 1: give a list of faces, each four numbers [nx, ny, nz, d]"),
         ('[[[0, 0, 1, "a"]]]', "solid 1: give a list of faces, each four numbers [nx, ny, nz, d]"),
         ("[[[0, 0, 1, 0]], [[0, 0, 0, 1]]]", "solid 2: plane 0,0,0,1: give four finite numbers"),
+        (f"[[[0, 0, 1, {401 * '1'}]]]", "solid 1: plane 0,0,1,inf: give four finite numbers"),
+        (f"[[[0, 0, 1, {5000 * '1'}]]]", "solid 1: plane 0,0,1,inf: give four finite numbers"),
+        ("[[[1e300, 1e300, 1, 0]]]", "solid 1: plane 1e+300,1e+300,1,0: give four finite numbers"),
         (str([[[0, 0, 1, 0]]] * 65), "65 faces; at most 64 are handled"),
     ],
 )
@@ -67,4 +70,17 @@ def test_a_slope_that_nothing_stands_on_is_refused() -> None:
     assert str(error.value) == (
         "--gravity-up 1,0,0.5: that makes the ground a slope of 63 degrees; give a direction at most 45 degrees from"
         " the ground's normal 0,0,1"
+    )
+
+
+def test_a_solid_that_holds_the_body_is_named(tmp_path: Path) -> None:
+    """The second floor's normal points down into the body."""
+    thing = pawn(device="cpu")
+    path = tmp_path / "t.json"
+    path.write_text("[[[0, 1, 0, 9]], [[0, 0, 1, -3]]]")
+    with pytest.raises(UserError) as error:
+        make_creature(thing.cloud, plane=thing.plane, solids=read_terrain(path))
+    assert str(error.value) == (
+        "--terrain, solid 2: the body is inside it; inside is where n.x + d < 0 for every face [nx, ny, nz, d]:"
+        " turn the signs of a face, or move the solid"
     )

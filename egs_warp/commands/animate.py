@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from egs_warp.cli_input import check_device, guessed_up, parse_direction, parse_up
+from egs_warp.errors import UserError
 from egs_warp.scene_input import add_object_flags, plane_of, read_scene, say
 
 
@@ -38,8 +39,12 @@ def add_parser(commands) -> None:
     animate.add_argument(
         "--muscles", type=Path, help="JSON with fibres (docs/motions.md); else they are made automatically"
     )
-    animate.add_argument("--distance", type=float, help="of a jump or hop, body heights (0.5; 0.7)")
-    animate.add_argument("--height", type=float, help="rise of the centre of mass, body heights (0.2)")
+    animate.add_argument("--distance", type=float, help="body heights: of a jump (0.5), hop (0.7) or twist (0)")
+    animate.add_argument(
+        "--height",
+        type=float,
+        help="rise of the centre of mass, body heights: of a jump (0.2), hop (0.3) or twist (0.3)",
+    )
     animate.add_argument("--heading-degrees", type=float, help="of a twist, counter-clockwise from above (180)")
     animate.add_argument("--frames", type=int, help="length of the video at 60 Hz (until the body rests)")
     animate.add_argument("--size", type=int, help="pixels, both sides (512)")
@@ -126,12 +131,16 @@ def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
 
     numbers = ("distance", "height", "heading_degrees", "frames", "size", "seed", "metres_per_unit", "friction")
     given = {name: getattr(chosen, name) for name in numbers if getattr(chosen, name) is not None}
+    options = AnimateOptions(**given, shadow=not chosen.no_shadow)
+    # Single precision holds no lengths far beyond; ``make_body`` says which of these fit the body.
+    if options.metres_per_unit is not None and not 1e-9 <= options.metres_per_unit <= 1e9:
+        raise UserError(f"--metres-per-unit {options.metres_per_unit}: give a number from 1e-9 to 1e9")
     return {
         "motion": chosen.motion,
         "forward": parse_direction("forward", chosen.forward) if chosen.forward else None,
         "gravity_up": parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up else None,
         "muscles_file": chosen.muscles,
         "solids": read_terrain(chosen.terrain) if chosen.terrain else (),
-        "options": AnimateOptions(**given, shadow=not chosen.no_shadow),
+        "options": options,
         "source": Path(chosen.capture).name,
     }

@@ -13,7 +13,9 @@ def add_parser(commands) -> None:
     """Add the command to the subparsers ``commands``."""
     muscles = commands.add_parser("muscles", help="draw the muscles of a capture's body, automatic ones or your own")
     muscles.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog or an unbundled SOG folder")
-    muscles.add_argument("--plot", required=True, type=Path, help="picture.png with the body from three sides")
+    muscles.add_argument(
+        "--plot", required=True, type=Path, help="picture (.png, .jpg, ...) with the body from three sides"
+    )
     muscles.add_argument(
         "--muscles", type=Path, help="JSON with fibres (docs/motions.md); else they are made automatically"
     )
@@ -32,9 +34,10 @@ def _muscles(chosen: argparse.Namespace) -> int:
     from egs_warp.body import make_body
     from egs_warp.cage import build_cage
     from egs_warp.creature import body_muscles
-    from egs_warp.fibre_plot import plot_muscles
+    from egs_warp.fibre_plot import check_picture_name, plot_muscles
     from egs_warp.io import read_capture
 
+    check_picture_name(chosen.plot)
     up = parse_up(chosen.up) if chosen.up else None
     plane = plane_of(chosen.plane) if chosen.plane else None
     capture = read_capture(chosen.capture)
