@@ -56,6 +56,7 @@ class Follow:
         self._began: float | None = None
         self._end = max(key.time for key in self.keys)
         self._reached: dict[int, np.ndarray] = {}
+        self._turned = {name: np.zeros(3) for name in self.parts}
         self._ruled = {(channel.part, channel.quantity) for channel in self.channels}
 
     def planned(self) -> dict[str, float]:
@@ -77,8 +78,11 @@ class Follow:
         return notes
 
     def _miss(self, index: int) -> np.ndarray:
-        """(3,) value at the time of a key minus the key's, in its unit."""
-        return self._reached[index] - np.array(self.keys[index].value)
+        """(3,) from a key's value to that at its time, in its unit; of an orientation, the rotation between the two."""
+        key, reached = self.keys[index], self._reached[index]
+        if key.quantity is Quantity.ORIENTATION:
+            return turn_between(np.array(key.value), reached)
+        return reached - np.array(key.value)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
@@ -128,10 +132,8 @@ class Follow:
         if channel.quantity is Quantity.VELOCITY:
             return part_velocity(body, part, body.height * value, weight, axes)
         if channel.quantity is Quantity.ORIENTATION:
-            wanted = Rotation.from_rotvec(value, degrees=True)
-            ahead = Rotation.from_rotvec(value + dt * rate, degrees=True)
-            error = (wanted * Rotation.from_rotvec(now, degrees=True).inv()).as_rotvec()
-            turning = (ahead * wanted.inv()).as_rotvec() / dt + self._rate * error
+            before = value - dt * rate
+            turning = np.radians(turn_between(before, value) / dt + self._rate * turn_between(now, before))
             if whole:
                 return SpinObjective(body.inertia(state.positions) @ (self.ground.axes.T @ turning), weight)
             return part_turning(body, part, state, turning, weight, axes)
@@ -141,7 +143,7 @@ class Follow:
         return part_angular_momentum(body, part, state, momentum, weight, axes)
 
     def _measured(self, name: str, quantity: Quantity, state: BodyState) -> np.ndarray:
-        """(3,) in the unit of the quantity, axes of the ground."""
+        """(3,) in the unit of the quantity, axes of the ground; of a turn, the one that the body came by since the last look at it."""
         part, axes, height = self.parts[name], self.ground.axes, self.body.height
         if quantity is Quantity.POSITION:
             return axes @ (part.centre(state.positions) - part.centre(self._standing)) / height
@@ -150,10 +152,38 @@ class Follow:
         if quantity is Quantity.ORIENTATION:
             before, after = (x[part.nodes] - part.centre(x) for x in (self._standing, state.positions))
             turn = best_turn(part.masses, before, after)
-            return axes @ Rotation.from_matrix(turn).as_rotvec(degrees=True)
+            shorter = axes @ Rotation.from_matrix(turn).as_rotvec(degrees=True)
+            self._turned[name] = _lift_near(shorter, self._turned[name])
+            return self._turned[name]
         arms = state.positions[part.nodes] - part.centre(state.positions)
         spin = (part.masses[:, None] * np.cross(arms, state.velocities[part.nodes])).sum(axis=0)
         return axes @ spin / (self.body.mass * height**2)
 
 
 _LINEAR = (Quantity.POSITION, Quantity.VELOCITY)
+
+
+def turn_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """(3,) the rotation that leads from one orientation to another, all rotation vectors in degrees.
+
+    Its angle is at most 360: orientations a whole turn apart are told apart, those two turns apart are not.
+    """
+    (a, *u), (b, *v) = _quaternion(first), _quaternion(second)
+    w, axis = a * b + np.dot(u, v), a * np.array(v) - b * np.array(u) - np.cross(v, u)
+    sine = float(np.linalg.norm(axis))
+    return np.degrees(2.0 * np.arctan2(sine, w)) * (axis / sine if sine > 0.0 else np.array([0.0, 0.0, 1.0]))
+
+
+def _quaternion(turn: np.ndarray) -> np.ndarray:
+    """(4,) scalar first, of a rotation vector (3,) in degrees; of opposite sign for turns that differ by 360."""
+    half = 0.5 * np.radians(turn)
+    angle = float(np.linalg.norm(half))
+    return np.array([np.cos(angle), *(np.sinc(angle / np.pi) * half)])
+
+
+def _lift_near(turn: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """(3,) ``turn``, a rotation vector of at most 180 degrees, or the same rotation the longer way round if that is nearer to ``last``."""
+    if _quaternion(turn) @ _quaternion(last) >= 0.0:
+        return turn
+    angle = float(np.linalg.norm(turn))
+    return turn * (1.0 - 360.0 / angle) if angle > 0.0 else np.array([0.0, 0.0, 360.0])

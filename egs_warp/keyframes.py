@@ -29,7 +29,7 @@ class Quantity(Enum):
     VELOCITY = "velocity"
     """Body heights a second."""
     ORIENTATION = "orientation"
-    """Turn from the start as a rotation vector, degrees."""
+    """Turn from the start as a rotation vector, degrees; its length says the way round: 270 is not -90."""
     ANGULAR_MOMENTUM = "angular_momentum"
     """About the part's centre, body mass x height squared a second."""
 
@@ -41,7 +41,7 @@ LONGEST_TIME = 60.0
 LARGEST: Mapping[Quantity, float] = {
     Quantity.POSITION: 10.0,
     Quantity.VELOCITY: 20.0,
-    Quantity.ORIENTATION: 720.0,
+    Quantity.ORIENTATION: 360.0,
     Quantity.ANGULAR_MOMENTUM: 10.0,
 }
 """Length of a value beyond which it is refused as a slip of the pen."""

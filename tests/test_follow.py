@@ -100,3 +100,38 @@ def test_missed_keys_are_told_and_reached_ones_are_not(place: Place) -> None:
     assert follow.notes()[1] == "k.json, key 3: head position at 0.3 s was not reached in time"
     follow.objectives(BodyState(place.standing, 0 * place.standing, 0.4), None, DT)
     assert follow.phase is FollowPhase.REST and len(follow.notes()) == 1
+
+
+def spun(place: Place, degrees: float, time: float) -> BodyState:
+    """The block turned about up where it stands."""
+    centre = place.body.centre_of_mass(place.standing)
+    turn = Rotation.from_rotvec([0.0, 0.0, degrees], degrees=True)
+    return BodyState(centre + turn.apply(place.standing - centre), 0 * place.standing, time)
+
+
+@pytest.mark.parametrize("part", ["body", "head"])
+@pytest.mark.parametrize("asked", [170.0, 180.0, 270.0, 360.0, -360.0])
+def test_a_turn_is_reached_the_way_round_that_was_asked(place: Place, part: str, asked: float) -> None:
+    """A body that turns all the way misses nothing; by 10 degrees less, 10; one that does not turn, all of it."""
+    for share, miss in ((1.0, 0.0), (1.0 - 10.0 / abs(asked), 10.0), (0.0, abs(asked))):
+        follow = Follow(place, [key(1.0, part, Quantity.ORIENTATION, (0.0, 0.0, asked))])
+        for time in np.linspace(0.0, 1.0, 61):
+            follow.objectives(spun(place, share * time * asked, time), None, DT)
+        assert follow.planned()["worst_miss"] == pytest.approx(miss, abs=1e-6)
+        assert len(follow.notes()) == (miss > 36.0)
+
+
+@pytest.mark.parametrize("behind", [0.0, 20.0, 190.0])
+def test_a_turn_over_half_is_steered_the_way_round_that_was_asked(place: Place, behind: float) -> None:
+    """Late in a turn by 350 degrees the asked rate is that of the curve, and more for what the body is behind, however far."""
+    follow = Follow(place, [key(2.0, "body", Quantity.ORIENTATION, (0.0, 0.0, 350.0))])
+    (channel,), body = follow.channels, place.body
+    follow.objectives(spun(place, 0.0, 0.0), None, DT)
+    rates = []
+    for time in np.arange(1, 109) * DT:
+        value, rate = channel.at(time + DT)
+        state = spun(place, max((value - DT * rate)[2] - behind, 0.0), time)
+        (spin,) = [o for o in follow.objectives(state, None, DT) if isinstance(o, SpinObjective)]
+        rates.append(np.linalg.solve(body.inertia(state.positions), spin.target))
+    gain = 6.0 * np.sqrt(9.81 / body.height)
+    assert np.allclose(rates[-1], [0.0, 0.0, np.radians(rate[2] + gain * behind)], atol=1e-4)

@@ -74,6 +74,10 @@ def test_curve_passes_through_keys_starts_at_rest_and_never_overshoots(tmp_path:
         ([{**GOOD, "value": [1, 2, None]}], "key 1: value [1, 2, None]: give three numbers: forward, left, up"),
         ([{**GOOD, "value": 4}], "key 1: value 4: give three numbers: forward, left, up"),
         ([{**GOOD, "value": [0, 30, 40]}], "value [0, 30, 40] has the length 50; at most 10 is done"),
+        (
+            [{**GOOD, "quantity": "orientation", "value": [0, 0, -361]}],
+            "key 1: value [0, 0, -361] has the length 361; at most 360 is done",
+        ),
         ([{**GOOD, "weight": 0}], "key 1: weight 0: give a number above 0, at most 1000"),
         ([GOOD, GOOD], "key 2: time 0.5 is not after 0.5, the key before of head position"),
     ],
