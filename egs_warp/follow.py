@@ -125,7 +125,9 @@ class Follow:
         axes = Coordinates(self.ground.axes, False)
         value, rate = channel.at(elapsed + dt)
         now = self._measured(channel.part, channel.quantity, state)
-        weight = channel.weight * (self.weights.com if channel.quantity in _LINEAR else self.weights.spin)
+        # Sums of steps may end a hair after their key, so the middle of the step says on the way to which key it is.
+        weight = channel.weight_at(elapsed + 0.5 * dt)
+        weight *= self.weights.com if channel.quantity in _LINEAR else self.weights.spin
         if channel.quantity is Quantity.POSITION:
             target = body.height * (rate + self._rate * (value - now - dt * rate))
             return part_velocity(body, part, target, weight, axes)

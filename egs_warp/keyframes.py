@@ -58,7 +58,7 @@ class Key:
     quantity: Quantity
     value: tuple[float, float, float]
     weight: float = 1.0
-    """Relative to the motion's own."""
+    """Relative to the motion's own, on the way from the key before to this one."""
     where: str = ""
     """File and place in it, for messages."""
 
@@ -73,13 +73,18 @@ class Channel:
     """(k+1,) seconds, from 0."""
     values: np.ndarray
     """(k+1, 3)."""
-    weight: float
+    weights: np.ndarray
+    """(k,) of the keys."""
 
     def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Value (3,) and its rate (3,) per second."""
         inside = min(time, float(self.times[-1]))
         curve = PchipInterpolator(self.times, self.values, axis=0)
         return curve(inside), curve(inside, 1) * (time < self.times[-1])
+
+    def weight_at(self, time: float) -> float:
+        """That of the next key; after the last one, its own."""
+        return float(self.weights[min(np.searchsorted(self.times[1:], time), len(self.weights) - 1)])
 
 
 def read_keyframes(path: Path) -> tuple[Key, ...]:
@@ -112,7 +117,7 @@ def channels(keys: Sequence[Key]) -> tuple[Channel, ...]:
             quantity,
             np.array([0.0, *(key.time for key in group)]),
             np.array([(0.0, 0.0, 0.0), *(key.value for key in group)]),
-            float(np.mean([key.weight for key in group])),
+            np.array([key.weight for key in group]),
         )
         for (part, quantity), group in found.items()
     )

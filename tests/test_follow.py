@@ -70,6 +70,17 @@ def test_a_position_key_asks_for_the_speed_of_its_curve(place: Place) -> None:
     assert np.allclose(asked[0], [speed, 0.0, 0.0]) and asked[1][0] > 1.5 * speed
 
 
+def test_each_key_has_its_own_weight(place: Place) -> None:
+    """Of 1 and 9, the first key's holds until it is reached, the second's from then on."""
+    value = (0.1, 0.0, 0.0)
+    keys = [Key(time, "head", Quantity.POSITION, value, weight) for time, weight in ((6 * DT, 1.0), (12 * DT, 9.0))]
+    follow, found = Follow(place, keys), []
+    for index in range(14):
+        wishes = follow.objectives(BodyState(place.standing, 0 * place.standing, index * DT), None, DT)
+        found += [o.weight for o in wishes if isinstance(o, Objective) and o.name == "head velocity"]
+    assert found == [follow.weights.com] * 6 + [9.0 * follow.weights.com] * 8
+
+
 def test_keys_of_the_whole_body_replace_its_own_balance_or_spin(place: Place) -> None:
     state = BodyState(place.standing, 0 * place.standing)
     moving = Follow(place, [key(1.0, "body", Quantity.VELOCITY, (0.3, 0.0, 0.0))]).objectives(state, None, DT)

@@ -50,6 +50,12 @@ def test_curve_passes_through_keys_starts_at_rest_and_never_overshoots(tmp_path:
     assert channel.at(1.6)[1][0] == 0.0
 
 
+def test_a_weight_holds_on_the_way_to_its_key(tmp_path: Path) -> None:
+    entries = [{**GOOD, "time": t, "weight": w} for t, w in ((0.5, 1), (1.0, 9), (2.0, 4))]
+    (channel,) = channels(read_keyframes(written(tmp_path, "k.json", entries)))
+    assert [channel.weight_at(t) for t in (0.0, 0.5, 0.51, 1.0, 1.9, 2.0, 7.0)] == [1, 1, 9, 9, 4, 4, 4]
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
