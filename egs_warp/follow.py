@@ -9,6 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from egs_warp.body import BodyState, best_turn
+from egs_warp.errors import UserError
+from egs_warp.feet import find_feet
 from egs_warp.keyframes import Channel, Key, Quantity, channels
 from egs_warp.locomotion import StepReport
 from egs_warp.objectives import (
@@ -27,6 +29,8 @@ from egs_warp.stance import PoseFamily, Weights
 
 MISSED = 0.1
 """Of the largest value of its channel: a key missed by more is noted."""
+AHEAD = np.radians(15.0)
+"""A foot that is less than this to the right of straight ahead counts as straight ahead."""
 
 
 class FollowPhase(Enum):
@@ -40,14 +44,13 @@ class Follow:
     """The keys' own objectives, and beside them a standing body: balance, no spin, its shape, each unless a key rules it."""
 
     def __init__(self, place: Place, keys: Sequence[Key], *, weights: Weights | None = None) -> None:
+        """Raises ``UserError`` for a key of a part that the body does not have."""
         self.body, self.ground, self.weights = place.body, place.ground, weights or Weights()
         self.keys, self.channels = tuple(keys), channels(keys)
-        heights = place.ground.local(place.standing)[:, 2]
-        self.parts = {
-            "body": BodyPart.whole(self.body),
-            "base": BodyPart.base(self.body, heights),
-            "head": BodyPart.head(self.body, heights),
-        }
+        self.parts = {part.name: part for part in parts_of_body(place)}
+        for key in self.keys:
+            if key.part not in self.parts:
+                raise UserError(f"{key.where}: the body has no part {key.part!r}; it has {', '.join(self.parts)}")
         self.pose = PoseFamily(self.body, place.ground, place.standing, place.touching)
         self.phase = FollowPhase.FOLLOW
         self._standing = place.standing
@@ -163,6 +166,29 @@ class Follow:
 
 
 _LINEAR = (Quantity.POSITION, Quantity.VELOCITY)
+
+
+def parts_of_body(place: Place) -> list[BodyPart]:
+    """The parts that keys may name: the whole body, its base, its head and its feet.
+
+    A single foot is the base. Several are numbered anticlockwise as seen from above, from straight ahead on.
+    """
+    body, ground, standing = place.body, place.ground, place.standing
+    heights = (standing - ground.origin) @ ground.surface_normal
+    base = BodyPart.base(body, heights)
+    found = [BodyPart.whole(body), base, BodyPart.head(body, ground.local(standing)[:, 2])]
+    feet = find_feet(body.mesh, heights, body.height)
+    if len(feet) == 1:
+        return [*found, BodyPart("foot", base.nodes, base.masses)]
+    soles = np.array([ground.local(standing[foot.sole])[:, :2].mean(axis=0) for foot in feet])
+    ahead, left = (soles - soles.mean(axis=0)).T
+    # A foot straight ahead is the first, even if a little to the right.
+    order = np.argsort((np.arctan2(left, ahead) + AHEAD) % (2.0 * np.pi))
+    legs = [feet[index].leg for index in order]
+    return found + [
+        BodyPart.of(body, f"foot {number}", base.nodes[leg[base.nodes] > 0.0])
+        for number, leg in enumerate(legs, start=1)
+    ]
 
 
 def turn_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -34,8 +35,10 @@ class Quantity(Enum):
     """About the part's centre, body mass x height squared a second."""
 
 
-PARTS = ("body", "base", "head")
-"""Parts that a key may name: the whole body (of which the position is that of the centre of mass), what stands on the ground, the top."""
+PARTS = ("body", "base", "head", "foot")
+"""Parts that a key may name: the whole body (of which the position is that of the centre of mass), what stands on the ground, the top,
+the only foot. Feet of a body with several have numbers, as ``foot 2``."""
+_NUMBERED_FOOT = re.compile(r"foot [1-9]\d?")
 LONGEST_TIME = 60.0
 """Seconds."""
 LARGEST: Mapping[Quantity, float] = {
@@ -176,8 +179,10 @@ def _key(entry: Mapping[str, Any], where: str) -> Key:
         if name not in _FIELDS:
             raise UserError(f'{where}: "{name}" is unknown; a key has {", ".join(_FIELDS)}')
     part, quantity, value = entry["part"], entry["quantity"], entry["value"]
-    if part not in PARTS:
-        raise UserError(f"{where}: part {part!r} is unknown; give one of {', '.join(PARTS)}")
+    if part not in PARTS and not (isinstance(part, str) and _NUMBERED_FOOT.fullmatch(part)):
+        raise UserError(
+            f"{where}: part {part!r} is unknown; give one of {', '.join(PARTS)}, or of several feet foot 1, foot 2, ..."
+        )
     names = [member.value for member in Quantity]
     if quantity not in names:
         raise UserError(f"{where}: quantity {quantity!r} is unknown; give one of {', '.join(names)}")

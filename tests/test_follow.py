@@ -7,13 +7,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from egs_warp.body import BodyState, make_body
+from egs_warp.errors import UserError
 from egs_warp.follow import Follow, FollowPhase
 from egs_warp.keyframes import Key, Quantity
 from egs_warp.objectives import Objective, SpinObjective
 from egs_warp.plane import Plane
 from egs_warp.sequence import Place
 from egs_warp.stance import Ground
+from egs_warp.tetmesh import TetMesh
 from tests.meshes import block_mesh
+from tests.test_skeleton import figure, stool
 
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 DT = 1 / 60
@@ -21,7 +24,11 @@ DT = 1 / 60
 
 @pytest.fixture
 def place() -> Place:
-    mesh = block_mesh()
+    return stood(block_mesh())
+
+
+def stood(mesh: TetMesh) -> Place:
+    """A body of ``mesh`` at rest; forward is +y."""
     body = make_body(mesh, FLOOR, device="cpu")
     ground = Ground.on(FLOOR, np.array([0.0, 1.0, 0.0]), body.centre_of_mass(mesh.nodes))
     return Place(body, ground, mesh.nodes, mesh.nodes[mesh.nodes[:, 2] < 1e-9], DT)
@@ -31,7 +38,7 @@ def key(time: float, part: str, quantity: Quantity, value: tuple[float, float, f
     return Key(time, part, quantity, value, where="k.json, key 1")
 
 
-@pytest.mark.parametrize("part", ["body", "base", "head"])
+@pytest.mark.parametrize("part", ["body", "base", "head", "foot"])
 def test_each_quantity_is_measured_in_its_unit_along_forward_left_up(place: Place, part: str) -> None:
     """A rigid motion: forward is +y, left is -x; lengths over H, spin over m H^2."""
     body, height = place.body, place.body.height
@@ -93,6 +100,37 @@ def test_keys_of_the_whole_body_replace_its_own_balance_or_spin(place: Place) ->
     (turn,) = [o for o in turning if isinstance(o, SpinObjective)]
     rate = np.linalg.solve(place.body.inertia(state.positions), turn.target)
     assert rate[2] > 0.0 and np.abs(rate[:2]).max() < 1e-6 * rate[2]
+
+
+def test_feet_are_numbered_anticlockwise_from_straight_ahead() -> None:
+    """Forward is +y and left -x: of a stool front left, back left, back right, front right; of a figure left, right."""
+    for mesh, corners in (
+        (stool(), [(-1, 1), (-1, -1), (1, -1), (1, 1)]),
+        (figure(), [(-1, 0), (1, 0)]),
+    ):
+        place = stood(mesh)
+        follow = Follow(place, [key(0.5, "foot 2", Quantity.POSITION, (0.0, 0.0, 0.1))])
+        feet = [part for name, part in follow.parts.items() if name.startswith("foot ")]
+        assert [part.name for part in feet] == [f"foot {n + 1}" for n in range(len(corners))]
+        assert [tuple(np.sign(np.round(part.centre(mesh.nodes)[:2], 1)).astype(int)) for part in feet] == corners
+        together = np.sort(np.concatenate([part.nodes for part in feet]))
+        assert np.array_equal(together, follow.parts["base"].nodes)
+        still = BodyState(place.standing, 0 * place.standing)
+        (lift,) = [o for o in follow.objectives(still, None, DT) if isinstance(o, Objective) and "foot" in o.name]
+        pulled = np.flatnonzero(np.abs(lift.rows).sum(axis=0).reshape(-1, 3).any(axis=1))
+        assert lift.name == "foot 2 velocity" and np.array_equal(pulled, feet[1].nodes)
+        assert np.allclose(lift.target[:2], 0.0) and lift.target[2] > 0.0
+
+
+def test_a_part_that_the_body_does_not_have_is_refused_with_those_that_it_has(place: Place) -> None:
+    """The one foot of a block is its base."""
+    parts = Follow(place, [key(0.5, "foot", Quantity.POSITION, (0.0, 0.0, 0.1))]).parts
+    assert np.array_equal(parts["foot"].nodes, parts["base"].nodes)
+    with pytest.raises(UserError) as error:
+        Follow(place, [key(0.5, "foot 1", Quantity.POSITION, (0.0, 0.0, 0.1))])
+    assert str(error.value) == "k.json, key 1: the body has no part 'foot 1'; it has body, base, head, foot"
+    with pytest.raises(UserError, match=r"has no part 'foot'; it has body, base, head, foot 1, foot 2$"):
+        Follow(stood(figure()), [key(0.5, "foot", Quantity.POSITION, (0.0, 0.0, 0.1))])
 
 
 def test_missed_keys_are_told_and_reached_ones_are_not(place: Place) -> None:

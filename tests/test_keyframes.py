@@ -50,6 +50,11 @@ def test_curve_passes_through_keys_starts_at_rest_and_never_overshoots(tmp_path:
     assert channel.at(1.6)[1][0] == 0.0
 
 
+def test_feet_have_numbers(tmp_path: Path) -> None:
+    path = written(tmp_path, "k.csv", HEADER + "0.5,foot 12,position,0,0,0.1\n0.5,foot,position,0,0,0.1\n")
+    assert [k.part for k in read_keyframes(path)] == ["foot 12", "foot"]
+
+
 def test_a_weight_holds_on_the_way_to_its_key(tmp_path: Path) -> None:
     entries = [{**GOOD, "time": t, "weight": w} for t, w in ((0.5, 1), (1.0, 9), (2.0, 4))]
     (channel,) = channels(read_keyframes(written(tmp_path, "k.json", entries)))
@@ -68,7 +73,12 @@ def test_a_weight_holds_on_the_way_to_its_key(tmp_path: Path) -> None:
             [GOOD, {**GOOD, "time": 1, "speed": 3}],
             'key 2: "speed" is unknown; a key has time, part, quantity, value, weight',
         ),
-        ([{**GOOD, "part": "tail"}], "key 1: part 'tail' is unknown; give one of body, base, head"),
+        (
+            [{**GOOD, "part": "tail"}],
+            "key 1: part 'tail' is unknown; give one of body, base, head, foot, or of several feet foot 1",
+        ),
+        ([{**GOOD, "part": "foot 0"}], "key 1: part 'foot 0' is unknown"),
+        ([{**GOOD, "part": ["head"]}], "key 1: part ['head'] is unknown"),
         (
             [{**GOOD, "quantity": "mood"}],
             "quantity 'mood' is unknown; give one of position, velocity, orientation, angular_momentum",
