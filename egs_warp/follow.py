@@ -12,6 +12,7 @@ from egs_warp.body import BodyState, best_turn
 from egs_warp.errors import UserError
 from egs_warp.feet import find_feet
 from egs_warp.keyframes import Channel, Key, Quantity, channels
+from egs_warp.leap import CALM
 from egs_warp.locomotion import StepReport
 from egs_warp.objectives import (
     BodyPart,
@@ -31,12 +32,17 @@ MISSED = 0.1
 """Of the largest value of its channel: a key missed by more is noted."""
 AHEAD = np.radians(15.0)
 """A foot that is less than this to the right of straight ahead counts as straight ahead."""
+CALM_TIME = 0.3
+"""Of sqrt(H / g): for how long the body is slow, after the last key, before it is at rest; as after a jump."""
+LONGEST_HOLD = 9.0
+"""Of sqrt(H / g): at most for how long that is waited for."""
 
 
 class FollowPhase(Enum):
     """Phases of a trajectory."""
 
     FOLLOW = "follow"
+    HOLD = "hold"
     REST = "rest"
 
 
@@ -58,9 +64,10 @@ class Follow:
         self._rate = 6.0 * float(np.sqrt(self._gravity / self.body.height))
         self._began: float | None = None
         self._end = max(key.time for key in self.keys)
+        self._calm_since: float | None = None
+        self._restless = False
         self._reached: dict[int, np.ndarray] = {}
         self._turned = {name: np.zeros(3) for name in self.parts}
-        self._ruled = {(channel.part, channel.quantity) for channel in self.channels}
 
     def planned(self) -> dict[str, float]:
         """How many keys there are, how long they take (seconds), and the worst miss so far, in the unit of its quantity."""
@@ -68,7 +75,7 @@ class Follow:
         return {"keys": float(len(self.keys)), "duration": self._end, "worst_miss": max(misses, default=0.0)}
 
     def notes(self) -> list[str]:
-        """Which keys were missed."""
+        """Which keys were missed, and whether the body never came to rest."""
         notes = []
         for index, key in enumerate(self.keys):
             group = [np.linalg.norm(k.value) for k in self.keys if (k.part, k.quantity) == (key.part, key.quantity)]
@@ -78,6 +85,8 @@ class Follow:
             elif np.linalg.norm(self._miss(index)) > MISSED * max(group):
                 told = ", ".join(f"{value:.3g}" for value in self._reached[index])
                 notes.append(f"{name}: reached ({told})")
+        if self._restless:
+            notes.append("the body was not yet at rest when the time for it, after the last key, was up")
         return notes
 
     def _miss(self, index: int) -> np.ndarray:
@@ -95,14 +104,33 @@ class Follow:
         for index, key in enumerate(self.keys):
             if index not in self._reached and elapsed >= key.time - 0.5 * dt:
                 self._reached[index] = self._measured(key.part, key.quantity, state)
-        if elapsed > self._end:
-            self.phase = FollowPhase.REST
+        self._advance_phase(state, elapsed)
+        # Where a part is, is held after its last key; how fast it goes, is not.
+        ruling = [c for c in self.channels if c.quantity in _HELD or elapsed < c.times[-1] - 0.5 * dt]
         return [
-            *self._standing_objectives(state, report, dt),
-            *(self._keyed(channel, state, elapsed, dt) for channel in self.channels),
+            *self._standing_objectives(state, report, dt, {(channel.part, channel.quantity) for channel in ruling}),
+            *(self._keyed(channel, state, elapsed, dt) for channel in ruling),
         ]
 
-    def _standing_objectives(self, state, report, dt: float) -> list[Objective | SpinObjective]:
+    def _advance_phase(self, state: BodyState, elapsed: float) -> None:
+        """After the last key the body holds still until its centre of mass has been slow for a while, or time is up."""
+        if self.phase is FollowPhase.FOLLOW and elapsed > self._end:
+            self.phase = FollowPhase.HOLD
+        if self.phase is not FollowPhase.HOLD:
+            return
+        time_unit, speed = np.sqrt(self.body.height / self._gravity), self.body.centre_of_mass(state.velocities)
+        if np.linalg.norm(speed) > CALM * np.sqrt(self._gravity * self.body.height):
+            self._calm_since = None
+        elif self._calm_since is None:
+            self._calm_since = elapsed
+        calm = self._calm_since is not None and elapsed - self._calm_since > CALM_TIME * time_unit
+        late = elapsed - self._end > LONGEST_HOLD * time_unit
+        if calm or late:
+            self.phase, self._restless = FollowPhase.REST, not calm
+
+    def _standing_objectives(
+        self, state: BodyState, report: StepReport | None, dt: float, ruled: set[tuple[str, Quantity]]
+    ) -> list[Objective | SpinObjective]:
         seen = self.pose.measure(state, report)
         balance = np.array([*(seen.base - self.pose.base_offset), self.pose.standing_height])
         rules: list[Objective | SpinObjective] = []
@@ -110,9 +138,9 @@ class Follow:
         acceleration = (velocity - seen.velocity) / dt
         level = self.pose.balanced_acceleration(seen, acceleration[:2], float(acceleration[2]), self._gravity)
         velocity[:2] = seen.velocity[:2] + dt * level
-        if not {("body", Quantity.POSITION), ("body", Quantity.VELOCITY)} & self._ruled:
+        if not {("body", Quantity.POSITION), ("body", Quantity.VELOCITY)} & ruled:
             rules.append(centre_of_mass_velocity(self.body, self.ground.axes.T @ velocity, self.weights.com))
-        if not {("body", Quantity.ORIENTATION), ("body", Quantity.ANGULAR_MOMENTUM)} & self._ruled:
+        if not {("body", Quantity.ORIENTATION), ("body", Quantity.ANGULAR_MOMENTUM)} & ruled:
             pose = self.pose.over_base(seen.com, seen.base, seen.heading)
             spin = self.body.inertia(state.positions) @ (self.pose.turn_towards(state, pose) * 0.7 * self._rate)
             rules.append(SpinObjective(spin, self.weights.spin))
@@ -166,6 +194,7 @@ class Follow:
 
 
 _LINEAR = (Quantity.POSITION, Quantity.VELOCITY)
+_HELD = (Quantity.POSITION, Quantity.ORIENTATION)
 
 
 def parts_of_body(place: Place) -> list[BodyPart]:

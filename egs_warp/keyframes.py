@@ -68,7 +68,7 @@ class Key:
 
 @dataclass(frozen=True)
 class Channel:
-    """All keys of one part and quantity, joined by a monotone cubic; at rest at time 0 and after the last key."""
+    """All keys of one part and quantity, joined by a monotone cubic from zero at time 0; after the last key its value stays."""
 
     part: str
     quantity: Quantity

@@ -148,7 +148,38 @@ def test_missed_keys_are_told_and_reached_ones_are_not(place: Place) -> None:
     assert follow.notes()[0].startswith("k.json, key 2: head position at 0.2 s: reached (0.12, ")
     assert follow.notes()[1] == "k.json, key 3: head position at 0.3 s was not reached in time"
     follow.objectives(BodyState(place.standing, 0 * place.standing, 0.4), None, DT)
-    assert follow.phase is FollowPhase.REST and len(follow.notes()) == 1
+    assert follow.phase is FollowPhase.HOLD and len(follow.notes()) == 1
+
+
+def drifting(place: Place, speed: float, time: float) -> BodyState:
+    """The body standing at its place with ``speed`` forward, in sqrt(g H)."""
+    velocity = speed * np.sqrt(9.81 * place.body.height) * place.ground.axes[0]
+    return BodyState(place.standing, np.tile(velocity, (len(place.standing), 1)), time)
+
+
+def test_a_trajectory_rests_once_the_body_is_slow_and_at_last_in_any_case(place: Place) -> None:
+    """Slow from some time on, it rests 0.3 sqrt(H / g) later; never slow, 9 sqrt(H / g) after the last key, which is noted."""
+    unit = np.sqrt(place.body.height / 9.81)
+    for slow_from, rest in ((0.0, 0.5 + 0.3 * unit), (1.2, 1.2 + 0.3 * unit), (np.inf, 0.5 + 9.0 * unit)):
+        follow = Follow(place, [key(0.5, "head", Quantity.POSITION, (0.0, 0.0, 0.0))])
+        rested = None
+        for time in np.arange(240) * DT:
+            follow.objectives(drifting(place, 0.025 if time > slow_from else 0.035, time), None, DT)
+            if follow.phase is FollowPhase.REST and rested is None:
+                rested = time
+        assert rested == pytest.approx(rest, abs=2.5 * DT)
+        assert len(follow.notes()) == (slow_from == np.inf)
+
+
+def test_places_are_held_after_their_last_key_and_speeds_are_not(place: Place) -> None:
+    """After a body velocity the balance rules again; a head position stays asked for."""
+    keys = [key(0.1, "body", Quantity.VELOCITY, (0.3, 0.0, 0.0)), key(0.2, "head", Quantity.POSITION, (0.1, 0.0, 0.0))]
+    follow = Follow(place, keys)
+    names = []
+    for time in (0.0, 0.05, 0.1, 0.3):
+        wishes = follow.objectives(BodyState(place.standing, 0 * place.standing, time), None, DT)
+        names.append({o.name for o in wishes if isinstance(o, Objective)})
+    assert names == [{"pose", "body velocity", "head velocity"}] * 2 + [{"pose", "com", "head velocity"}] * 2
 
 
 def spun(place: Place, degrees: float, time: float) -> BodyState:
