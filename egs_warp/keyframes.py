@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -29,13 +30,15 @@ class Quantity(Enum):
     VELOCITY = "velocity"
     """Body heights a second."""
     ORIENTATION = "orientation"
-    """Turn from the start as a rotation vector, degrees."""
+    """Turn from the start as a rotation vector, degrees; its length says the way round: 270 is not -90."""
     ANGULAR_MOMENTUM = "angular_momentum"
     """About the part's centre, body mass x height squared a second."""
 
 
-PARTS = ("body", "base", "head")
-"""Parts that a key may name: the whole body (of which the position is that of the centre of mass), what stands on the ground, the top."""
+PARTS = ("body", "base", "head", "foot")
+"""Parts that a key may name: the whole body (of which the position is that of the centre of mass), what stands on the ground, the top,
+the only foot. Feet of a body with several have numbers, as ``foot 2``."""
+_NUMBERED_FOOT = re.compile(r"foot [1-9]\d?")
 LONGEST_TIME = 60.0
 """Seconds."""
 SHORTEST_GAP = 0.001
@@ -43,7 +46,7 @@ SHORTEST_GAP = 0.001
 LARGEST: Mapping[Quantity, float] = {
     Quantity.POSITION: 10.0,
     Quantity.VELOCITY: 20.0,
-    Quantity.ORIENTATION: 720.0,
+    Quantity.ORIENTATION: 360.0,
     Quantity.ANGULAR_MOMENTUM: 10.0,
 }
 """Length of a value beyond which it is refused as a slip of the pen."""
@@ -60,14 +63,14 @@ class Key:
     quantity: Quantity
     value: tuple[float, float, float]
     weight: float = 1.0
-    """Relative to the motion's own."""
+    """Relative to the motion's own, on the way from the key before to this one."""
     where: str = ""
     """File and place in it, for messages."""
 
 
 @dataclass(frozen=True)
 class Channel:
-    """All keys of one part and quantity, joined by a monotone cubic; at rest at time 0 and after the last key."""
+    """All keys of one part and quantity, joined by a monotone cubic from zero at time 0; after the last key its value stays."""
 
     part: str
     quantity: Quantity
@@ -75,13 +78,18 @@ class Channel:
     """(k+1,) seconds, from 0."""
     values: np.ndarray
     """(k+1, 3)."""
-    weight: float
+    weights: np.ndarray
+    """(k,) of the keys."""
 
     def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Value (3,) and its rate (3,) per second."""
         inside = min(time, float(self.times[-1]))
         curve = PchipInterpolator(self.times, self.values, axis=0)
         return curve(inside), curve(inside, 1) * (time < self.times[-1])
+
+    def weight_at(self, time: float) -> float:
+        """That of the next key; after the last one, its own."""
+        return float(self.weights[min(np.searchsorted(self.times[1:], time), len(self.weights) - 1)])
 
 
 def read_keyframes(path: Path) -> tuple[Key, ...]:
@@ -115,7 +123,7 @@ def channels(keys: Sequence[Key]) -> tuple[Channel, ...]:
             quantity,
             np.array([0.0, *(key.time for key in group)]),
             np.array([(0.0, 0.0, 0.0), *(key.value for key in group)]),
-            float(np.mean([key.weight for key in group])),
+            np.array([key.weight for key in group]),
         )
         for (part, quantity), group in found.items()
     )
@@ -177,8 +185,10 @@ def _key(entry: Mapping[str, Any], where: str) -> Key:
         if name not in _FIELDS:
             raise UserError(f'{where}: "{name}" is unknown; a key has {", ".join(_FIELDS)}')
     part, quantity, value = entry["part"], entry["quantity"], entry["value"]
-    if part not in PARTS:
-        raise UserError(f"{where}: part {part!r} is unknown; give one of {', '.join(PARTS)}")
+    if part not in PARTS and not (isinstance(part, str) and _NUMBERED_FOOT.fullmatch(part)):
+        raise UserError(
+            f"{where}: part {part!r} is unknown; give one of {', '.join(PARTS)}, or of several feet foot 1, foot 2, ..."
+        )
     names = [member.value for member in Quantity]
     if quantity not in names:
         raise UserError(f"{where}: quantity {quantity!r} is unknown; give one of {', '.join(names)}")

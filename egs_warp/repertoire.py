@@ -22,8 +22,8 @@ FRAMES: Mapping[str, int] = {"jump": 120, "hop": 150, "twist": 480, "walk": 170}
 """Frames at 60 Hz within which a motion of each kind comes to rest; one that takes longer is cut off."""
 STEP_FRAMES = 36
 """Frames of each step of a walk, on top."""
-TRAJECTORY_TAIL = 30
-"""Frames shown after the last key of a trajectory."""
+TRAJECTORY_TAIL = 200
+"""Frames after the last key of a trajectory within which the body is at rest."""
 
 
 def _jump(asked: Mapping[str, float], place: Place) -> BodyMotion:

@@ -50,6 +50,17 @@ def test_curve_passes_through_keys_starts_at_rest_and_never_overshoots(tmp_path:
     assert channel.at(1.6)[1][0] == 0.0
 
 
+def test_feet_have_numbers(tmp_path: Path) -> None:
+    path = written(tmp_path, "k.csv", HEADER + "0.5,foot 12,position,0,0,0.1\n0.5,foot,position,0,0,0.1\n")
+    assert [k.part for k in read_keyframes(path)] == ["foot 12", "foot"]
+
+
+def test_a_weight_holds_on_the_way_to_its_key(tmp_path: Path) -> None:
+    entries = [{**GOOD, "time": t, "weight": w} for t, w in ((0.5, 1), (1.0, 9), (2.0, 4))]
+    (channel,) = channels(read_keyframes(written(tmp_path, "k.json", entries)))
+    assert [channel.weight_at(t) for t in (0.0, 0.5, 0.51, 1.0, 1.9, 2.0, 7.0)] == [1, 1, 9, 9, 4, 4, 4]
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -62,7 +73,12 @@ def test_curve_passes_through_keys_starts_at_rest_and_never_overshoots(tmp_path:
             [GOOD, {**GOOD, "time": 1, "speed": 3}],
             'key 2: "speed" is unknown; a key has time, part, quantity, value, weight',
         ),
-        ([{**GOOD, "part": "tail"}], "key 1: part 'tail' is unknown; give one of body, base, head"),
+        (
+            [{**GOOD, "part": "tail"}],
+            "key 1: part 'tail' is unknown; give one of body, base, head, foot, or of several feet foot 1",
+        ),
+        ([{**GOOD, "part": "foot 0"}], "key 1: part 'foot 0' is unknown"),
+        ([{**GOOD, "part": ["head"]}], "key 1: part ['head'] is unknown"),
         (
             [{**GOOD, "quantity": "mood"}],
             "quantity 'mood' is unknown; give one of position, velocity, orientation, angular_momentum",
@@ -78,6 +94,10 @@ def test_curve_passes_through_keys_starts_at_rest_and_never_overshoots(tmp_path:
         (f'[{{"time": {5000 * "9"}}}]', 'key 1: "part" is missing'),
         ([{**GOOD, "value": 4}], "key 1: value 4: give three numbers: forward, left, up"),
         ([{**GOOD, "value": [0, 30, 40]}], "value [0, 30, 40] has the length 50; at most 10 is done"),
+        (
+            [{**GOOD, "quantity": "orientation", "value": [0, 0, -361]}],
+            "key 1: value [0, 0, -361] has the length 361; at most 360 is done",
+        ),
         ([{**GOOD, "weight": 0}], "key 1: weight 0: give a number above 0, at most 1000"),
         ([GOOD, GOOD], "key 2: time 0.5 is not 0.001 s after 0.5, the key before of head position"),
     ],
