@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from egs_warp.body import BodyState
 from egs_warp.creature import first_place, make_creature
+from egs_warp.follow import Follow
 from egs_warp.hop import Hop
+from egs_warp.keyframes import Quantity
 from egs_warp.plane import Plane
 from egs_warp.repertoire import longest, parts_of
 from egs_warp.scenes import pawn
@@ -71,3 +76,17 @@ def test_hops_land_on_their_squares(script: str, ground: dict) -> None:
         assert isinstance(done.motion, Hop)
         assert done.motion.miss(end) <= 0.1 * done.motion.target.distance
         assert result.tilt_degrees < 12.0 and result.airborne_frames > 10.0
+
+
+@pytest.mark.slow
+def test_the_head_follows_its_key_and_the_body_comes_to_rest(tmp_path: Path) -> None:
+    """The key asks for 0.05; measured on two cores, it is missed by 0.0002. A body that only stands misses it by 0.05."""
+    file = tmp_path / "keys.csv"
+    file.write_text("time,part,quantity,x,y,z\n0.5,head,position,0.05,0,0\n")
+    sequence, (reached,), (end,) = run(f"trajectory {file}")
+    follow = sequence.done[0].motion
+    assert isinstance(follow, Follow) and sequence.finished and follow.notes() == []
+    assert follow.planned()["worst_miss"] < 0.002
+    held = follow._measured("head", Quantity.POSITION, BodyState(end, 0 * end))
+    assert np.allclose(held, [0.05, 0.0, 0.0], atol=0.002)
+    assert reached.tilt_degrees < 2.0 and reached.airborne_frames == 0.0
