@@ -19,7 +19,7 @@ from egs_warp.plane import Plane
 from egs_warp.plane_file import read_planes, write_planes
 from egs_warp.render import render
 from egs_warp.render.ground import CapturedScene, ContactShadow
-from egs_warp.scene_pipeline import SceneOptions, prepare_scene, viewing_direction
+from egs_warp.scene_pipeline import PreparedScene, SceneOptions, prepare_scene, viewing_direction
 from egs_warp.segmentation import ObjectSpec, masks_from_selection
 from tests.test_segmentation import FLOOR, ball_on_floor
 
@@ -42,6 +42,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     away = Camera.look_at(np.array([0.0, 0.0, 9.0]), np.array([0.0, 1.0, 20.0]), np.eye(3)[1], width=96, height=96)
     write_cameras(path / "away.json", [away], ["photo1.png"])
     return path
+
+
+@pytest.fixture(scope="module")
+def prepared() -> PreparedScene:
+    """The ball taken off its floor, whose hole is left."""
+    options = SceneOptions(clearing=Clearing.SPLIT, inpaint=False)
+    return prepare_scene(ball_on_floor()[0], ObjectSpec(point=np.array([0.0, -0.5, 0.5])), options=options)
 
 
 def test_plane_then_segment_take_each_others_files(folder: Path, tmp_path: Path) -> None:
@@ -218,6 +225,50 @@ def test_the_shadow_lies_on_an_uneven_floor_without_an_edge() -> None:
     assert uneven[right].sum() > 0.8 * even[right].sum()
     assert terrace[right].sum() < 0.3 * even[right].sum()
     assert np.abs(np.diff(terrace, axis=1)).max() < 1.5 * np.abs(np.diff(even, axis=1)).max()
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--motion", "nothing"], "unknown motion 'nothing'"),
+        (["--motion", "twist 180", "--distance", "nan"], "--distance nan"),
+        (["--motion", "trajectory {tmp}/no.json"], "no.json: cannot be read"),
+        (["--muscles", "{tmp}/no.json"], "no.json: cannot be read"),
+        (["--terrain", "{tmp}/no.json"], "no.json: cannot be read"),
+    ],
+)
+def test_a_slip_is_told_before_the_scene_is_taken_apart(
+    folder: Path,
+    tmp_path: Path,
+    flags: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def too_late(*_: object, **__: object) -> None:
+        pytest.fail("the scene is being taken apart")
+
+    monkeypatch.setattr("egs_warp.scene_pipeline.prepare_scene", too_late)
+    given = [flag.format(tmp=tmp_path) for flag in flags]
+    scene = ["animate", str(folder / "scene.ply"), "--object", "0,0,0.5", "--out", str(tmp_path / "out")]
+    assert main([*scene, *given]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_an_animation_that_fails_loses_none_of_the_parts(
+    folder: Path, tmp_path: Path, prepared: PreparedScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_: object, **__: object) -> None:
+        raise UserError("animate: cannot")
+
+    monkeypatch.setattr("egs_warp.scene_pipeline.prepare_scene", lambda *_, **__: prepared)
+    monkeypatch.setattr("egs_warp.animation.animate", failing)
+    out = tmp_path / "out"
+    assert main(["animate", str(folder / "scene.ply"), "--object", "0,0,0.5", "--out", str(out)]) == 2
+    assert read_capture(out / "object.ply").cloud.count == prepared.object.count
+    assert read_capture(out / "background.ply").cloud.count == prepared.background.count
+    assert (out / "plane.json").is_file()
 
 
 def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:

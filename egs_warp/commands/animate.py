@@ -104,6 +104,8 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[dict, str]:
         options=SceneOptions(inpaint=not chosen.no_inpaint),
         progress=lambda stage: say(f"{stage} ..."),
     )
+    # Whatever goes wrong later, the minutes that these took are not lost.
+    scene.write(folder)
     for note in scene.notes:
         say(note)
     report = animate(
@@ -115,23 +117,30 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[dict, str]:
         notes=(*given.notes, *scene.notes),
         **asked,
     )
-    scene.write(folder)
     return report, ", object.ply, background.ply, plane.json"
 
 
 def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
-    """What the flags say of the motion, as arguments of ``animate``."""
+    """What the flags say of the motion, as arguments of ``animate``. Raises ``UserError`` for what can be told at once."""
     from egs_warp.animation import AnimateOptions
+    from egs_warp.repertoire import longest
+    from egs_warp.script import parse_script
     from egs_warp.terrain import read_terrain
+    from egs_warp.user_files import parse_json, read_text
 
     numbers = ("distance", "height", "heading_degrees", "frames", "size", "seed", "metres_per_unit", "friction")
     given = {name: getattr(chosen, name) for name in numbers if getattr(chosen, name) is not None}
+    options = AnimateOptions(**given, shadow=not chosen.no_shadow)
+    # The files of key frames are read, too.
+    longest(parse_script(chosen.motion, defaults=options.targets()))
+    if chosen.muscles is not None:
+        parse_json(read_text(chosen.muscles), chosen.muscles)
     return {
         "motion": chosen.motion,
         "forward": parse_direction("forward", chosen.forward) if chosen.forward else None,
         "gravity_up": parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up else None,
         "muscles_file": chosen.muscles,
         "solids": read_terrain(chosen.terrain) if chosen.terrain else (),
-        "options": AnimateOptions(**given, shadow=not chosen.no_shadow),
+        "options": options,
         "source": Path(chosen.capture).name,
     }
