@@ -29,6 +29,7 @@ from egs_warp.segmentation import CELLS, ObjectSpec, Segmentation, segment, vote
 
 if TYPE_CHECKING:
     from egs_warp.finetune import TrainingView
+    from egs_warp.inpainters import Inpainter
 
 _PLANE_ELEVATIONS = (40.0, 58.0, 75.0)
 """Degrees: seen at a grazing angle, splats in front hide those behind, and the floor seems to lie higher."""
@@ -52,6 +53,8 @@ class SceneOptions:
     clearing: Clearing | None = None
     """None: fine-tuning where PyTorch is installed, else the static split."""
     inpaint: bool = True
+    inpainter: Inpainter | None = None
+    """None: patch synthesis."""
     clearing_options: ClearingOptions = field(default_factory=ClearingOptions)
 
 
@@ -129,7 +132,12 @@ def prepare_scene(
 
         steps = {} if has_torch() else {"steps": 0}
         try:
-            result = inpaint(bare, hole_under(cloud, located), options=InpaintOptions(margin=_HOLE_MARGIN, **steps))
+            result = inpaint(
+                bare,
+                hole_under(cloud, located),
+                inpainter=options.inpainter,
+                options=InpaintOptions(margin=_HOLE_MARGIN, **steps),
+            )
             background, notes = result.cloud, (*notes, *result.notes)
         except UserError as error:
             # A floor with a hole is worth more than no animation.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from egs_warp.clearance import Clearing, ClearingOptions, clear_plane, reach_acr
 from egs_warp.cli import main
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
+from egs_warp.inpainters import OpenCvInpainter, OpenCvMethod
 from egs_warp.io import read_capture, write_ply
 from egs_warp.plane import Plane
 from egs_warp.plane_file import read_planes, write_planes
@@ -235,6 +238,9 @@ def test_the_shadow_lies_on_an_uneven_floor_without_an_edge() -> None:
         (["--motion", "trajectory {tmp}/no.json"], "no.json: cannot be read"),
         (["--muscles", "{tmp}/no.json"], "no.json: cannot be read"),
         (["--terrain", "{tmp}/no.json"], "no.json: cannot be read"),
+        (["--inpainter", "lama"], "--inpainter lama: give patch, telea, ns or a TorchScript file"),
+        (["--inpainter", "ns", "--no-inpaint"], "--inpainter: --no-inpaint leaves the floor as captured"),
+        (["--background", "{tmp}/no.ply"], "--background: with --object the rest of the scene is behind the object"),
     ],
 )
 def test_a_slip_is_told_before_the_scene_is_taken_apart(
@@ -254,6 +260,39 @@ def test_a_slip_is_told_before_the_scene_is_taken_apart(
     assert main([*scene, *given]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
+
+
+def _noting(told: dict[str, Any]) -> Callable[..., None]:
+    """Stands for a function: ends the command, and keeps the arguments that it was given by name."""
+
+    def note(*_: object, **named: Any) -> None:
+        told.update(named)
+        raise UserError("far enough")
+
+    return note
+
+
+def test_animate_passes_on_how_the_scene_is_taken_apart(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: dict[str, Any] = {}
+    monkeypatch.setattr("egs_warp.scene_pipeline.prepare_scene", _noting(told))
+    flags = ["--object", "0,0,0.5", "--inpainter", "ns", "--straddling", "remove", "--out", str(tmp_path / "out")]
+    assert main(["animate", str(folder / "scene.ply"), *flags]) == 2
+    assert told["options"].inpainter == OpenCvInpainter(OpenCvMethod.NAVIER_STOKES)
+    assert told["options"].clearing is Clearing.REMOVE
+
+
+def test_the_parts_of_earlier_steps_are_animated(
+    tmp_path: Path, prepared: PreparedScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepared.write(tmp_path)
+    told: dict[str, Any] = {}
+    monkeypatch.setattr("egs_warp.animation.animate", _noting(told))
+    flags = ["--plane", str(tmp_path / "plane.json"), "--background", str(tmp_path / "background.ply")]
+    assert main(["animate", str(tmp_path / "object.ply"), *flags, "--out", str(tmp_path / "out")]) == 2
+    assert told["background"].count == prepared.background.count
+    np.testing.assert_allclose(told["plane"].normal, prepared.plane.normal, atol=1e-9)
 
 
 def test_an_animation_that_fails_loses_none_of_the_parts(

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from egs_warp.cli_input import check_device, guessed_up, parse_direction, parse_up
+from egs_warp.commands.segment import add_straddling_flag, clearing_of
+from egs_warp.errors import UserError
 from egs_warp.scene_input import add_object_flags, plane_of, read_scene, say
 
 
@@ -27,6 +29,11 @@ def add_parser(commands) -> None:
     add_object_flags(animate)
     animate.add_argument(
         "--view-from", help="x,y,z or an axis: from the object to the camera of the video, capture's frame"
+    )
+    add_straddling_flag(animate)
+    animate.add_argument("--inpainter", help="patch (default), telea, ns, or LaMa's TorchScript file")
+    animate.add_argument(
+        "--background", help="capture to draw behind the object of earlier steps, as inpaint writes it"
     )
     animate.add_argument("--no-inpaint", action="store_true", help="leave the floor under the object as captured")
     animate.add_argument("--no-shadow", action="store_true", help="no shadow on the ground under the object")
@@ -73,6 +80,7 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[dict, str]:
     plane = plane_of(chosen.plane) if chosen.plane else None
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from else None
     capture = read_capture(chosen.capture, device=chosen.device)
+    background = read_capture(chosen.background, device=chosen.device).cloud if chosen.background is not None else None
     notes = list(capture.notes)
     if capture.infinite_opacities:
         notes.append(f"{capture.infinite_opacities} infinite opacities were read as 0 or 1")
@@ -80,17 +88,33 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[dict, str]:
         up, note = guessed_up(capture)
         notes.append(note)
         say(note)
-    report = animate(capture.cloud, chosen.out, up=up, plane=plane, view_from=view_from, notes=tuple(notes), **asked)
+    report = animate(
+        capture.cloud,
+        chosen.out,
+        up=up,
+        plane=plane,
+        background=background,
+        view_from=view_from,
+        notes=tuple(notes),
+        **asked,
+    )
     return report, ""
 
 
 def _animate_scene(chosen: argparse.Namespace) -> tuple[dict, str]:
     """The object of a scene, cut out of it, over the rest of the scene."""
     from egs_warp.animation import animate
+    from egs_warp.inpainters import inpainter_by_name
     from egs_warp.io.atomic import writable_folder
     from egs_warp.scene_pipeline import SceneOptions, prepare_scene, viewing_direction
 
+    if chosen.background is not None:
+        raise UserError("--background: with --object the rest of the scene is behind the object; leave one of them out")
+    if chosen.inpainter is not None and chosen.no_inpaint:
+        raise UserError("--inpainter: --no-inpaint leaves the floor as captured; leave one of them out")
     asked = _asked(chosen)
+    check_device(chosen.device)
+    inpainter = inpainter_by_name(chosen.inpainter or "patch", device=chosen.device)
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from else None
     given = read_scene(chosen)
     folder = writable_folder(chosen.out)
@@ -101,7 +125,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[dict, str]:
         photographs=given.photographs(),
         up=given.up,
         plane=given.plane,
-        options=SceneOptions(inpaint=not chosen.no_inpaint),
+        options=SceneOptions(clearing=clearing_of(chosen), inpaint=not chosen.no_inpaint, inpainter=inpainter),
         progress=lambda stage: say(f"{stage} ..."),
     )
     # Whatever goes wrong later, the minutes that these took are not lost.
