@@ -295,6 +295,26 @@ def test_the_parts_of_earlier_steps_are_animated(
     np.testing.assert_allclose(told["plane"].normal, prepared.plane.normal, atol=1e-9)
 
 
+def test_one_command_from_a_scene_to_a_film(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As without PyTorch, whose training takes a minute."""
+    monkeypatch.setattr("egs_warp.scene_pipeline.has_torch", lambda: False)
+    scene, out = str(folder / "scene.ply"), tmp_path / "out"
+    flags = ["--object", "0,-0.5,0.5", "--frames", "1", "--size", "64", "--out", str(out)]
+    assert main(["animate", scene, *flags]) == 0
+    wrote = capsys.readouterr().out.splitlines()[-1]
+    assert (out / "jump.mp4").stat().st_size > 0
+    for name in ("sheet.png", "report.json", "trajectory.npz", "object.ply", "background.ply", "plane.json"):
+        assert (out / name).stat().st_size > 0 and name in wrote
+    rest = read_capture(out / "background.ply").cloud.means.numpy()
+    ball = read_capture(out / "object.ply").cloud.means.numpy()
+    assert not ((rest[:, 2] > 0.05) & (np.linalg.norm(rest - [0.0, 0.0, 0.5], axis=1) < 0.55)).any()
+    assert (np.linalg.norm(ball - [0.0, 0.0, 0.5], axis=1) < 0.55).sum() > 1400
+    # There is floor where it stood.
+    assert ((np.abs(rest[:, 2]) < 0.05) & (np.linalg.norm(rest[:, :2], axis=1) < 0.1)).sum() > 20
+
+
 def test_an_animation_that_fails_loses_none_of_the_parts(
     folder: Path, tmp_path: Path, prepared: PreparedScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
