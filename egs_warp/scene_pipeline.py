@@ -30,6 +30,7 @@ from egs_warp.segmentation import CELLS, ObjectSpec, Segmentation, segment, vote
 if TYPE_CHECKING:
     from egs_warp.finetune import TrainingView
     from egs_warp.inpainters import Inpainter
+    from egs_warp.inpainting import InpaintResult
 
 _PLANE_ELEVATIONS = (40.0, 58.0, 75.0)
 """Degrees: seen at a grazing angle, splats in front hide those behind, and the floor seems to lie higher."""
@@ -94,6 +95,8 @@ class PreparedScene:
     located: LocatedPlane
     notes: tuple[str, ...]
     """What was found and done, for the user."""
+    filled: InpaintResult | None = None
+    """How the background got its new floor; None where it got none."""
 
     def write(self, folder: Path) -> None:
         """``object.ply``, ``background.ply`` and ``plane.json`` into ``folder``."""
@@ -124,7 +127,7 @@ def prepare_scene(
     located = locate_plane(cloud, spec, cameras=cameras, up=up, plane=plane)
     progress("segment")
     thing, bare, notes = take_apart(cloud, located, options, photographs)
-    background = bare
+    filled = None
     if options.inpaint:
         progress("inpaint")
         # torch may be missing, and with it the training that inpainting ends with.
@@ -132,17 +135,18 @@ def prepare_scene(
 
         steps = {} if has_torch() else {"steps": 0}
         try:
-            result = inpaint(
+            filled = inpaint(
                 bare,
                 hole_under(cloud, located),
                 inpainter=options.inpainter,
                 options=InpaintOptions(margin=_HOLE_MARGIN, **steps),
             )
-            background, notes = result.cloud, (*notes, *result.notes)
+            notes = (*notes, *filled.notes)
         except UserError as error:
             # A floor with a hole is worth more than no animation.
             notes = (*notes, f"the floor under the object was not filled ({error})")
-    return PreparedScene(thing, background, bare, located.plane, located, (*located.notes, *notes))
+    background = bare if filled is None else filled.cloud
+    return PreparedScene(thing, background, bare, located.plane, located, (*located.notes, *notes), filled)
 
 
 def take_apart(

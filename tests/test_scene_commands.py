@@ -305,7 +305,8 @@ def test_one_command_from_a_scene_to_a_film(
     assert main(["animate", scene, *flags]) == 0
     wrote = capsys.readouterr().out.splitlines()[-1]
     assert (out / "jump.mp4").stat().st_size > 0
-    for name in ("sheet.png", "report.json", "trajectory.npz", "object.ply", "background.ply", "plane.json"):
+    parts, pictures = ("object.ply", "background.ply", "plane.json"), ("plane.png", "segment.png", "filled.png")
+    for name in ("sheet.png", "report.json", "trajectory.npz", *parts, *pictures):
         assert (out / name).stat().st_size > 0 and name in wrote
     rest = read_capture(out / "background.ply").cloud.means.numpy()
     ball = read_capture(out / "object.ply").cloud.means.numpy()
@@ -327,7 +328,9 @@ def test_an_animation_that_fails_loses_none_of_the_parts(
     assert main(["animate", str(folder / "scene.ply"), "--object", "0,0,0.5", "--out", str(out)]) == 2
     assert read_capture(out / "object.ply").cloud.count == prepared.object.count
     assert read_capture(out / "background.ply").cloud.count == prepared.background.count
-    assert (out / "plane.json").is_file()
+    for name in ("plane.json", "plane.png", "segment.png"):
+        assert (out / name).is_file()
+    assert not (out / "filled.png").exists(), "no floor was filled"
 
 
 def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:

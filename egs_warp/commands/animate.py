@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from egs_warp.cli_input import check_device, guessed_up, parse_direction, parse_up
 from egs_warp.commands.segment import add_straddling_flag, clearing_of
 from egs_warp.errors import UserError
-from egs_warp.scene_input import add_object_flags, plane_of, read_scene, say
+from egs_warp.scene_input import SceneInput, add_object_flags, plane_of, read_scene, say
+
+if TYPE_CHECKING:
+    from egs_warp.scene_pipeline import PreparedScene
 
 
 def add_parser(commands) -> None:
@@ -130,6 +133,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[dict, str]:
     )
     # Whatever goes wrong later, the minutes that these took are not lost.
     scene.write(folder)
+    pictures = _write_pictures(folder, given, scene)
     for note in scene.notes:
         say(note)
     report = animate(
@@ -141,7 +145,26 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[dict, str]:
         notes=(*given.notes, *scene.notes),
         **asked,
     )
-    return report, ", object.ply, background.ply, plane.json"
+    return report, ", ".join(["", "object.ply", "background.ply", "plane.json", *pictures])
+
+
+def _write_pictures(folder: Path, given: SceneInput, scene: PreparedScene) -> list[str]:
+    """Pictures that show whether each step has worked, as the steps' own commands write them; returns their names."""
+    from egs_warp.inpainting_picture import before_and_after
+    from egs_warp.render.video import write_png
+    from egs_warp.scene_pictures import picture_cameras, plane_picture, segmentation_picture
+
+    centre, size = scene.located.centre, scene.located.size
+    cameras = picture_cameras(scene.plane, centre, size, given.cameras)
+    pictures = {
+        "plane.png": plane_picture(given.cloud, [scene.plane], cameras, centre=centre, size=size),
+        "segment.png": segmentation_picture(given.cloud, scene.object, scene.bare, cameras),
+    }
+    if scene.filled is not None:
+        pictures["filled.png"] = before_and_after(scene.filled)
+    for name, picture in pictures.items():
+        write_png(folder / name, picture)
+    return list(pictures)
 
 
 def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
