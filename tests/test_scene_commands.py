@@ -240,6 +240,8 @@ def test_the_shadow_lies_on_an_uneven_floor_without_an_edge() -> None:
         (["--terrain", "{tmp}/no.json"], "no.json: cannot be read"),
         (["--inpainter", "lama"], "--inpainter lama: give patch, telea, ns or a TorchScript file"),
         (["--inpainter", "ns", "--no-inpaint"], "--inpainter: --no-inpaint leaves the floor as captured"),
+        (["--object", ""], "--object: nothing is given; give a mask.png"),
+        (["--object", "0,0,0.5", "--up", ""], "--up : give one of x, y, z"),
         (["--background", "{tmp}/no.ply"], "--background: with --object the rest of the scene is behind the object"),
     ],
 )
@@ -260,6 +262,25 @@ def test_a_slip_is_told_before_the_scene_is_taken_apart(
     assert main([*scene, *given]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ["--cameras", "no.json"],
+        ["--view", "0"],
+        ["--no-inpaint"],
+        ["--inpainter", "ns"],
+        ["--straddling", "split"],
+    ],
+)
+def test_what_only_a_scene_takes_needs_the_object(
+    folder: Path, tmp_path: Path, flags: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["animate", str(folder / "scene.ply"), *flags, "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"egs-warp: {flags[0]}: needs --object") and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 def _noting(told: dict[str, Any]) -> Callable[..., None]:

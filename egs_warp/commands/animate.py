@@ -66,7 +66,7 @@ def _animate(chosen: argparse.Namespace) -> int:
     wp.config.log_level = wp.LOG_WARNING
     from egs_warp.report import summary
 
-    report, more = _animate_scene(chosen) if chosen.object else _animate_capture(chosen)
+    report, more = _animate_scene(chosen) if chosen.object is not None else _animate_capture(chosen)
     print(summary(report))
     print(f"wrote the video, sheet.png, report.json, trajectory.npz{more} into {chosen.out}")
     return 0
@@ -77,11 +77,14 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[dict, str]:
     from egs_warp.animation import animate
     from egs_warp.io import read_capture
 
+    for name in ("cameras", "view", "straddling", "inpainter", "no_inpaint"):
+        if getattr(chosen, name) not in (None, False):
+            raise UserError(f"--{name.replace('_', '-')}: needs --object, which says what to take out of a scene")
     asked = _asked(chosen)
     check_device(chosen.device)
-    up = parse_up(chosen.up) if chosen.up else None
-    plane = plane_of(chosen.plane) if chosen.plane else None
-    view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from else None
+    up = parse_up(chosen.up) if chosen.up is not None else None
+    plane = plane_of(chosen.plane) if chosen.plane is not None else None
+    view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
     capture = read_capture(chosen.capture, device=chosen.device)
     background = read_capture(chosen.background, device=chosen.device).cloud if chosen.background is not None else None
     notes = list(capture.notes)
@@ -118,7 +121,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[dict, str]:
     asked = _asked(chosen)
     check_device(chosen.device)
     inpainter = inpainter_by_name(chosen.inpainter or "patch", device=chosen.device)
-    view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from else None
+    view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
     given = read_scene(chosen)
     folder = writable_folder(chosen.out)
     scene = prepare_scene(
@@ -184,8 +187,8 @@ def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
         parse_json(read_text(chosen.muscles), chosen.muscles)
     return {
         "motion": chosen.motion,
-        "forward": parse_direction("forward", chosen.forward) if chosen.forward else None,
-        "gravity_up": parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up else None,
+        "forward": parse_direction("forward", chosen.forward) if chosen.forward is not None else None,
+        "gravity_up": parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up is not None else None,
         "muscles_file": chosen.muscles,
         "solids": read_terrain(chosen.terrain) if chosen.terrain else (),
         "options": options,
