@@ -300,6 +300,11 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> Pla
         lowest = spec.point
     planes = find_planes(searched, up, tilt_degrees=_LEVEL_DEGREES)
     plane = plane_under(planes, lowest, tolerance=0.0, least_share=least_share)
+    if plane is None and spec.masks and planes:
+        raise UserError(
+            "object: most of the mask lies on the floor, not on an object that stands on it; mark the object, or check "
+            "--view and --up"
+        )
     if plane is None:
         raise UserError(
             "plane: none in sight under the object: nothing flat and level lies below it; check --up, or give --plane"

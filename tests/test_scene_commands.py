@@ -39,7 +39,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     Image.fromarray(mask.astype(np.uint8) * 255).save(path / "photo1.png")
     corner = np.zeros_like(mask)
     corner[:6, :6] = True
-    for name, wrong in (("empty", mask & False), ("sky", corner), ("short", mask[:50])):
+    wrong_masks = {"empty": mask & False, "sky": corner, "short": mask[:50], "white": mask | True, "inverted": ~mask}
+    for name, wrong in wrong_masks.items():
         (path / name).mkdir()
         Image.fromarray(wrong.astype(np.uint8) * 255).save(path / name / "photo1.png")
     away = Camera.look_at(np.array([0.0, 0.0, 9.0]), np.array([0.0, 1.0, 20.0]), np.eye(3)[1], width=96, height=96)
@@ -99,6 +100,14 @@ def test_without_cameras_a_ring_is_used_and_written(folder: Path, tmp_path: Path
         (
             ["--object", "{folder}/short/photo1.png", "--cameras", "{folder}/cameras.json"],
             "make it at the photo's size",
+        ),
+        (
+            ["--object", "{folder}/white/photo1.png", "--cameras", "{folder}/cameras.json"],
+            "most of the mask lies on the floor, not on an object",
+        ),
+        (
+            ["--object", "{folder}/inverted/photo1.png", "--cameras", "{folder}/cameras.json"],
+            "most of the mask lies on the floor, not on an object",
         ),
         (["--object", "5,5,5,6,6,6"], "the box holds nothing of the capture"),
     ],
