@@ -66,6 +66,10 @@ class AnimateOptions:
         if self.metres_per_unit is not None and not (np.isfinite(self.metres_per_unit) and self.metres_per_unit > 0.0):
             raise UserError(f"--metres-per-unit {self.metres_per_unit}: give a positive number")
 
+    def targets(self) -> dict[str, float | None]:
+        """By the names that a script gives them."""
+        return {"distance": self.distance, "height": self.height, "heading_degrees": self.heading_degrees}
+
 
 def animate(
     cloud: GaussianCloud,
@@ -94,8 +98,7 @@ def animate(
     Returns the report (docs/report.md). Raises ``UserError`` for bad input, before any file of an earlier run is touched.
     """
     options = options or AnimateOptions()
-    flags = {"distance": options.distance, "height": options.height, "heading_degrees": options.heading_degrees}
-    requests = parse_script(motion, defaults=flags)
+    requests = parse_script(motion, defaults=options.targets())
     cut_off = longest(requests)
     folder = writable_folder(out)
     with tqdm(total=1, desc="prepare", unit="capture", disable=quiet) as bar:

@@ -108,13 +108,16 @@ class TorchScriptInpainter:
 
 
 def inpainter_by_name(name: str, *, seed: int = 0, device: str = "cpu") -> Inpainter:
-    """``patch``, ``telea``, ``ns`` or the path of a TorchScript file. Raises ``UserError`` for anything else."""
+    """``patch``, ``telea``, ``ns`` or the path of a TorchScript file, which is tried. Raises ``UserError`` for anything else."""
     if name == "patch":
         return PatchSynthesis(seed=seed, device=device)
     if name in (method.value for method in OpenCvMethod):
         return OpenCvInpainter(OpenCvMethod(name))
     if Path(name).suffix in (".pt", ".pth", ".ts") or Path(name).is_file():
-        return TorchScriptInpainter(Path(name), device="cuda" if device.startswith("cuda") else "cpu")
+        network = TorchScriptInpainter(Path(name), device="cuda" if device.startswith("cuda") else "cpu")
+        # A wrong file is told now, not after the minutes that come before the filling.
+        network._load()
+        return network
     raise UserError(f"--inpainter {name}: give patch, telea, ns or a TorchScript file (.pt)")
 
 

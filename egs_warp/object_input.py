@@ -29,6 +29,8 @@ def read_object(
 
     Masks belong to the camera whose photo has the same name. Raises ``UserError`` with one line for anything else.
     """
+    if not text.strip():
+        raise UserError(f"--object: nothing is given; {_HELP}")
     if Path(text).exists():
         return ObjectSpec(masks=tuple(_read_masks(Path(text), posed, view)))
     try:

@@ -135,14 +135,14 @@ def plane_of(text: str) -> Plane:
 def read_scene(chosen: argparse.Namespace) -> SceneInput:
     """Read what the flags name. Raises ``UserError`` with one line for whatever is wrong."""
     check_device(chosen.device)
-    up = parse_up(chosen.up) if chosen.up else None
-    plane = plane_of(chosen.plane) if chosen.plane else None
+    up = parse_up(chosen.up) if chosen.up is not None else None
+    plane = plane_of(chosen.plane) if chosen.plane is not None else None
     capture = read_capture(chosen.capture, device=chosen.device)
     posed = read_cameras(chosen.cameras) if chosen.cameras else []
     notes = list(capture.notes)
     if capture.infinite_opacities:
         notes.append(f"{capture.infinite_opacities} infinite opacities were read as 0 or 1")
-    spec = read_object(chosen.object, capture.cloud, posed, view=chosen.view) if chosen.object else None
+    spec = read_object(chosen.object, capture.cloud, posed, view=chosen.view) if chosen.object is not None else None
     if up is None and capture.up is not None:
         up = np.asarray(capture.up, dtype=float)
     return SceneInput(capture.cloud, posed, spec, up, plane, tuple(notes))

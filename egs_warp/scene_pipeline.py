@@ -29,6 +29,8 @@ from egs_warp.segmentation import CELLS, ObjectSpec, Segmentation, segment, vote
 
 if TYPE_CHECKING:
     from egs_warp.finetune import TrainingView
+    from egs_warp.inpainters import Inpainter
+    from egs_warp.inpainting import InpaintResult
 
 _PLANE_ELEVATIONS = (40.0, 58.0, 75.0)
 """Degrees: seen at a grazing angle, splats in front hide those behind, and the floor seems to lie higher."""
@@ -52,6 +54,8 @@ class SceneOptions:
     clearing: Clearing | None = None
     """None: fine-tuning where PyTorch is installed, else the static split."""
     inpaint: bool = True
+    inpainter: Inpainter | None = None
+    """None: patch synthesis."""
     clearing_options: ClearingOptions = field(default_factory=ClearingOptions)
 
 
@@ -91,6 +95,8 @@ class PreparedScene:
     located: LocatedPlane
     notes: tuple[str, ...]
     """What was found and done, for the user."""
+    filled: InpaintResult | None = None
+    """How the background got its new floor; None where it got none."""
 
     def write(self, folder: Path) -> None:
         """``object.ply``, ``background.ply`` and ``plane.json`` into ``folder``."""
@@ -121,7 +127,7 @@ def prepare_scene(
     located = locate_plane(cloud, spec, cameras=cameras, up=up, plane=plane)
     progress("segment")
     thing, bare, notes = take_apart(cloud, located, options, photographs)
-    background = bare
+    filled = None
     if options.inpaint:
         progress("inpaint")
         # torch may be missing, and with it the training that inpainting ends with.
@@ -129,12 +135,18 @@ def prepare_scene(
 
         steps = {} if has_torch() else {"steps": 0}
         try:
-            result = inpaint(bare, hole_under(cloud, located), options=InpaintOptions(margin=_HOLE_MARGIN, **steps))
-            background, notes = result.cloud, (*notes, *result.notes)
+            filled = inpaint(
+                bare,
+                hole_under(cloud, located),
+                inpainter=options.inpainter,
+                options=InpaintOptions(margin=_HOLE_MARGIN, **steps),
+            )
+            notes = (*notes, *filled.notes)
         except UserError as error:
             # A floor with a hole is worth more than no animation.
             notes = (*notes, f"the floor under the object was not filled ({error})")
-    return PreparedScene(thing, background, bare, located.plane, located, (*located.notes, *notes))
+    background = bare if filled is None else filled.cloud
+    return PreparedScene(thing, background, bare, located.plane, located, (*located.notes, *notes), filled)
 
 
 def take_apart(
@@ -288,6 +300,11 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> Pla
         lowest = spec.point
     planes = find_planes(searched, up, tilt_degrees=_LEVEL_DEGREES)
     plane = plane_under(planes, lowest, tolerance=0.0, least_share=least_share)
+    if plane is None and spec.masks and planes:
+        raise UserError(
+            "object: most of the mask lies on the floor, not on an object that stands on it; mark the object, or check "
+            "--view and --up"
+        )
     if plane is None:
         raise UserError(
             "plane: none in sight under the object: nothing flat and level lies below it; check --up, or give --plane"

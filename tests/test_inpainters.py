@@ -65,7 +65,7 @@ def test_names(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="--inpainter lama: give patch, telea, ns or a TorchScript file"):
         inpainter_by_name("lama")
     with pytest.raises(UserError, match=r"gone\.pt: no such file; give the TorchScript file"):
-        inpainter_by_name(str(tmp_path / "gone.pt")).fill(*holed(), ~holed()[1])
+        inpainter_by_name(str(tmp_path / "gone.pt"))
 
 
 def test_bad_networks(tmp_path: Path) -> None:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from egs_warp.cli_input import check_device, guessed_up, parse_direction, parse_up
+from egs_warp.commands.segment import add_straddling_flag, clearing_of
 from egs_warp.errors import UserError
-from egs_warp.scene_input import add_object_flags, plane_of, read_scene, say
+from egs_warp.scene_input import SceneInput, add_object_flags, plane_of, read_scene, say
+
+if TYPE_CHECKING:
+    from egs_warp.scene_pipeline import PreparedScene
 
 
 def add_parser(commands) -> None:
@@ -28,6 +32,11 @@ def add_parser(commands) -> None:
     add_object_flags(animate)
     animate.add_argument(
         "--view-from", help="x,y,z or an axis: from the object to the camera of the video, capture's frame"
+    )
+    add_straddling_flag(animate)
+    animate.add_argument("--inpainter", help="patch (default), telea, ns, or LaMa's TorchScript file")
+    animate.add_argument(
+        "--background", help="capture to draw behind the object of earlier steps, as inpaint writes it"
     )
     animate.add_argument("--no-inpaint", action="store_true", help="leave the floor under the object as captured")
     animate.add_argument("--no-shadow", action="store_true", help="no shadow on the ground under the object")
@@ -61,7 +70,7 @@ def _animate(chosen: argparse.Namespace) -> int:
     wp.config.log_level = wp.LOG_WARNING
     from egs_warp.report import summary
 
-    report, more = _animate_scene(chosen) if chosen.object else _animate_capture(chosen)
+    report, more = _animate_scene(chosen) if chosen.object is not None else _animate_capture(chosen)
     print(summary(report))
     print(f"wrote the video, sheet.png, report.json, trajectory.npz{more} into {chosen.out}")
     return 0
@@ -72,12 +81,16 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[dict, str]:
     from egs_warp.animation import animate
     from egs_warp.io import read_capture
 
+    for name in ("cameras", "view", "straddling", "inpainter", "no_inpaint"):
+        if getattr(chosen, name) not in (None, False):
+            raise UserError(f"--{name.replace('_', '-')}: needs --object, which says what to take out of a scene")
     asked = _asked(chosen)
     check_device(chosen.device)
-    up = parse_up(chosen.up) if chosen.up else None
-    plane = plane_of(chosen.plane) if chosen.plane else None
-    view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from else None
+    up = parse_up(chosen.up) if chosen.up is not None else None
+    plane = plane_of(chosen.plane) if chosen.plane is not None else None
+    view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
     capture = read_capture(chosen.capture, device=chosen.device)
+    background = read_capture(chosen.background, device=chosen.device).cloud if chosen.background is not None else None
     notes = list(capture.notes)
     if capture.infinite_opacities:
         notes.append(f"{capture.infinite_opacities} infinite opacities were read as 0 or 1")
@@ -85,18 +98,34 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[dict, str]:
         up, note = guessed_up(capture)
         notes.append(note)
         say(note)
-    report = animate(capture.cloud, chosen.out, up=up, plane=plane, view_from=view_from, notes=tuple(notes), **asked)
+    report = animate(
+        capture.cloud,
+        chosen.out,
+        up=up,
+        plane=plane,
+        background=background,
+        view_from=view_from,
+        notes=tuple(notes),
+        **asked,
+    )
     return report, ""
 
 
 def _animate_scene(chosen: argparse.Namespace) -> tuple[dict, str]:
     """The object of a scene, cut out of it, over the rest of the scene."""
     from egs_warp.animation import animate
+    from egs_warp.inpainters import inpainter_by_name
     from egs_warp.io.atomic import writable_folder
     from egs_warp.scene_pipeline import SceneOptions, prepare_scene, viewing_direction
 
+    if chosen.background is not None:
+        raise UserError("--background: with --object the rest of the scene is behind the object; leave one of them out")
+    if chosen.inpainter is not None and chosen.no_inpaint:
+        raise UserError("--inpainter: --no-inpaint leaves the floor as captured; leave one of them out")
     asked = _asked(chosen)
-    view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from else None
+    check_device(chosen.device)
+    inpainter = inpainter_by_name(chosen.inpainter or "patch", device=chosen.device)
+    view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
     given = read_scene(chosen)
     folder = writable_folder(chosen.out)
     scene = prepare_scene(
@@ -106,9 +135,12 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[dict, str]:
         photographs=given.photographs(),
         up=given.up,
         plane=given.plane,
-        options=SceneOptions(inpaint=not chosen.no_inpaint),
+        options=SceneOptions(clearing=clearing_of(chosen), inpaint=not chosen.no_inpaint, inpainter=inpainter),
         progress=lambda stage: say(f"{stage} ..."),
     )
+    # Whatever goes wrong later, the minutes that these took are not lost.
+    scene.write(folder)
+    pictures = _write_pictures(folder, given, scene)
     for note in scene.notes:
         say(note)
     report = animate(
@@ -120,14 +152,35 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[dict, str]:
         notes=(*given.notes, *scene.notes),
         **asked,
     )
-    scene.write(folder)
-    return report, ", object.ply, background.ply, plane.json"
+    return report, ", ".join(["", "object.ply", "background.ply", "plane.json", *pictures])
+
+
+def _write_pictures(folder: Path, given: SceneInput, scene: PreparedScene) -> list[str]:
+    """Pictures that show whether each step has worked, as the steps' own commands write them; returns their names."""
+    from egs_warp.inpainting_picture import before_and_after
+    from egs_warp.render.video import write_png
+    from egs_warp.scene_pictures import picture_cameras, plane_picture, segmentation_picture
+
+    centre, size = scene.located.centre, scene.located.size
+    cameras = picture_cameras(scene.plane, centre, size, given.cameras)
+    pictures = {
+        "plane.png": plane_picture(given.cloud, [scene.plane], cameras, centre=centre, size=size),
+        "segment.png": segmentation_picture(given.cloud, scene.object, scene.bare, cameras),
+    }
+    if scene.filled is not None:
+        pictures["filled.png"] = before_and_after(scene.filled)
+    for name, picture in pictures.items():
+        write_png(folder / name, picture)
+    return list(pictures)
 
 
 def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
-    """What the flags say of the motion, as arguments of ``animate``."""
+    """What the flags say of the motion, as arguments of ``animate``. Raises ``UserError`` for what can be told at once."""
     from egs_warp.animation import AnimateOptions
+    from egs_warp.repertoire import longest
+    from egs_warp.script import parse_script
     from egs_warp.terrain import read_terrain
+    from egs_warp.user_files import parse_json, read_text
 
     numbers = ("distance", "height", "heading_degrees", "frames", "size", "seed", "metres_per_unit", "friction")
     given = {name: getattr(chosen, name) for name in numbers if getattr(chosen, name) is not None}
@@ -135,10 +188,14 @@ def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
     # Single precision holds no lengths far beyond; ``make_body`` says which of these fit the body.
     if options.metres_per_unit is not None and not 1e-9 <= options.metres_per_unit <= 1e9:
         raise UserError(f"--metres-per-unit {options.metres_per_unit}: give a number from 1e-9 to 1e9")
+    # The files of key frames are read, too.
+    longest(parse_script(chosen.motion, defaults=options.targets()))
+    if chosen.muscles is not None:
+        parse_json(read_text(chosen.muscles), chosen.muscles)
     return {
         "motion": chosen.motion,
-        "forward": parse_direction("forward", chosen.forward) if chosen.forward else None,
-        "gravity_up": parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up else None,
+        "forward": parse_direction("forward", chosen.forward) if chosen.forward is not None else None,
+        "gravity_up": parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up is not None else None,
         "muscles_file": chosen.muscles,
         "solids": read_terrain(chosen.terrain) if chosen.terrain else (),
         "options": options,

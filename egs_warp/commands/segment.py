@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from egs_warp.scene_input import add_scene_flags, read_scene, say
+
+if TYPE_CHECKING:
+    from egs_warp.clearance import Clearing
 
 METHODS = {"finetune": "FINETUNE", "split": "SPLIT", "remove": "REMOVE", "none": "NONE"}
 
@@ -13,19 +17,30 @@ def add_parser(commands) -> None:
     """Add the command to the subparsers ``commands``."""
     segment = commands.add_parser("segment", help="take an object out of a scene")
     add_scene_flags(segment)
-    segment.add_argument(
+    add_straddling_flag(segment)
+    segment.set_defaults(run=_segment)
+
+
+def add_straddling_flag(parser: argparse.ArgumentParser) -> None:
+    """Add the flag that ``clearing_of`` reads."""
+    parser.add_argument(
         "--straddling",
         choices=METHODS,
         help="Gaussians across the plane: finetune them clear of it (default, needs PyTorch), split, remove, none",
     )
-    segment.set_defaults(run=_segment)
+
+
+def clearing_of(chosen: argparse.Namespace) -> Clearing | None:
+    """What ``--straddling`` asks for; None without it."""
+    from egs_warp.clearance import Clearing
+
+    return Clearing[METHODS[chosen.straddling]] if chosen.straddling else None
 
 
 def _segment(chosen: argparse.Namespace) -> int:
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING
-    from egs_warp.clearance import Clearing
     from egs_warp.errors import UserError
     from egs_warp.io.atomic import writable_folder
     from egs_warp.render.video import write_png
@@ -43,9 +58,7 @@ def _segment(chosen: argparse.Namespace) -> int:
         photographs=given.photographs(),
         up=given.up,
         plane=given.plane,
-        options=SceneOptions(
-            clearing=Clearing[METHODS[chosen.straddling]] if chosen.straddling else None, inpaint=False
-        ),
+        options=SceneOptions(clearing=clearing_of(chosen), inpaint=False),
     )
     for note in (*given.notes, *scene.notes):
         say(note)
