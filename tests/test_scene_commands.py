@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from egs_warp.clearance import Clearing, ClearingOptions, clear_plane, reach_acr
 from egs_warp.cli import main
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
+from egs_warp.inpainters import inpainter_by_name
+from egs_warp.inpainting import InpaintOptions, inpaint
 from egs_warp.io import read_capture, write_ply
 from egs_warp.plane import Plane
 from egs_warp.plane_file import read_planes, write_planes
@@ -144,6 +147,35 @@ def test_photographs_beside_the_cameras_clear_the_plane(folder: Path) -> None:
 
     assert thing.count - 10 <= tuned.count <= thing.count
     assert crossing(tuned) < 0.6 * crossing(thing)
+
+
+def test_inpaint_fills_the_hole_that_animate_fills(folder: Path, tmp_path: Path) -> None:
+    """Outline and margin go from segment to inpaint by plane.json; an object elsewhere has its own foot."""
+    cloud, spec = read_capture(folder / "scene.ply").cloud, ObjectSpec(point=np.array([0.0, -0.5, 0.5]))
+    flags = ["--object", "0,-0.5,0.5", "--plane", "0,0,1,0", "--straddling", "split", "--out", str(tmp_path)]
+    assert main(["segment", str(folder / "scene.ply"), *flags]) == 0
+    options = SceneOptions(clearing=Clearing.SPLIT, inpaint=False)
+    prepared = prepare_scene(cloud, spec, plane=FLOOR, options=options)
+    expected = inpaint(
+        prepared.bare, prepared.hole, inpainter=inpainter_by_name("ns"), options=InpaintOptions(steps=0)
+    ).cloud.means.numpy()
+    files = [str(tmp_path / "background.ply"), "--plane", str(tmp_path / "plane.json"), "--steps", "0"]
+    filled = tmp_path / "filled.ply"
+    for thing in ([], ["--object", str(tmp_path / "object.ply")]):
+        assert main(["inpaint", *files, *thing, "--inpainter", "ns", "--out", str(filled)]) == 0
+        np.testing.assert_allclose(read_capture(filled).cloud.means.numpy(), expected, atol=1e-5)
+    thing = read_capture(tmp_path / "object.ply").cloud
+    fields = (getattr(thing, name).numpy() for name in ("rotations", "log_scales", "opacity_logits", "sh"))
+    away = GaussianCloud.from_numpy(thing.means.numpy() + [1.2, 0.0, 0.0], *fields)
+    write_ply(tmp_path / "away.ply", away)
+    picture = ["--inpainter", "ns", "--out", str(filled), "--object", str(tmp_path / "away.ply")]
+    assert main(["inpaint", *files, *picture]) == 0
+    assert not np.array_equal(read_capture(filled).cloud.means.numpy(), expected)
+    entry = json.loads((tmp_path / "plane.json").read_text())["planes"][0]
+    for damage in ({"texels": 5}, {"outlines": [["a"]]}):
+        broken = {"planes": [entry | {"hole": entry["hole"] | damage}]}
+        (tmp_path / "plane.json").write_text(json.dumps(broken))
+        assert main(["inpaint", *files, "--out", str(filled)]) == 2
 
 
 def test_plane_files_are_checked(tmp_path: Path) -> None:
