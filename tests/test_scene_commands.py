@@ -22,7 +22,12 @@ from egs_warp.plane import Plane
 from egs_warp.plane_file import read_planes, write_planes
 from egs_warp.render import render
 from egs_warp.render.ground import CapturedScene, ContactShadow
+from egs_warp.scene_input import SceneInput
+from egs_warp.scene_pictures import picture_cameras, plane_picture
 from egs_warp.scene_pipeline import SceneOptions, prepare_scene, viewing_direction
+from egs_warp.scene_planes import planes_of_scene
+from egs_warp.scenes import scene
+from egs_warp.scenes.rooms import joined
 from egs_warp.segmentation import ObjectSpec, masks_from_selection
 from tests.test_segmentation import FLOOR, ball_on_floor
 
@@ -176,6 +181,22 @@ def test_inpaint_fills_the_hole_that_animate_fills(folder: Path, tmp_path: Path)
         broken = {"planes": [entry | {"hole": entry["hole"] | damage}]}
         (tmp_path / "plane.json").write_text(json.dumps(broken))
         assert main(["inpaint", *files, "--out", str(filled)]) == 2
+
+
+def test_further_planes_are_level_patches_in_colours_of_their_own() -> None:
+    """Beside a bedroom's floor only the stool's board and cushion are level; slices of walls and legs are no planes."""
+    made = scene("stool")
+    cloud = joined(made.background, made.object)
+    given = SceneInput(cloud, [], ObjectSpec(point=np.array([0.0, 0.0, 0.68])), None, made.plane, ())
+    found = planes_of_scene(given, plane_mask=None, view=None, count=5)
+    assert [-one.offset for one in found.planes] == pytest.approx([0.0, 0.52, 0.68], abs=0.01)
+    assert all(one.normal[2] > np.cos(np.radians(1.0)) for one in found.planes)
+    assert found.notes[-1] == "3 of 5 planes found"
+    cameras = picture_cameras(made.plane, found.centre, found.size)[1:2]
+    picture = plane_picture(cloud, found.planes[:2], cameras, centre=found.centre, size=found.size).astype(float)
+    red, green, _ = np.moveaxis(picture, -1, 0)
+    assert (red - green > 90).mean() > 0.01
+    assert (green - red > 60).mean() > 0.002
 
 
 def test_plane_files_are_checked(tmp_path: Path) -> None:
