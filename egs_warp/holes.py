@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import cv2
 import numpy as np
 from scipy import ndimage
 
@@ -54,6 +56,29 @@ class Hole:
         middle = np.array([[columns.min() + columns.max() + 1, rows.min() + rows.max() + 1]]) / 2.0
         side = max(np.ptp(rows), np.ptp(columns)) + 1
         return self.window.points(middle)[0], float(side) * self.window.texel
+
+    def facts(self) -> dict[str, Any]:
+        """What ``plane.json`` says of it: its outlines, in columns and rows of the window, whose middle is ``centre``."""
+        outlines, _ = cv2.findContours(self.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+        return {
+            "centre": self.window.centre.tolist(),
+            "texel": self.window.texel,
+            "texels": list(self.mask.shape),
+            "outlines": [outline[:, 0].tolist() for outline in outlines],
+        }
+
+    @classmethod
+    def from_facts(cls, plane: Plane, facts: dict[str, Any]) -> Hole:
+        """The hole in ``plane`` that ``facts`` tells of. Raises ``UserError`` where something is amiss in them."""
+        try:
+            rows, columns = (int(count) for count in facts["texels"])
+            centre = np.array(facts["centre"], dtype=float).reshape(3)
+            mask = np.zeros((rows, columns), np.uint8)
+            for outline in facts["outlines"]:
+                cv2.fillPoly(mask, [np.array(outline, np.int32).reshape(-1, 2)], (1,))
+            return cls(PlaneWindow(plane, centre, float(facts["texel"]), rows, columns), mask > 0)
+        except (TypeError, KeyError, ValueError, cv2.error) as error:
+            raise UserError("plane.json: its hole is damaged; make it again with egs-warp segment") from error
 
     def drawn_on(self, window: PlaneWindow) -> np.ndarray:
         """(rows, columns) bool: the hole on another window of the same plane."""

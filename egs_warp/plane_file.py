@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -29,6 +30,11 @@ def write_planes(path: Path | str, planes: Sequence[Plane], *, facts: Sequence[M
 
 def read_planes(path: Path | str) -> list[Plane]:
     """The planes of a ``plane.json``. Raises ``UserError`` for anything else."""
+    return [plane for plane, _ in read_planes_and_facts(path)]
+
+
+def read_planes_and_facts(path: Path | str) -> list[tuple[Plane, dict[str, Any]]]:
+    """The planes of a ``plane.json``, each with its further entries. Raises ``UserError`` for anything else."""
     try:
         tree = json.loads(Path(path).read_bytes(), parse_int=whole_number)
     except FileNotFoundError as error:
@@ -38,12 +44,13 @@ def read_planes(path: Path | str) -> list[Plane]:
     entries = tree.get("planes") if isinstance(tree, dict) else None
     if not isinstance(entries, list) or not entries:
         raise UserError(f"{path}: it has no planes; make it with egs-warp plane")
-    planes = []
+    read = []
     for number, entry in enumerate(entries):
         try:
             normal = np.array(entry["normal"], dtype=float).reshape(3)
             offset = float(entry["offset"])
         except (TypeError, KeyError, ValueError) as error:
             raise UserError(f"{path}: plane {number} needs normal [x, y, z] and offset; make it again") from error
-        planes.append(Plane.from_coefficients(*normal, offset))
-    return planes
+        facts = {name: value for name, value in entry.items() if name not in ("normal", "offset")}
+        read.append((Plane.from_coefficients(*normal, offset), facts))
+    return read

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from colorsys import hsv_to_rgb
 
 import numpy as np
 
@@ -15,7 +16,6 @@ from egs_warp.render.ground import ContactShadow
 from egs_warp.render.rasteriser import render
 from egs_warp.render.video import contact_sheet
 
-_GRID = np.array([0.95, 0.15, 0.55], np.float32)
 _BACKDROP = (0.55, 0.75, 0.55)
 _SIDE = 480
 
@@ -31,7 +31,7 @@ def picture_cameras(plane: Plane, centre: np.ndarray, size: float, cameras: Sequ
 def plane_picture(
     cloud: GaussianCloud, planes: Sequence[Plane], cameras: Sequence[Camera], *, centre: np.ndarray, size: float
 ) -> np.ndarray:
-    """(H, W, 3) uint8: the capture with a grid on each plane, faint where something stands before it.
+    """(H, W, 3) uint8: the capture with a grid on each plane, in a colour of its own, faint where something stands before it.
 
     Ten lines to the ``size`` (scene units) of the object about ``centre`` (3,).
     """
@@ -40,14 +40,16 @@ def plane_picture(
         image = render(cloud, camera)
         picture = np.clip(image.colour.numpy(), 0.0, 1.0)
         depth = np.where(image.alpha.numpy() > 0.5, image.depth.numpy(), np.inf)
-        for plane in planes:
+        for number, plane in enumerate(planes):
+            # Hues a golden section apart differ, however many.
+            colour = np.array(hsv_to_rgb((0.92 + 0.618 * number) % 1.0, 0.85, 0.95))
             seen = ContactShadow(camera, plane, centre=centre, reach=size)
             cell = 0.1 * size
             distance = np.abs((seen.flat / cell + 0.5) % 1.0 - 0.5) * cell
             line = np.clip(1.6 - distance / (1.0 * seen.pixel[..., None]), 0.0, 1.0).max(axis=-1)
             line *= np.clip(4.0 - 2.0 * np.linalg.norm(seen.flat, axis=-1) / size, 0.0, 1.0) * seen.hit
             line *= np.where(seen.depth < 1.01 * depth, 0.9, 0.12)
-            picture = picture + line[..., None] * (_GRID - picture)
+            picture = picture + line[..., None] * (colour - picture)
         frames.append(_bytes(picture))
     return contact_sheet(frames, 2, ["the grid must lie on what the object stands on", "", "", ""][: len(frames)])
 

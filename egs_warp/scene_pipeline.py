@@ -36,9 +36,6 @@ _PLANE_ELEVATIONS = (40.0, 58.0, 75.0)
 """Degrees: seen at a grazing angle, splats in front hide those behind, and the floor seems to lie higher."""
 _HOLE_HEIGHT = 0.08
 """Of the object's size: under what it has below this height the floor is unseen, or seen so badly that it is smeared."""
-_HOLE_MARGIN = 0.01
-"""Of the hole's side; gaps in the floor that touch it join it anyway. With 0.03 and more, a sheet under a plush toy lost
-part of its edge."""
 _HOLE_TEXELS = 200
 _CLEAR_SUPPORT = 0.1
 """Share of the visible surface: a plane as wide as this is no accident."""
@@ -92,6 +89,8 @@ class PreparedScene:
     bare: GaussianCloud
     """The background before inpainting."""
     plane: Plane
+    hole: Hole
+    """In the floor, under the object."""
     located: LocatedPlane
     notes: tuple[str, ...]
     """What was found and done, for the user."""
@@ -102,7 +101,7 @@ class PreparedScene:
         """``object.ply``, ``background.ply`` and ``plane.json`` into ``folder``."""
         write_ply(folder / "object.ply", self.object)
         write_ply(folder / "background.ply", self.background)
-        write_planes(folder / "plane.json", [self.plane], facts=[self.located.facts()])
+        write_planes(folder / "plane.json", [self.plane], facts=[self.located.facts() | {"hole": self.hole.facts()}])
 
 
 def prepare_scene(
@@ -127,7 +126,7 @@ def prepare_scene(
     located = locate_plane(cloud, spec, cameras=cameras, up=up, plane=plane)
     progress("segment")
     thing, bare, notes = take_apart(cloud, located, options, photographs)
-    filled = None
+    filled, hole = None, hole_under(cloud, located)
     if options.inpaint:
         progress("inpaint")
         # torch may be missing, and with it the training that inpainting ends with.
@@ -135,18 +134,13 @@ def prepare_scene(
 
         steps = {} if has_torch() else {"steps": 0}
         try:
-            filled = inpaint(
-                bare,
-                hole_under(cloud, located),
-                inpainter=options.inpainter,
-                options=InpaintOptions(margin=_HOLE_MARGIN, **steps),
-            )
+            filled = inpaint(bare, hole, inpainter=options.inpainter, options=InpaintOptions(**steps))
             notes = (*notes, *filled.notes)
         except UserError as error:
             # A floor with a hole is worth more than no animation.
             notes = (*notes, f"the floor under the object was not filled ({error})")
     background = bare if filled is None else filled.cloud
-    return PreparedScene(thing, background, bare, located.plane, located, (*located.notes, *notes), filled)
+    return PreparedScene(thing, background, bare, located.plane, hole, located, (*located.notes, *notes), filled)
 
 
 def take_apart(

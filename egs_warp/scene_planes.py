@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from egs_warp.bitmaps import connected_parts
 from egs_warp.camera_ring import ring_cameras, write_cameras
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
@@ -17,13 +18,19 @@ from egs_warp.plane import Plane
 from egs_warp.plane_file import write_planes
 from egs_warp.plane_fit import PlaneView, camera_rays, fit_plane
 from egs_warp.plane_search import find_planes
+from egs_warp.rectified import near_plane
 from egs_warp.render.rasteriser import render
 from egs_warp.render.video import write_png
 from egs_warp.scene_input import SceneInput
 from egs_warp.scene_pipeline import locate_plane
+from egs_warp.segmentation import lies_along
 
-_MIN_SUPPORT = 0.02
-"""Of the visible surface: less is no plane but an accident."""
+_MIN_SUPPORT = 0.005
+"""Of the visible surface that lies level: less is no plane but an accident."""
+_CELL = 0.1
+"""Of the object's size: cells of the grid on which a plane must be one patch."""
+_COVERED = 0.3
+"""Of a cell, for it to be part of the patch."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +81,31 @@ def planes_of_scene(given: SceneInput, *, plane_mask: str | None, view: str | No
         size = 2.0 * float(np.median(np.linalg.norm(points - centre, axis=1)))
         notes = ()
         facts = {"noise": fit.noise, "inlier_share": fit.inlier_share, "pixels": fit.pixel_count}
-    level = find_planes(given.cloud, plane.normal, count=count + 3, tilt_degrees=5.0) if count > 1 else []
-    others = [one for one in level if one.support > _MIN_SUPPORT and _differ(one.plane, plane, size)]
-    planes = [plane, *(one.plane for one in others[: count - 1])]
-    return ScenePlanes(planes, [facts, *({"support": one.support} for one in others[: count - 1])], centre, size, notes)
+    # Without this, slices of walls and of the object count, too.
+    level = given.cloud.subset(lies_along(given.cloud, plane))
+    others = [
+        one
+        for one in (find_planes(level, plane.normal, count=count + 3, tilt_degrees=5.0) if count > 1 else [])
+        if one.support > _MIN_SUPPORT
+        and _differ(one.plane, plane, size)
+        and _is_one_patch(level, one.plane, _CELL * size)
+    ][: count - 1]
+    planes = [plane, *(one.plane for one in others)]
+    if len(planes) < count:
+        notes = (*notes, f"{len(planes)} of {count} planes found")
+    return ScenePlanes(planes, [facts, *({"support": one.support} for one in others)], centre, size, notes)
+
+
+def _is_one_patch(level: GaussianCloud, plane: Plane, cell: float) -> bool:
+    """Whether one patch of well covered cells (scene units) holds most of what lies near ``plane``."""
+    near = level.subset(near_plane(level, plane, 0.5 * cell))
+    flat = near.means.numpy() @ np.stack(plane.tangents(), axis=1)
+    area = near.opacities() * np.exp(np.sort(near.log_scales.numpy(), axis=1)[:, 1:].sum(axis=1))
+    place = np.floor((flat - flat.min(axis=0)) / cell).astype(int)
+    cover = np.zeros(place.max(axis=0) + 1)
+    np.add.at(cover, tuple(place.T), area / cell**2)
+    parts, _ = connected_parts(cover > _COVERED)
+    return bool(np.bincount(parts.ravel(), cover.ravel())[1:].max(initial=0.0) > 0.5 * cover.sum())
 
 
 def _differ(a: Plane, b: Plane, size: float) -> bool:

@@ -130,6 +130,15 @@ def segment(cloud: GaussianCloud, plane: Plane, spec: ObjectSpec) -> Segmentatio
     return Segmentation(object_mask, buried, floaters, size)
 
 
+def lies_along(cloud: GaussianCloud, plane: Plane) -> np.ndarray:
+    """(n,) bool: flat Gaussians that lie along ``plane``, at whatever height, as a floor's do."""
+    scales = cloud.log_scales.numpy()
+    turns = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
+    thin = np.take_along_axis(turns, scales.argmin(axis=1)[:, None, None], axis=2)[:, :, 0]
+    ordered = np.sort(scales, axis=1)
+    return (np.abs(thin @ plane.normal) > 0.85) & (ordered[:, 1] - ordered[:, 0] > np.log(2.0))
+
+
 @dataclass(frozen=True)
 class _Scene:
     """What is asked of the capture again and again; all (n, ...)."""
@@ -149,11 +158,7 @@ class _Scene:
     @classmethod
     def of(cls, cloud: GaussianCloud, plane: Plane) -> _Scene:
         means, opacity = cloud.means.numpy().astype(np.float64), cloud.opacities()
-        scales = cloud.log_scales.numpy()
-        turns = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
-        thin = np.take_along_axis(turns, scales.argmin(axis=1)[:, None, None], axis=2)[:, :, 0]
-        ordered = np.sort(scales, axis=1)
-        level = (np.abs(thin @ plane.normal) > 0.85) & (ordered[:, 1] - ordered[:, 0] > np.log(2.0))
+        level = lies_along(cloud, plane)
         flat = means @ np.stack(plane.tangents(), axis=1)
         return cls(cloud, plane, means, flat, plane.heights(means), opacity, opacity >= _MIN_OPACITY, level)
 

@@ -199,12 +199,25 @@ def test_footprints_and_what_no_view_sees() -> None:
         unseen(PLANE, [MaskedView(up, np.ones((160, 160), bool))])
 
 
+def test_what_hangs_over_the_hole_stays() -> None:
+    """A shelf at the height of the hole's width is no floor; haze at the foot goes."""
+    truth, hole = floor(spacing=0.04), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
+    shelf = floor(spacing=0.04, half=0.4, height=2.0 * RADIUS)
+    background = joined(holed(truth, hole), shelf)
+    result, bare = (
+        inpaint(cloud, hole, inpainter=OpenCvInpainter(), options=InpaintOptions(steps=0))
+        for cloud in (background, holed(truth, hole))
+    )
+    assert np.count_nonzero(PLANE.heights(result.cloud.means.numpy()) > RADIUS) == shelf.count
+    assert result.removed == bare.removed > 0
+
+
 @pytest.mark.parametrize(
     ("place", "radius", "message"),
     [
         ((5.0, 5.0), 0.2, "the hole is off the floor: nothing lies on the plane around it"),
         ((1.3, 0.0), 0.35, "the hole is off the floor: only"),
-        ((0.0, 0.0), 1.1, "the hole covers nearly all of the floor; make it smaller"),
+        ((0.0, 0.0), 1.2, "the hole covers nearly all of the floor; make it smaller"),
         ((0.0, 0.0), 3.0, "the hole takes the whole capture; make it smaller"),
         ((0.0, 0.0), -1.0, "the hole's radius -1 must be a positive number"),
         ((0.0, 0.0), np.nan, "the hole's radius nan must be a positive number"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,13 +17,19 @@ from egs_warp.clearance import Clearing, ClearingOptions, clear_plane, reach_acr
 from egs_warp.cli import main
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
-from egs_warp.inpainters import OpenCvInpainter, OpenCvMethod
+from egs_warp.inpainters import OpenCvInpainter, OpenCvMethod, inpainter_by_name
+from egs_warp.inpainting import InpaintOptions, inpaint
 from egs_warp.io import read_capture, write_ply
 from egs_warp.plane import Plane
 from egs_warp.plane_file import read_planes, write_planes
 from egs_warp.render import render
 from egs_warp.render.ground import CapturedScene, ContactShadow
+from egs_warp.scene_input import SceneInput
+from egs_warp.scene_pictures import picture_cameras, plane_picture
 from egs_warp.scene_pipeline import PreparedScene, SceneOptions, prepare_scene, viewing_direction
+from egs_warp.scene_planes import planes_of_scene
+from egs_warp.scenes import scene
+from egs_warp.scenes.rooms import joined
 from egs_warp.segmentation import ObjectSpec, masks_from_selection
 from tests.test_segmentation import FLOOR, ball_on_floor
 
@@ -163,6 +170,51 @@ def test_photographs_beside_the_cameras_clear_the_plane(folder: Path) -> None:
 
     assert thing.count - 10 <= tuned.count <= thing.count
     assert crossing(tuned) < 0.6 * crossing(thing)
+
+
+def test_inpaint_fills_the_hole_that_animate_fills(folder: Path, tmp_path: Path) -> None:
+    """Outline and margin go from segment to inpaint by plane.json; an object elsewhere has its own foot."""
+    cloud, spec = read_capture(folder / "scene.ply").cloud, ObjectSpec(point=np.array([0.0, -0.5, 0.5]))
+    flags = ["--object", "0,-0.5,0.5", "--plane", "0,0,1,0", "--straddling", "split", "--out", str(tmp_path)]
+    assert main(["segment", str(folder / "scene.ply"), *flags]) == 0
+    options = SceneOptions(clearing=Clearing.SPLIT, inpaint=False)
+    prepared = prepare_scene(cloud, spec, plane=FLOOR, options=options)
+    expected = inpaint(
+        prepared.bare, prepared.hole, inpainter=inpainter_by_name("ns"), options=InpaintOptions(steps=0)
+    ).cloud.means.numpy()
+    files = [str(tmp_path / "background.ply"), "--plane", str(tmp_path / "plane.json"), "--steps", "0"]
+    filled = tmp_path / "filled.ply"
+    for thing in ([], ["--object", str(tmp_path / "object.ply")]):
+        assert main(["inpaint", *files, *thing, "--inpainter", "ns", "--out", str(filled)]) == 0
+        np.testing.assert_allclose(read_capture(filled).cloud.means.numpy(), expected, atol=1e-5)
+    thing = read_capture(tmp_path / "object.ply").cloud
+    fields = (getattr(thing, name).numpy() for name in ("rotations", "log_scales", "opacity_logits", "sh"))
+    away = GaussianCloud.from_numpy(thing.means.numpy() + [1.2, 0.0, 0.0], *fields)
+    write_ply(tmp_path / "away.ply", away)
+    picture = ["--inpainter", "ns", "--out", str(filled), "--object", str(tmp_path / "away.ply")]
+    assert main(["inpaint", *files, *picture]) == 0
+    assert not np.array_equal(read_capture(filled).cloud.means.numpy(), expected)
+    entry = json.loads((tmp_path / "plane.json").read_text())["planes"][0]
+    for damage in ({"texels": 5}, {"outlines": [["a"]]}):
+        broken = {"planes": [entry | {"hole": entry["hole"] | damage}]}
+        (tmp_path / "plane.json").write_text(json.dumps(broken))
+        assert main(["inpaint", *files, "--out", str(filled)]) == 2
+
+
+def test_further_planes_are_level_patches_in_colours_of_their_own() -> None:
+    """Beside a bedroom's floor only the stool's board and cushion are level; slices of walls and legs are no planes."""
+    made = scene("stool")
+    cloud = joined(made.background, made.object)
+    given = SceneInput(cloud, [], ObjectSpec(point=np.array([0.0, 0.0, 0.68])), None, made.plane, ())
+    found = planes_of_scene(given, plane_mask=None, view=None, count=5)
+    assert [-one.offset for one in found.planes] == pytest.approx([0.0, 0.52, 0.68], abs=0.01)
+    assert all(one.normal[2] > np.cos(np.radians(1.0)) for one in found.planes)
+    assert found.notes[-1] == "3 of 5 planes found"
+    cameras = picture_cameras(made.plane, found.centre, found.size)[1:2]
+    picture = plane_picture(cloud, found.planes[:2], cameras, centre=found.centre, size=found.size).astype(float)
+    red, green, _ = np.moveaxis(picture, -1, 0)
+    assert (red - green > 90).mean() > 0.01
+    assert (green - red > 60).mean() > 0.002
 
 
 def test_plane_files_are_checked(tmp_path: Path) -> None:

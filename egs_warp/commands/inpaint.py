@@ -17,7 +17,9 @@ def add_parser(commands) -> None:
     inpaint = commands.add_parser("inpaint", help="close the hole in the floor that an object leaves")
     inpaint.add_argument("background", help="capture without the object, as segment writes it; any format")
     inpaint.add_argument("--plane", required=True, help="plane.json, as plane writes it, or nx,ny,nz,d")
-    inpaint.add_argument("--object", help="capture of the object: the floor under its foot is the hole")
+    inpaint.add_argument(
+        "--object", help="capture of the object: the hole is under its foot, as segment's plane.json says"
+    )
     inpaint.add_argument("--mask", help="PNG of the object, or a folder of them: the floor that none of them sees")
     inpaint.add_argument("--cameras", help="cameras of the masks: cameras.json, transforms.json, a COLMAP model")
     inpaint.add_argument("--view", help="name or number of the camera of a single mask")
@@ -26,7 +28,7 @@ def add_parser(commands) -> None:
     inpaint.add_argument("--picture", type=Path, help="before, after and depth as PNG (--out with .png)")
     inpaint.add_argument("--inpainter", default="patch", help="patch (default), telea, ns, or LaMa's TorchScript file")
     inpaint.add_argument("--steps", type=int, help="of training against the inpainted picture (100); 0: no PyTorch")
-    inpaint.add_argument("--margin", type=float, help="by how much the hole is made larger, of its side (0.04)")
+    inpaint.add_argument("--margin", type=float, help="by how much the hole is made larger, of its side (0.01)")
     inpaint.add_argument("--seed", type=int, default=0, help="of the patch search (0)")
     inpaint.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
     inpaint.set_defaults(run=_inpaint)
@@ -46,13 +48,17 @@ def _inpaint(chosen: argparse.Namespace) -> int:
     options = InpaintOptions(**{name: value for name, value in given.items() if value is not None})
     if chosen.out.suffix.lower() != ".ply":
         raise UserError(f"--out {chosen.out}: give the name of a .ply file")
-    if sum([chosen.object is not None, chosen.mask is not None, chosen.hole is not None]) != 1:
-        raise UserError("inpaint: say where the hole is by one of --object, --mask with --cameras, or --hole")
+    plane, recorded = _plane(chosen.plane)
+    said = sum([chosen.object is not None, chosen.mask is not None, chosen.hole is not None])
+    if said > 1 or (said == 0 and recorded is None):
+        raise UserError(
+            "inpaint: say where the hole is by one of --object, --mask with --cameras, or --hole,"
+            " or give the plane.json that segment wrote by --plane"
+        )
     check_device(chosen.device)
     inpainter = inpainter_by_name(chosen.inpainter, seed=chosen.seed, device=chosen.device)
-    plane = _plane(chosen.plane)
     background = read_capture(chosen.background, device=chosen.device)
-    hole = _hole(chosen, plane, background.cloud)
+    hole = _hole(chosen, plane, recorded, background.cloud)
     result = inpaint(background.cloud, hole, inpainter=inpainter, options=options)
     write_ply(chosen.out, result.cloud)
     picture = chosen.picture or chosen.out.with_suffix(".png")
@@ -63,27 +69,36 @@ def _inpaint(chosen: argparse.Namespace) -> int:
     return 0
 
 
-def _plane(text: str) -> Any:
+def _plane(text: str) -> tuple[Any, Any]:
+    """The plane, and the hole that ``segment`` found in it, if it did."""
     if not text.lower().endswith(".json"):
-        return parse_plane(text)
-    from egs_warp.plane_file import read_planes
+        return parse_plane(text), None
+    from egs_warp.holes import Hole
+    from egs_warp.plane_file import read_planes_and_facts
 
-    return read_planes(text)[0]
+    plane, facts = read_planes_and_facts(text)[0]
+    return plane, Hole.from_facts(plane, facts["hole"]) if "hole" in facts else None
 
 
-def _hole(chosen: argparse.Namespace, plane: Any, background: Any) -> Any:
+def _hole(chosen: argparse.Namespace, plane: Any, recorded: Any, background: Any) -> Any:
     from egs_warp.holes import disc, footprint, unseen
     from egs_warp.io import read_cameras, read_capture
     from egs_warp.object_input import read_object
 
     if chosen.object is not None:
-        return footprint(read_capture(chosen.object, device=chosen.device).cloud, plane)
+        thing = read_capture(chosen.object, device=chosen.device).cloud
+        # The hole may be another object's.
+        if recorded is None or not recorded.window.sample(recorded.mask, thing.means.numpy()).any():
+            return footprint(thing, plane)
+        return recorded
     if chosen.hole is not None:
         try:
             x, y, z, radius = (float(part) for part in chosen.hole.split(","))
         except ValueError as error:
             raise UserError(f"--hole {chosen.hole}: give four numbers x,y,z,radius") from error
         return disc(plane, np.array([x, y, z]), radius)
+    if chosen.mask is None:
+        return recorded
     if not Path(chosen.mask).exists():
         raise UserError(f"--mask {chosen.mask}: no such file or folder; give a PNG or a folder of them")
     if chosen.cameras is None:
