@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -97,11 +97,17 @@ class PreparedScene:
     filled: InpaintResult | None = None
     """How the background got its new floor; None where it got none."""
 
-    def write(self, folder: Path) -> None:
-        """``object.ply``, ``background.ply`` and ``plane.json`` into ``folder``."""
+    def write(self, folder: Path, known: Sequence[tuple[Plane, Mapping[str, object]]] = ()) -> None:
+        """``object.ply``, ``background.ply`` and ``plane.json`` into ``folder``.
+
+        ``known`` is what the file that gave the plane held; what is not found anew goes along.
+        """
         write_ply(folder / "object.ply", self.object)
         write_ply(folder / "background.ply", self.background)
-        write_planes(folder / "plane.json", [self.plane], facts=[self.located.facts() | {"hole": self.hole.facts()}])
+        facts = dict(known[0][1]) if known else {}
+        facts |= self.located.facts() | {"hole": self.hole.facts()}
+        entries = [(self.plane, facts), *known[1:]]
+        write_planes(folder / "plane.json", [plane for plane, _ in entries], facts=[said for _, said in entries])
 
 
 def prepare_scene(

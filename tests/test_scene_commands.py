@@ -21,7 +21,7 @@ from egs_warp.inpainters import OpenCvInpainter, OpenCvMethod, inpainter_by_name
 from egs_warp.inpainting import InpaintOptions, inpaint
 from egs_warp.io import read_capture, write_ply
 from egs_warp.plane import Plane
-from egs_warp.plane_file import read_planes, write_planes
+from egs_warp.plane_file import read_planes, read_planes_and_facts, write_planes
 from egs_warp.render import render
 from egs_warp.render.ground import CapturedScene, ContactShadow
 from egs_warp.scene_input import SceneInput
@@ -71,8 +71,16 @@ def test_plane_then_segment_take_each_others_files(folder: Path, tmp_path: Path)
     with Image.open(tmp_path / "plane" / "plane.png") as picture:
         red, green, _ = np.moveaxis(np.asarray(picture, float), -1, 0)
         assert (red - green > 90).mean() > 0.01, "no grid in the picture"
-    flags = ["--plane", str(tmp_path / "plane" / "plane.json"), "--straddling", "split"]
+    found = read_planes_and_facts(tmp_path / "plane" / "plane.json")
+    found.append((Plane.from_coefficients(0.0, 0.0, 1.0, -0.8), {"support": 0.1}))
+    (tmp_path / "parts").mkdir()
+    path = tmp_path / "parts" / "plane.json"
+    write_planes(path, [one for one, _ in found], facts=[facts for _, facts in found])
+    flags = ["--plane", str(path), "--straddling", "split"]
     assert main(["segment", scene, *shared, *flags, "--out", str(tmp_path / "parts")]) == 0
+    first, second = read_planes_and_facts(path)
+    assert first[1].keys() == found[0][1].keys() | {"hole"} and first[1]["noise"] == found[0][1]["noise"]
+    assert second[0].offset == -0.8 and second[1] == {"support": 0.1}
     thing = read_capture(tmp_path / "parts" / "object.ply").cloud
     rest = read_capture(tmp_path / "parts" / "background.ply").cloud
     assert 1450 < thing.count <= 1525

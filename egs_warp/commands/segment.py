@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egs_warp.scene_input import add_scene_flags, read_scene, say
@@ -43,6 +44,7 @@ def _segment(chosen: argparse.Namespace) -> int:
     wp.config.log_level = wp.LOG_WARNING
     from egs_warp.errors import UserError
     from egs_warp.io.atomic import writable_folder
+    from egs_warp.plane_file import read_planes_and_facts
     from egs_warp.render.video import write_png
     from egs_warp.scene_pictures import picture_cameras, segmentation_picture
     from egs_warp.scene_pipeline import SceneOptions, prepare_scene
@@ -50,6 +52,7 @@ def _segment(chosen: argparse.Namespace) -> int:
     if not chosen.object:
         raise UserError("segment: give --object: a mask, a point, a box or a pixel")
     given = read_scene(chosen)
+    known = read_planes_and_facts(chosen.plane) if chosen.plane and Path(chosen.plane).is_file() else []
     folder = writable_folder(chosen.out)
     scene = prepare_scene(
         given.cloud,
@@ -62,7 +65,7 @@ def _segment(chosen: argparse.Namespace) -> int:
     )
     for note in (*given.notes, *scene.notes):
         say(note)
-    scene.write(folder)
+    scene.write(folder, known)
     cameras = picture_cameras(scene.plane, scene.located.centre, scene.located.size, given.cameras)
     write_png(folder / "segment.png", segmentation_picture(given.cloud, scene.object, scene.background, cameras))
     print(f"object: {scene.object.count} Gaussians, background: {scene.background.count}")
