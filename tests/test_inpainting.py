@@ -256,7 +256,12 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     camera = look(0.4, 0.8)
     assert render(filled, camera).alpha.numpy()[70:90, 70:90].min() > 0.97
     assert (tmp_path / "filled.png").stat().st_size > 10_000
+    before = (tmp_path / "filled.ply").read_bytes()
+    quick = [*files, str(tmp_path / "filled.ply"), *where, "--steps", "0", "--inpainter", "telea", "--picture"]
     for flags, message in (
+        ([*quick, str(tmp_path / "gone" / "a.png")], "a.png: its folder does not exist; create"),
+        ([*quick, str(tmp_path / "a.jpg")], "a.jpg: give the name of a .png file"),
+        ([*files, str(tmp_path / "gone" / "a.ply"), *where], "a.ply: its folder does not exist; create"),
         ([*files, "a.ply"], "say where the hole is by one of --object, --mask with --cameras, or --hole"),
         ([*files, "a.txt", *where], "--out a.txt: give the name of a .ply file"),
         ([*files, "a.ply", "--hole", "1,2"], "--hole 1,2: give four numbers x,y,z,radius"),
@@ -273,3 +278,4 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["inpaint", *flags]) == 2
         error = capsys.readouterr().err
         assert message in error and error.count("\n") == 1
+    assert (tmp_path / "filled.ply").read_bytes() == before

@@ -48,6 +48,12 @@ def _inpaint(chosen: argparse.Namespace) -> int:
     options = InpaintOptions(**{name: value for name, value in given.items() if value is not None})
     if chosen.out.suffix.lower() != ".ply":
         raise UserError(f"--out {chosen.out}: give the name of a .ply file")
+    picture = chosen.picture or chosen.out.with_suffix(".png")
+    if picture.suffix.lower() != ".png":
+        raise UserError(f"--picture {picture}: give the name of a .png file")
+    for file in (chosen.out, picture):
+        if not file.parent.is_dir():
+            raise UserError(f"{file}: its folder does not exist; create {file.parent} first")
     plane, recorded = _plane(chosen.plane)
     said = sum([chosen.object is not None, chosen.mask is not None, chosen.hole is not None])
     if said > 1 or (said == 0 and recorded is None):
@@ -61,7 +67,6 @@ def _inpaint(chosen: argparse.Namespace) -> int:
     hole = _hole(chosen, plane, recorded, background.cloud)
     result = inpaint(background.cloud, hole, inpainter=inpainter, options=options)
     write_ply(chosen.out, result.cloud)
-    picture = chosen.picture or chosen.out.with_suffix(".png")
     write_png(picture, before_and_after(result))
     for note in (*background.notes, *result.notes):
         print(f"note: {note}")
