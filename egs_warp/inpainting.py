@@ -31,7 +31,7 @@ the hole join it anyway. With 0.03 and more, a sheet under a plush toy lost part
 _THICKNESS = 0.15
 """Of the hole's side: what lies nearer to the plane is floor."""
 _HAZE = 0.25
-"""Of the hole's side: what lies nearer to the plane over or under the hole is floor or haze at the object's foot."""
+"""Of the hole's side: what lies lower over the hole is floor or haze at the object's foot."""
 _KNOWN = 0.6
 """Opacity of the floor above which its colour is trusted."""
 _SOLID = 0.3
@@ -175,9 +175,11 @@ def _look(background: GaussianCloud, hole: Hole, margin: float) -> tuple[PlaneWi
 
 
 def _in_hole(background: GaussianCloud, window: PlaneWindow, mask: np.ndarray, side: float) -> np.ndarray:
-    """(n,) bool: Gaussians of the floor or of haze over or under the hole; not what hangs over it."""
+    """(n,) bool: Gaussians of the floor or of haze over the hole, not what hangs higher; and those under it, as deep as
+    it is wide, which show beyond a thin floor's edge."""
     means = background.means.numpy()
-    return window.sample(mask, means) & near_plane(background, window.plane, _HAZE * side)
+    heights = window.plane.heights(means)
+    return window.sample(mask, means) & (heights > -side) & (heights < _HAZE * side)
 
 
 def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
