@@ -17,7 +17,7 @@ from egs_warp.object_input import read_object
 from egs_warp.plane import Plane
 from egs_warp.plane_file import write_planes
 from egs_warp.plane_fit import PlaneView, camera_rays, fit_plane
-from egs_warp.plane_search import find_planes
+from egs_warp.plane_search import FoundPlane, find_planes
 from egs_warp.rectified import near_plane
 from egs_warp.render.rasteriser import render
 from egs_warp.render.video import write_png
@@ -81,19 +81,27 @@ def planes_of_scene(given: SceneInput, *, plane_mask: str | None, view: str | No
         size = 2.0 * float(np.median(np.linalg.norm(points - centre, axis=1)))
         notes = ()
         facts = {"noise": fit.noise, "inlier_share": fit.inlier_share, "pixels": fit.pixel_count}
-    # Without this, slices of walls and of the object count, too.
-    level = given.cloud.subset(lies_along(given.cloud, plane))
-    others = [
-        one
-        for one in (find_planes(level, plane.normal, count=count + 3, tilt_degrees=5.0) if count > 1 else [])
-        if one.support > _MIN_SUPPORT
-        and _differ(one.plane, plane, size)
-        and _is_one_patch(level, one.plane, _CELL * size)
-    ][: count - 1]
+    others = _further(given.cloud, plane, size, count - 1) if count > 1 else []
     planes = [plane, *(one.plane for one in others)]
     if len(planes) < count:
         notes = (*notes, f"{len(planes)} of {count} planes found")
     return ScenePlanes(planes, [facts, *({"support": one.support} for one in others)], centre, size, notes)
+
+
+def _further(cloud: GaussianCloud, plane: Plane, size: float, count: int) -> list[FoundPlane]:
+    """At most ``count`` other planes level with ``plane``, widest first."""
+    # Without this, slices of walls and of the object count, too.
+    lying = lies_along(cloud, plane)
+    if not lying.any():
+        return []
+    level = cloud.subset(lying)
+    return [
+        one
+        for one in find_planes(level, plane.normal, count=count + 4, tilt_degrees=5.0)
+        if one.support > _MIN_SUPPORT
+        and _differ(one.plane, plane, size)
+        and _is_one_patch(level, one.plane, _CELL * size)
+    ][:count]
 
 
 def _is_one_patch(level: GaussianCloud, plane: Plane, cell: float) -> bool:

@@ -1,11 +1,9 @@
-"""The commands from a scene to its parts: files, one line for every mistake; and what the animation is drawn over."""
+"""The commands from a scene to its parts: files, and one line for every mistake."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,16 +15,15 @@ from egs_warp.clearance import Clearing, ClearingOptions, clear_plane, reach_acr
 from egs_warp.cli import main
 from egs_warp.errors import UserError
 from egs_warp.gaussians import GaussianCloud
-from egs_warp.inpainters import OpenCvInpainter, OpenCvMethod, inpainter_by_name
+from egs_warp.inpainters import inpainter_by_name
 from egs_warp.inpainting import InpaintOptions, inpaint
 from egs_warp.io import read_capture, write_ply
 from egs_warp.plane import Plane
 from egs_warp.plane_file import read_planes, read_planes_and_facts, write_planes
 from egs_warp.render import render
-from egs_warp.render.ground import CapturedScene, ContactShadow
 from egs_warp.scene_input import SceneInput
 from egs_warp.scene_pictures import picture_cameras, plane_picture
-from egs_warp.scene_pipeline import PreparedScene, SceneOptions, prepare_scene, viewing_direction
+from egs_warp.scene_pipeline import SceneOptions, prepare_scene, viewing_direction
 from egs_warp.scene_planes import planes_of_scene
 from egs_warp.scenes import scene
 from egs_warp.scenes.rooms import joined
@@ -53,13 +50,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     away = Camera.look_at(np.array([0.0, 0.0, 9.0]), np.array([0.0, 1.0, 20.0]), np.eye(3)[1], width=96, height=96)
     write_cameras(path / "away.json", [away], ["photo1.png"])
     return path
-
-
-@pytest.fixture(scope="module")
-def prepared() -> PreparedScene:
-    """The ball taken off its floor, whose hole is left."""
-    options = SceneOptions(clearing=Clearing.SPLIT, inpaint=False)
-    return prepare_scene(ball_on_floor()[0], ObjectSpec(point=np.array([0.0, -0.5, 0.5])), options=options)
 
 
 def test_plane_then_segment_take_each_others_files(folder: Path, tmp_path: Path) -> None:
@@ -225,6 +215,25 @@ def test_further_planes_are_level_patches_in_colours_of_their_own() -> None:
     assert (green - red > 60).mean() > 0.002
 
 
+def test_a_capture_with_nothing_flat_has_one_plane() -> None:
+    """Round Gaussians on a grid: the plane that is given, and none beside it."""
+    x, y = (values.ravel() for values in np.meshgrid(np.linspace(-1.0, 1.0, 40), np.linspace(-1.0, 1.0, 40)))
+    means = np.stack([x, y, np.zeros_like(x)], axis=1)
+    box = (np.abs(x) < 0.2) & (np.abs(y) < 0.2)
+    means = np.concatenate([means, *(means[box] + [0.0, 0.0, height] for height in np.linspace(0.03, 0.6, 12))])
+    count = len(means)
+    cloud = GaussianCloud.from_numpy(
+        means,
+        np.tile([1.0, 0, 0, 0], (count, 1)),
+        np.full((count, 3), -3.5),
+        np.full(count, 4.0),
+        np.zeros((count, 1, 3)),
+    )
+    given = SceneInput(cloud, [], ObjectSpec(point=np.array([0.0, 0.0, 0.3])), None, FLOOR, ())
+    found = planes_of_scene(given, plane_mask=None, view=None, count=2)
+    assert len(found.planes) == 1 and found.notes[-1] == "1 of 2 planes found"
+
+
 def test_plane_files_are_checked(tmp_path: Path) -> None:
     path = tmp_path / "plane.json"
     planes = [FLOOR, Plane.from_coefficients(0.0, 1.0, 0.0, 2.0)]
@@ -241,187 +250,6 @@ def test_plane_files_are_checked(tmp_path: Path) -> None:
         path.write_text(text)
         with pytest.raises(UserError, match=message):
             read_planes(path)
-
-
-def test_the_shadow_falls_where_the_floor_is_seen() -> None:
-    """Darker under the body, unchanged elsewhere and on what hides the floor; softer and paler from above."""
-    cloud, truth = ball_on_floor()
-    floor = cloud.subset(~truth)
-    camera = Camera.look_at(np.array([0.0, -4.0, 2.5]), np.zeros(3), np.eye(3)[2], width=120, height=120)
-    where = {"centre": np.zeros(3), "reach": 2.0}
-    fields = ("rotations", "log_scales", "opacity_logits", "sh")
-
-    def placed(source: GaussianCloud, means: np.ndarray) -> GaussianCloud:
-        return GaussianCloud.from_numpy(means, *(getattr(source, name).numpy() for name in fields))
-
-    ball = cloud.subset(truth)
-    body = placed(ball, ball.means.numpy() * [1.0, 1.0, 0.1])
-    bare = CapturedScene(floor, camera, FLOOR, **where, shadow=False).background(body, height=1.0)
-    dark = CapturedScene(floor, camera, FLOOR, **where).background(body, height=1.0)
-    shadow = ContactShadow(camera, FLOOR, **where)
-    away = np.linalg.norm(shadow.flat, axis=-1)
-    under, far = shadow.hit & (away < 0.2), shadow.hit & (away > 1.2)
-    assert dark[under].mean() < 0.75 * bare[under].mean()
-    np.testing.assert_array_equal(dark[far], bare[far])
-    lifted = shadow.darkness(placed(body, body.means.numpy() + [0.0, 0.0, 0.4]), height=1.0)
-    assert 0.0 < lifted.max() < shadow.darkness(body, height=1.0).max() <= 0.5
-    # A wall in front of the floor takes no shadow.
-    wall = placed(floor, floor.means.numpy()[:, [0, 2, 1]] + [0.0, -1.2, 1.0])
-    plain, shaded = (
-        CapturedScene(wall, camera, FLOOR, **where, shadow=one).background(body, height=1.0) for one in (False, True)
-    )
-    np.testing.assert_allclose(shaded, plain, atol=0.02)
-
-
-def test_the_shadow_lies_on_an_uneven_floor_without_an_edge() -> None:
-    """Half of a floor that stands 3 % of the reach above the fitted plane, as sheets do, bears nearly the same shadow; at a
-    terrace too high for it the shadow ends, but not from one pixel to the next."""
-    cloud, truth = ball_on_floor()
-    camera = Camera.look_at(np.array([0.0, -4.0, 2.5]), np.zeros(3), np.eye(3)[2], width=120, height=120)
-    fields = ("rotations", "log_scales", "opacity_logits", "sh")
-
-    def placed(source: GaussianCloud, means: np.ndarray) -> GaussianCloud:
-        return GaussianCloud.from_numpy(means, *(getattr(source, name).numpy() for name in fields))
-
-    flat = cloud.subset(~truth)
-    body = placed(cloud.subset(truth), cloud.subset(truth).means.numpy() * [1.0, 1.0, 0.1])
-    darkness = []
-    for step in (0.0, 0.06, 0.4):
-        floor = placed(flat, flat.means.numpy() + np.outer(flat.means.numpy()[:, 0] > 0.0, [0.0, 0.0, step]))
-        bare, dark = (
-            CapturedScene(floor, camera, FLOOR, centre=np.zeros(3), reach=2.0, shadow=one).background(body, height=1.0)
-            for one in (False, True)
-        )
-        darkness.append(1.0 - dark.mean(axis=2) / np.maximum(bare.mean(axis=2), 1e-3))
-    even, uneven, terrace = darkness
-    right = np.s_[:, 62:]
-    assert uneven[right].sum() > 0.8 * even[right].sum()
-    assert terrace[right].sum() < 0.3 * even[right].sum()
-    assert np.abs(np.diff(terrace, axis=1)).max() < 1.5 * np.abs(np.diff(even, axis=1)).max()
-
-
-@pytest.mark.parametrize(
-    ("flags", "message"),
-    [
-        (["--motion", "nothing"], "unknown motion 'nothing'"),
-        (["--motion", "twist 180", "--distance", "nan"], "--distance nan"),
-        (["--motion", "trajectory {tmp}/no.json"], "no.json: cannot be read"),
-        (["--muscles", "{tmp}/no.json"], "no.json: cannot be read"),
-        (["--terrain", "{tmp}/no.json"], "no.json: cannot be read"),
-        (["--inpainter", "lama"], "--inpainter lama: give patch, telea, ns or a TorchScript file"),
-        (["--inpainter", "ns", "--no-inpaint"], "--inpainter: --no-inpaint leaves the floor as captured"),
-        (["--object", ""], "--object: nothing is given; give a mask.png"),
-        (["--object", "0,0,0.5", "--up", ""], "--up : give one of x, y, z"),
-        (["--background", "{tmp}/no.ply"], "--background: with --object the rest of the scene is behind the object"),
-    ],
-)
-def test_a_slip_is_told_before_the_scene_is_taken_apart(
-    folder: Path,
-    tmp_path: Path,
-    flags: list[str],
-    message: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def too_late(*_: object, **__: object) -> None:
-        pytest.fail("the scene is being taken apart")
-
-    monkeypatch.setattr("egs_warp.scene_pipeline.prepare_scene", too_late)
-    given = [flag.format(tmp=tmp_path) for flag in flags]
-    scene = ["animate", str(folder / "scene.ply"), "--object", "0,0,0.5", "--out", str(tmp_path / "out")]
-    assert main([*scene, *given]) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    "flags",
-    [
-        ["--cameras", "no.json"],
-        ["--view", "0"],
-        ["--no-inpaint"],
-        ["--inpainter", "ns"],
-        ["--straddling", "split"],
-    ],
-)
-def test_what_only_a_scene_takes_needs_the_object(
-    folder: Path, tmp_path: Path, flags: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["animate", str(folder / "scene.ply"), *flags, "--out", str(tmp_path / "out")]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith(f"egs-warp: {flags[0]}: needs --object") and error.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
-def _noting(told: dict[str, Any]) -> Callable[..., None]:
-    """Stands for a function: ends the command, and keeps the arguments that it was given by name."""
-
-    def note(*_: object, **named: Any) -> None:
-        told.update(named)
-        raise UserError("far enough")
-
-    return note
-
-
-def test_animate_passes_on_how_the_scene_is_taken_apart(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    told: dict[str, Any] = {}
-    monkeypatch.setattr("egs_warp.scene_pipeline.prepare_scene", _noting(told))
-    flags = ["--object", "0,0,0.5", "--inpainter", "ns", "--straddling", "remove", "--out", str(tmp_path / "out")]
-    assert main(["animate", str(folder / "scene.ply"), *flags]) == 2
-    assert told["options"].inpainter == OpenCvInpainter(OpenCvMethod.NAVIER_STOKES)
-    assert told["options"].clearing is Clearing.REMOVE
-
-
-def test_the_parts_of_earlier_steps_are_animated(
-    tmp_path: Path, prepared: PreparedScene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    prepared.write(tmp_path)
-    told: dict[str, Any] = {}
-    monkeypatch.setattr("egs_warp.animation.animate", _noting(told))
-    flags = ["--plane", str(tmp_path / "plane.json"), "--background", str(tmp_path / "background.ply")]
-    assert main(["animate", str(tmp_path / "object.ply"), *flags, "--out", str(tmp_path / "out")]) == 2
-    assert told["background"].count == prepared.background.count
-    np.testing.assert_allclose(told["plane"].normal, prepared.plane.normal, atol=1e-9)
-
-
-def test_one_command_from_a_scene_to_a_film(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """As without PyTorch, whose training takes a minute."""
-    monkeypatch.setattr("egs_warp.scene_pipeline.has_torch", lambda: False)
-    scene, out = str(folder / "scene.ply"), tmp_path / "out"
-    flags = ["--object", "0,-0.5,0.5", "--frames", "1", "--size", "64", "--out", str(out)]
-    assert main(["animate", scene, *flags]) == 0
-    wrote = capsys.readouterr().out.splitlines()[-1]
-    assert (out / "jump.mp4").stat().st_size > 0
-    parts, pictures = ("object.ply", "background.ply", "plane.json"), ("plane.png", "segment.png", "filled.png")
-    for name in ("sheet.png", "report.json", "trajectory.npz", *parts, *pictures):
-        assert (out / name).stat().st_size > 0 and name in wrote
-    rest = read_capture(out / "background.ply").cloud.means.numpy()
-    ball = read_capture(out / "object.ply").cloud.means.numpy()
-    assert not ((rest[:, 2] > 0.05) & (np.linalg.norm(rest - [0.0, 0.0, 0.5], axis=1) < 0.55)).any()
-    assert (np.linalg.norm(ball - [0.0, 0.0, 0.5], axis=1) < 0.55).sum() > 1400
-    # There is floor where it stood.
-    assert ((np.abs(rest[:, 2]) < 0.05) & (np.linalg.norm(rest[:, :2], axis=1) < 0.1)).sum() > 20
-
-
-def test_an_animation_that_fails_loses_none_of_the_parts(
-    folder: Path, tmp_path: Path, prepared: PreparedScene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def failing(*_: object, **__: object) -> None:
-        raise UserError("animate: cannot")
-
-    monkeypatch.setattr("egs_warp.scene_pipeline.prepare_scene", lambda *_, **__: prepared)
-    monkeypatch.setattr("egs_warp.animation.animate", failing)
-    out = tmp_path / "out"
-    assert main(["animate", str(folder / "scene.ply"), "--object", "0,0,0.5", "--out", str(out)]) == 2
-    assert read_capture(out / "object.ply").cloud.count == prepared.object.count
-    assert read_capture(out / "background.ply").cloud.count == prepared.background.count
-    for name in ("plane.json", "plane.png", "segment.png"):
-        assert (out / name).is_file()
-    assert not (out / "filled.png").exists(), "no floor was filled"
 
 
 def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:

@@ -12,7 +12,9 @@ def add_parser(commands) -> None:
     plane = commands.add_parser("plane", help="find the plane that an object of a scene rests on")
     add_scene_flags(plane)
     plane.add_argument("--plane-mask", help="mask.png or folder: the plane is fitted to what these masks show")
-    plane.add_argument("--count", type=int, default=1, help="list this many planes, widest first, after that one (1)")
+    plane.add_argument(
+        "--count", type=int, default=1, help="planes to list: that one, then the widest level with it (1)"
+    )
     plane.set_defaults(run=_plane)
 
 
