@@ -63,8 +63,9 @@ class AnimateOptions:
             raise UserError(f"--size {self.size}: give a number of pixels from 16 to {LARGEST_SIZE}")
         if not 0.0 <= self.friction <= LARGEST_FRICTION:
             raise UserError(f"--friction {self.friction}: give a Coulomb coefficient from 0 to {LARGEST_FRICTION:g}")
-        if self.metres_per_unit is not None and not (np.isfinite(self.metres_per_unit) and self.metres_per_unit > 0.0):
-            raise UserError(f"--metres-per-unit {self.metres_per_unit}: give a positive number")
+        if self.metres_per_unit is not None and not 1e-9 <= self.metres_per_unit <= 1e9:
+            # Single precision holds no lengths far beyond; ``make_body`` says which of these fit the body.
+            raise UserError(f"--metres-per-unit {self.metres_per_unit}: give a positive number, from 1e-9 to 1e9")
 
     def targets(self) -> dict[str, float | None]:
         """By the names that a script gives them."""

@@ -185,9 +185,6 @@ def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
     numbers = ("distance", "height", "heading_degrees", "frames", "size", "seed", "metres_per_unit", "friction")
     given = {name: getattr(chosen, name) for name in numbers if getattr(chosen, name) is not None}
     options = AnimateOptions(**given, shadow=not chosen.no_shadow)
-    # Single precision holds no lengths far beyond; ``make_body`` says which of these fit the body.
-    if options.metres_per_unit is not None and not 1e-9 <= options.metres_per_unit <= 1e9:
-        raise UserError(f"--metres-per-unit {options.metres_per_unit}: give a number from 1e-9 to 1e9")
     # The files of key frames are read, too.
     longest(parse_script(chosen.motion, defaults=options.targets()))
     if chosen.muscles is not None:
