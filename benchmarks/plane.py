@@ -115,7 +115,7 @@ def real_row(name: str, click: tuple[float, float, float], radius: float, device
     point = np.array(click)
     try:
         found = segment(cloud, coarse, ObjectSpec(point=point))
-        thing = found.object_mask | found.buried_mask
+        thing = ~found.background_mask
     except UserError:
         thing = None  # The robot of playbot hovers; its tile is a plane all the same.
     middle = point - coarse.heights(point) * coarse.normal

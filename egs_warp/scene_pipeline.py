@@ -250,9 +250,7 @@ def locate_plane(
     else:
         level = centre - coarse.heights(centre) * coarse.normal
         views = ring_cameras(coarse, level, radius, count=9, elevations=_PLANE_ELEVATIONS, size=_PLANE_SIDE)
-    fit = refine_plane(
-        cloud, coarse, views, centre=centre, radius=radius, object_mask=found.object_mask | found.buried_mask
-    )
+    fit = refine_plane(cloud, coarse, views, centre=centre, radius=radius, object_mask=~found.background_mask)
     found = segment(cloud, fit.plane, spec)
     notes.append(
         f"plane {','.join(f'{x:.4f}' for x in (*fit.plane.normal, fit.plane.offset))}: fits {fit.pixel_count} pixels "
