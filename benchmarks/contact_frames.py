@@ -9,24 +9,24 @@ from pathlib import Path
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
-from egs_warp.base_plane import find_base_plane
-from egs_warp.body import BodyState, make_body
-from egs_warp.cage import build_cage
-from egs_warp.complementarity import ContactLayout, states_from_prediction
-from egs_warp.contact import contact_geometry
-from egs_warp.contact_program import ContactProgram, CostScales, contact_program, linear_response
-from egs_warp.contact_step import contact_step
-from egs_warp.dynamics import ImplicitStep, conserve_angular_momentum
-from egs_warp.factorisation import Factorisation
+from egs_warp.assets import pawn, stool
+from egs_warp.contact.corrector import contact_step
+from egs_warp.contact.detection import contact_geometry
+from egs_warp.contact.penalty import predict
+from egs_warp.fem.body import BodyState, make_body
+from egs_warp.fem.factorisation import Factorisation
+from egs_warp.fem.implicit_step import ImplicitStep, conserve_angular_momentum
 from egs_warp.io import read_capture
-from egs_warp.locomotion import LocomotionSettings, LocomotionStepper
-from egs_warp.muscle_tension import MuscleTension
-from egs_warp.muscles import MuscleColumns, MuscleSet, automatic_muscles
-from egs_warp.objectives import SpinObjective, centre_of_mass_velocity, node_velocities
-from egs_warp.prediction import predict
-from egs_warp.scenes import pawn, stool
-from egs_warp.simulation import FRAME_RATE, settle
-from egs_warp.stance import Weights
+from egs_warp.locomotion.complementarity import ContactLayout, states_from_prediction
+from egs_warp.locomotion.objectives import SpinObjective, centre_of_mass_velocity, node_velocities
+from egs_warp.locomotion.program import ContactProgram, CostScales, contact_program, linear_response
+from egs_warp.locomotion.rollout import FRAME_RATE, settle
+from egs_warp.locomotion.stepper import LocomotionSettings, LocomotionStepper
+from egs_warp.meshing.cage import build_cage
+from egs_warp.motions.stance import Weights
+from egs_warp.muscles.muscle_set import MuscleColumns, MuscleSet, automatic_muscles
+from egs_warp.muscles.tension import MuscleTension
+from egs_warp.segmentation.base_plane import find_base_plane
 
 CAPTURES = {"monkey": ("monkey.ply", (0.0, 1.0, 0.0)), "plush dog": ("plush_dog.ply", (0.0, -1.0, 0.0))}
 """File and up axis of real captures in the data folder."""

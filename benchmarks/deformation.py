@@ -23,10 +23,10 @@ import warp as wp
 sys.path.insert(0, str(Path(__file__).parent))
 import mesh_scenes as scenes
 
-from egs_warp.deformation import Deformer
-from egs_warp.embedding import GaussianEmbedding, embed_gaussians
-from egs_warp.gaussians import GaussianCloud
-from egs_warp.kernels.carried_cage import load_row, store_row
+from egs_warp.deformation.deformer import Deformer
+from egs_warp.deformation.embedding import GaussianEmbedding, embed_gaussians
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.kernels.deformation.carried_cage import load_row, store_row
 
 BYTES_READ = 12 + 16 + 12 + 4
 """Mean, rotation, scales, tetrahedron of the mean; the carried cage itself stays in cache."""

@@ -8,17 +8,17 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from egs_warp.body import GRAVITY, BodyState, SoftBody
-from egs_warp.contact import contact_geometry
-from egs_warp.contact_step import contact_step
-from egs_warp.dynamics import ImplicitStep, conserve_angular_momentum
-from egs_warp.elasticity import ElasticAssembly, Material
-from egs_warp.factorisation import Factorisation
-from egs_warp.gaussians import GaussianCloud
-from egs_warp.locomotion import LocomotionStepper
-from egs_warp.muscles import automatic_muscles
-from egs_warp.plane import Plane
-from egs_warp.tetmesh import TetMesh
+from egs_warp.contact.corrector import contact_step
+from egs_warp.contact.detection import contact_geometry
+from egs_warp.fem.body import GRAVITY, BodyState, SoftBody
+from egs_warp.fem.elasticity import ElasticAssembly, Material
+from egs_warp.fem.factorisation import Factorisation
+from egs_warp.fem.implicit_step import ImplicitStep, conserve_angular_momentum
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.locomotion.stepper import LocomotionStepper
+from egs_warp.muscles.muscle_set import automatic_muscles
 
 TIME_STEP = 1.0 / 120.0
 """Seconds."""

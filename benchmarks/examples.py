@@ -14,7 +14,7 @@ from types import ModuleType
 
 import numpy as np
 
-from egs_warp.report import versions
+from egs_warp.pipelines.report import versions
 
 EXAMPLES = ("jump", "twist", "hop", "walk")
 

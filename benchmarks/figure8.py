@@ -19,10 +19,10 @@ import warp as wp
 sys.path.insert(0, str(Path(__file__).parent))
 import mesh_scenes as scenes
 
-from egs_warp.carrying import CarryMethod, carry
-from egs_warp.finetune import psnr
+from egs_warp.deformation.peers import CarryMethod, carry
+from egs_warp.io.video import write_png
 from egs_warp.render import render
-from egs_warp.render.video import write_png
+from egs_warp.training.finetune import psnr
 
 
 def main() -> None:

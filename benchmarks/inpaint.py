@@ -25,18 +25,19 @@ import cv2
 import numpy as np
 import warp as wp
 
-from egs_warp.camera import Camera
-from egs_warp.finetune import FinetuneOptions, TrainingView, finetune, psnr
-from egs_warp.gaussians import GaussianCloud
-from egs_warp.holes import Hole, disc, footprint
-from egs_warp.inpainting import InpaintOptions, InpaintResult, inpaint
-from egs_warp.inpainting_picture import depth_colours
+from egs_warp.assets import scene
+from egs_warp.assets.rooms import joined
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.inpainting.holes import Hole, disc, footprint
+from egs_warp.inpainting.inpaint import InpaintOptions, InpaintResult, inpaint
+from egs_warp.inpainting.picture import depth_colours
 from egs_warp.io import read_capture
-from egs_warp.plane import Plane
-from egs_warp.plane_fit import plane_depth
-from egs_warp.render import contact_sheet, render, write_png
-from egs_warp.scenes import scene
-from egs_warp.scenes.rooms import joined
+from egs_warp.io.video import contact_sheet, write_png
+from egs_warp.render import render
+from egs_warp.segmentation.plane_fit import plane_depth
+from egs_warp.training.finetune import FinetuneOptions, TrainingView, finetune, psnr
 
 AIMS = ("beats_cv2_by_3db", "beats_no_prior_by_3db", "seconds_on_gpu", "hole_size_independent")
 OURS, CV2, NO_PRIOR = "ours", "cv2 in the picture", "no plane prior"

@@ -12,9 +12,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from egs_warp.animation import AnimateOptions, animate
-from egs_warp.report import versions
-from egs_warp.scenes import pawn
+from egs_warp.assets import pawn
+from egs_warp.pipelines.animate import AnimateOptions, animate
+from egs_warp.pipelines.report import versions
 
 
 def main() -> None:

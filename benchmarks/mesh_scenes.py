@@ -14,12 +14,12 @@ import warp as wp
 from scipy import ndimage
 from scipy.spatial import Delaunay
 
-from egs_warp.camera import Camera
-from egs_warp.embedding import CageLocator
-from egs_warp.finetune import Densification, FinetuneOptions, TrainingView, finetune
-from egs_warp.gaussians import GaussianCloud
+from egs_warp.deformation.embedding import CageLocator
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.precision import Vec3
-from egs_warp.tetmesh import TetMesh
+from egs_warp.training.finetune import Densification, FinetuneOptions, TrainingView, finetune
 
 Paint = Callable[[np.ndarray], np.ndarray]
 """Colour (P, 3), 0 to 1, of points (P, 3) of the rest shape: a texture that goes through the solid."""

@@ -24,13 +24,13 @@ from scipy import ndimage
 sys.path.insert(0, str(Path(__file__).parent))
 import mesh_scenes as scenes
 
-from egs_warp.camera import Camera
-from egs_warp.deformation import Deformer
-from egs_warp.embedding import CageLocator, embed_gaussians
-from egs_warp.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.deformation.deformer import Deformer
+from egs_warp.deformation.embedding import CageLocator, embed_gaussians
+from egs_warp.deformation.splitting import split_bent, split_for_motion
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.capture import read_capture
 from egs_warp.render import render
-from egs_warp.splitting import split_bent, split_for_motion
 
 POP = 1.3
 

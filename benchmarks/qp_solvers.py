@@ -24,10 +24,10 @@ import warp as wp
 sys.path.insert(0, str(Path(__file__).parent))
 from contact_frames import Frame, animation_frames, body_named
 
-from egs_warp.complementarity import SEPARATE, states_of_pairs
-from egs_warp.qp import QpSolution, QpSolver, quadratic_program
-from egs_warp.report import versions
-from egs_warp.strategies import Strategy, contact_under, find_states
+from egs_warp.locomotion.complementarity import SEPARATE, states_of_pairs
+from egs_warp.locomotion.solvers import QpSolution, QpSolver, quadratic_program
+from egs_warp.locomotion.strategies import Strategy, contact_under, find_states
+from egs_warp.pipelines.report import versions
 
 CONTACTS = (1, 2, 4, 8, 16, 32)
 GROUPS = 40

@@ -27,8 +27,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 import render_peers as peers
 from render_roofline import arithmetic_by_threads, median_ms, stage_rows
 
-from egs_warp.camera import Camera
-from egs_warp.gaussians import GaussianCloud
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.launching import available_threads
 from egs_warp.render import render
 from egs_warp.render.compositing import Background, composite

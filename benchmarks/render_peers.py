@@ -13,8 +13,8 @@ import numpy as np
 import torch
 import warp as wp
 
-from egs_warp.camera import Camera
-from egs_warp.gaussians import SH_BAND_0
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import SH_BAND_0
 from egs_warp.render.autograd import render_torch
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.tiles import TileLists

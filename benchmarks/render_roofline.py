@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from egs_warp.camera import Camera
-from egs_warp.gaussians import GaussianCloud
-from egs_warp.kernels.render_ellipse import ALPHA_CUT, TILE_PIXELS, TRANSMITTANCE_STOP, pixel_of_thread, splat_alpha
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.kernels.render.ellipse import ALPHA_CUT, TILE_PIXELS, TRANSMITTANCE_STOP, pixel_of_thread, splat_alpha
 from egs_warp.launching import launch_rows
 from egs_warp.render.backward import backward
 from egs_warp.render.compositing import Background, composite

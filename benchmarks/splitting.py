@@ -2,7 +2,7 @@
 
 A round needle (thickness 0.3 of its length) is drawn whole and as children, from seven directions spread over the sphere;
 the error is root mean square over directions and pixels, in percent of the opacity. The last columns are the opacities of
-the outer and the middle child of the MEASURED rule that minimise it: the table in egs_warp/splitting.py.
+the outer and the middle child of the MEASURED rule that minimise it: the table in egs_warp/deformation/splitting.py.
 
 Aims: ``table_is_optimal`` (no opacity of the table is more than 0.002 from the optimum found here),
 ``measured_beats_paper`` (at every opacity).
@@ -19,7 +19,7 @@ import numpy as np
 from mesh_scenes import environment
 from scipy.optimize import least_squares
 
-from egs_warp.splitting import SplitRule, child_layout, child_opacities
+from egs_warp.deformation.splitting import SplitRule, child_layout, child_opacities
 
 THICKNESS = 0.3
 TILTS = np.radians([90.0, 75.0, 60.0, 45.0, 30.0, 15.0, 4.0])

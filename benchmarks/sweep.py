@@ -79,15 +79,15 @@ def run(case: Case, *, device: str, seed: int, frames: int | None = None) -> dic
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING
-    from egs_warp.creature import first_place, make_creature
+    from egs_warp.assets import figurine, pawn, stool
     from egs_warp.errors import UserError
     from egs_warp.io import read_capture
-    from egs_warp.repertoire import also_reached, longest, parts_of
-    from egs_warp.scenes import figurine, pawn, stool
-    from egs_warp.script import parse_script
-    from egs_warp.sequence import MotionSequence
-    from egs_warp.simulation import simulate
-    from egs_warp.trajectory import audit, measure
+    from egs_warp.locomotion.rollout import simulate
+    from egs_warp.locomotion.trajectory import audit, measure
+    from egs_warp.motions.repertoire import also_reached, longest, parts_of
+    from egs_warp.motions.script import parse_script
+    from egs_warp.motions.sequence import MotionSequence
+    from egs_warp.pipelines.creature import first_place, make_creature
 
     started = time.perf_counter()
     if case.body in CAPTURES:
@@ -217,7 +217,7 @@ def summary(rows: list[dict], *, device: str, seed: int) -> dict:
         }
         for factor in ("body", "motion", "friction", "sag", "step")
     }
-    from egs_warp.report import versions
+    from egs_warp.pipelines.report import versions
 
     rate = len(good) / len(rows)
     enough = len(rows) >= 100

@@ -30,16 +30,16 @@ import mesh_scenes as scenes
 from drop import Drop, simulated_drop
 from perceptual import lpips_distance
 
-from egs_warp.cage import build_cage
-from egs_warp.camera import Camera
-from egs_warp.carrying import CarryMethod, carry
-from egs_warp.embedding import embed_points
-from egs_warp.finetune import psnr, ssim
-from egs_warp.gaussians import GaussianCloud
-from egs_warp.plane import Plane
+from egs_warp.deformation.embedding import embed_points
+from egs_warp.deformation.peers import CarryMethod, carry
+from egs_warp.deformation.splitting import SPLIT_DEGREES, SplitRule
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.io.video import write_png
+from egs_warp.meshing.cage import build_cage
 from egs_warp.render import render
-from egs_warp.render.video import write_png
-from egs_warp.splitting import SPLIT_DEGREES, SplitRule
+from egs_warp.training.finetune import psnr, ssim
 
 MOTIONS = ("bend", "twist", "fall")
 OBJECTS = ("chair", "plant", "microphone")

@@ -31,10 +31,10 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parent))
 from contact_frames import CAPTURES, BenchBody, Frame, animation_frames, body_named, data_folder
 
-from egs_warp.qp import QpSolver
-from egs_warp.report import versions
-from egs_warp.strategies import Strategy, find_states
-from tests.contact_programs import small_problem
+from egs_warp.locomotion.solvers import QpSolver
+from egs_warp.locomotion.strategies import Strategy, find_states
+from egs_warp.pipelines.report import versions
+from tests.support.contact_programs import small_problem
 
 PAPER_QPS, PAPER_OBJECTIVE = 17.01 / 46.19, 0.83 / 1.29
 """Two-stage over QPCC in the paper's Table 2: 0.37 and 0.64."""

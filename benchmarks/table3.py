@@ -22,18 +22,19 @@ import torch
 from mesh_scenes import data_folder, environment
 from perceptual import lpips_distance
 
-from egs_warp.camera import Camera
-from egs_warp.camera_ring import ring_cameras
-from egs_warp.clearance import Clearing, ClearingOptions, clear_plane
-from egs_warp.finetune import psnr, ssim
-from egs_warp.gaussians import GaussianCloud
+from egs_warp.assets import scene
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera_ring import ring_cameras
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
 from egs_warp.io import read_capture
-from egs_warp.plane import Plane
-from egs_warp.render import render, write_png
-from egs_warp.scene_pipeline import LocatedPlane, locate_plane
-from egs_warp.scenes import scene
-from egs_warp.segmentation import ObjectSpec, masks_from_selection
-from egs_warp.votes import blending_votes
+from egs_warp.io.video import write_png
+from egs_warp.pipelines.prepare_scene import LocatedPlane, locate_plane
+from egs_warp.render import render
+from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane
+from egs_warp.segmentation.object_mask import ObjectSpec, masks_from_selection
+from egs_warp.segmentation.votes import blending_votes
+from egs_warp.training.finetune import psnr, ssim
 
 BUILT_IN = ("pawn", "stool", "figurine")
 CAPTURES = {"koala.ply": (0.1, -0.7, 0.15), "narcissus.sog": (0.0, -0.8, 0.0)}

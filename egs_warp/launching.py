@@ -1,4 +1,4 @@
-"""Launch a kernel over many independent rows: at once on a GPU, with every core on a CPU.
+"""New arrays, and launches of a kernel over many independent rows: at once on a GPU, with every core on a CPU.
 
 On a CPU, Warp runs one launch on one thread but releases the interpreter lock while it runs, so launches over disjoint
 rows from several threads run side by side.
@@ -12,10 +12,12 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import warp as wp
+
+Shape: TypeAlias = int | tuple[int, ...]
 
 _MIN_ROWS_PER_CHUNK = 2048
 """Below this many light rows a launch's own cost (about 20 us) is no longer small against its work."""
@@ -139,3 +141,13 @@ def _chunk_edges(row_count: int, threads: int, work: np.ndarray | None) -> list[
 @cache
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=max(1, (os.cpu_count() or 1) - 1))
+
+
+def empty(shape: Shape, dtype: Any, device: Any) -> wp.array:
+    """Array of undefined contents. Warp's own stub admits only Python's ``float`` as a type."""
+    return wp.empty(shape, dtype=dtype, device=device)
+
+
+def zeros(shape: Shape, dtype: Any, device: Any) -> wp.array:
+    """Array of zeros."""
+    return wp.zeros(shape, dtype=dtype, device=device)

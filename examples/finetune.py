@@ -13,15 +13,16 @@ import numpy as np
 import torch
 import warp as wp
 
-from egs_warp.camera import Camera
-from egs_warp.cli_input import check_device
+from egs_warp.assets import pawn
+from egs_warp.commands.flags import check_device
 from egs_warp.errors import UserError, one_line_errors
-from egs_warp.finetune import FinetuneOptions, Rates, finetune, psnr, views_of_capture
-from egs_warp.gaussians import GaussianCloud
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.atomic import writable_folder
-from egs_warp.render import contact_sheet, render, write_png
+from egs_warp.io.video import contact_sheet, write_png
+from egs_warp.render import render
 from egs_warp.render.autograd import render_torch
-from egs_warp.scenes import pawn
+from egs_warp.training.finetune import FinetuneOptions, Rates, finetune, psnr, views_of_capture
 
 
 def ring_of_cameras(cloud: GaussianCloud, up: np.ndarray, *, count: int, size: int) -> list[Camera]:

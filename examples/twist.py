@@ -7,11 +7,11 @@ from pathlib import Path
 
 import warp as wp
 
-from egs_warp.animation import AnimateOptions, animate
-from egs_warp.cli_input import check_device
+from egs_warp.assets import pawn
+from egs_warp.commands.flags import check_device
 from egs_warp.errors import one_line_errors
-from egs_warp.report import summary
-from egs_warp.scenes import pawn
+from egs_warp.pipelines.animate import AnimateOptions, animate
+from egs_warp.pipelines.report import summary
 
 
 def main(arguments: list[str] | None = None) -> dict:

@@ -69,7 +69,7 @@ def test_every_place_exists() -> None:
 
 def test_every_test_exists_and_names_its_equation() -> None:
     for number, row in ROWS.items():
-        tests = re.findall(r"`(tests/\w+\.py)::(\w+)`", row)
+        tests = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", row)
         assert tests, f"Eq. ({number}) has no test"
         for file, name in tests:
             known = definitions(ROOT / file)

@@ -12,7 +12,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from egs_warp.trajectory import Trajectory
+from egs_warp.locomotion.trajectory import Trajectory
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

@@ -6,13 +6,13 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from egs_warp.cli_input import check_device, guessed_up, parse_direction, parse_up
+from egs_warp.commands.flags import check_device, guessed_up, parse_direction, parse_up
+from egs_warp.commands.scene_flags import SceneInput, add_object_flags, plane_of, read_scene, say
 from egs_warp.commands.segment import add_straddling_flag, clearing_of
 from egs_warp.errors import UserError
-from egs_warp.scene_input import SceneInput, add_object_flags, plane_of, read_scene, say
 
 if TYPE_CHECKING:
-    from egs_warp.scene_pipeline import PreparedScene
+    from egs_warp.pipelines.prepare_scene import PreparedScene
 
 
 def add_parser(commands) -> None:
@@ -68,7 +68,7 @@ def _animate(chosen: argparse.Namespace) -> int:
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING
-    from egs_warp.report import summary
+    from egs_warp.pipelines.report import summary
 
     report, more = _animate_scene(chosen) if chosen.object is not None else _animate_capture(chosen)
     print(summary(report))
@@ -78,8 +78,8 @@ def _animate(chosen: argparse.Namespace) -> int:
 
 def _animate_capture(chosen: argparse.Namespace) -> tuple[dict, str]:
     """A capture that is the object alone; returns the report, and what was written besides."""
-    from egs_warp.animation import animate
     from egs_warp.io import read_capture
+    from egs_warp.pipelines.animate import animate
 
     for name in ("cameras", "view", "straddling", "inpainter", "no_inpaint"):
         if getattr(chosen, name) not in (None, False):
@@ -113,10 +113,10 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[dict, str]:
 
 def _animate_scene(chosen: argparse.Namespace) -> tuple[dict, str]:
     """The object of a scene, cut out of it, over the rest of the scene."""
-    from egs_warp.animation import animate
-    from egs_warp.inpainters import inpainter_by_name
+    from egs_warp.inpainting.inpainters import inpainter_by_name
     from egs_warp.io.atomic import writable_folder
-    from egs_warp.scene_pipeline import SceneOptions, prepare_scene, viewing_direction
+    from egs_warp.pipelines.animate import animate
+    from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene, viewing_direction
 
     if chosen.background is not None:
         raise UserError("--background: with --object the rest of the scene is behind the object; leave one of them out")
@@ -157,9 +157,9 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[dict, str]:
 
 def _write_pictures(folder: Path, given: SceneInput, scene: PreparedScene) -> list[str]:
     """Pictures that show whether each step has worked, as the steps' own commands write them; returns their names."""
-    from egs_warp.inpainting_picture import before_and_after
-    from egs_warp.render.video import write_png
-    from egs_warp.scene_pictures import picture_cameras, plane_picture, segmentation_picture
+    from egs_warp.inpainting.picture import before_and_after
+    from egs_warp.io.video import write_png
+    from egs_warp.pipelines.pictures import picture_cameras, plane_picture, segmentation_picture
 
     centre, size = scene.located.centre, scene.located.size
     cameras = picture_cameras(scene.plane, centre, size, given.cameras)
@@ -176,11 +176,11 @@ def _write_pictures(folder: Path, given: SceneInput, scene: PreparedScene) -> li
 
 def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
     """What the flags say of the motion, as arguments of ``animate``. Raises ``UserError`` for what can be told at once."""
-    from egs_warp.animation import AnimateOptions
-    from egs_warp.repertoire import longest
-    from egs_warp.script import parse_script
-    from egs_warp.terrain import read_terrain
-    from egs_warp.user_files import parse_json, read_text
+    from egs_warp.contact.terrain import read_terrain
+    from egs_warp.io.text import parse_json, read_text
+    from egs_warp.motions.repertoire import longest
+    from egs_warp.motions.script import parse_script
+    from egs_warp.pipelines.animate import AnimateOptions
 
     numbers = ("distance", "height", "heading_degrees", "frames", "size", "seed", "metres_per_unit", "friction")
     given = {name: getattr(chosen, name) for name in numbers if getattr(chosen, name) is not None}

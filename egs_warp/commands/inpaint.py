@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from egs_warp.cli_input import check_device, parse_plane
+from egs_warp.commands.flags import check_device, parse_plane
 from egs_warp.errors import UserError
 
 
@@ -38,11 +38,11 @@ def _inpaint(chosen: argparse.Namespace) -> int:
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING
-    from egs_warp.inpainters import inpainter_by_name
-    from egs_warp.inpainting import InpaintOptions, inpaint
-    from egs_warp.inpainting_picture import before_and_after
+    from egs_warp.inpainting.inpaint import InpaintOptions, inpaint
+    from egs_warp.inpainting.inpainters import inpainter_by_name
+    from egs_warp.inpainting.picture import before_and_after
     from egs_warp.io import read_capture, write_ply
-    from egs_warp.render import write_png
+    from egs_warp.io.video import write_png
 
     given = {"steps": chosen.steps, "margin": chosen.margin, "seed": chosen.seed}
     options = InpaintOptions(**{name: value for name, value in given.items() if value is not None})
@@ -78,17 +78,17 @@ def _plane(text: str) -> tuple[Any, Any]:
     """The plane, and the hole that ``segment`` found in it, if it did."""
     if not text.lower().endswith(".json"):
         return parse_plane(text), None
-    from egs_warp.holes import Hole
-    from egs_warp.plane_file import read_planes_and_facts
+    from egs_warp.inpainting.holes import Hole
+    from egs_warp.io.planes import read_planes_and_facts
 
     plane, facts = read_planes_and_facts(text)[0]
     return plane, Hole.from_facts(plane, facts["hole"]) if "hole" in facts else None
 
 
 def _hole(chosen: argparse.Namespace, plane: Any, recorded: Any, background: Any) -> Any:
-    from egs_warp.holes import disc, footprint, unseen
+    from egs_warp.commands.object_flag import read_object
+    from egs_warp.inpainting.holes import disc, footprint, unseen
     from egs_warp.io import read_cameras, read_capture
-    from egs_warp.object_input import read_object
 
     if chosen.object is not None:
         thing = read_capture(chosen.object, device=chosen.device).cloud

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from egs_warp.cli_input import guessed_up, parse_up
-from egs_warp.scene_input import plane_of, say
+from egs_warp.commands.flags import guessed_up, parse_up
+from egs_warp.commands.scene_flags import plane_of, say
 
 
 def add_parser(commands) -> None:
@@ -30,12 +30,12 @@ def _muscles(chosen: argparse.Namespace) -> int:
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING
-    from egs_warp.base_plane import find_base_plane
-    from egs_warp.body import make_body
-    from egs_warp.cage import build_cage
-    from egs_warp.creature import body_muscles
-    from egs_warp.fibre_plot import check_picture_name, plot_muscles
+    from egs_warp.fem.body import make_body
     from egs_warp.io import read_capture
+    from egs_warp.meshing.cage import build_cage
+    from egs_warp.muscles.plot import check_picture_name, plot_muscles
+    from egs_warp.pipelines.creature import body_muscles
+    from egs_warp.segmentation.base_plane import find_base_plane
 
     check_picture_name(chosen.plot)
     up = parse_up(chosen.up) if chosen.up else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from egs_warp.scene_input import add_scene_flags, read_scene, say
+from egs_warp.commands.scene_flags import add_scene_flags, read_scene, say
 
 
 def add_parser(commands) -> None:
@@ -22,11 +22,11 @@ def _plane(chosen: argparse.Namespace) -> int:
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING
+    from egs_warp.commands.scene_planes import planes_of_scene, write_ring
     from egs_warp.errors import UserError
     from egs_warp.io.atomic import writable_folder
-    from egs_warp.render.video import write_png
-    from egs_warp.scene_pictures import picture_cameras, plane_picture
-    from egs_warp.scene_planes import planes_of_scene, write_ring
+    from egs_warp.io.video import write_png
+    from egs_warp.pipelines.pictures import picture_cameras, plane_picture
 
     if not (chosen.object or chosen.plane_mask):
         raise UserError("plane: give --object, or --plane-mask with --cameras")

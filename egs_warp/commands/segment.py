@@ -6,10 +6,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from egs_warp.scene_input import add_scene_flags, read_scene, say
+from egs_warp.commands.scene_flags import add_scene_flags, read_scene, say
 
 if TYPE_CHECKING:
-    from egs_warp.clearance import Clearing
+    from egs_warp.segmentation.clearance import Clearing
 
 METHODS = {"finetune": "FINETUNE", "split": "SPLIT", "remove": "REMOVE", "none": "NONE"}
 
@@ -33,7 +33,7 @@ def add_straddling_flag(parser: argparse.ArgumentParser) -> None:
 
 def clearing_of(chosen: argparse.Namespace) -> Clearing | None:
     """What ``--straddling`` asks for; None without it."""
-    from egs_warp.clearance import Clearing
+    from egs_warp.segmentation.clearance import Clearing
 
     return Clearing[METHODS[chosen.straddling]] if chosen.straddling else None
 
@@ -44,10 +44,10 @@ def _segment(chosen: argparse.Namespace) -> int:
     wp.config.log_level = wp.LOG_WARNING
     from egs_warp.errors import UserError
     from egs_warp.io.atomic import writable_folder
-    from egs_warp.plane_file import read_planes_and_facts
-    from egs_warp.render.video import write_png
-    from egs_warp.scene_pictures import picture_cameras, segmentation_picture
-    from egs_warp.scene_pipeline import SceneOptions, prepare_scene
+    from egs_warp.io.planes import read_planes_and_facts
+    from egs_warp.io.video import write_png
+    from egs_warp.pipelines.pictures import picture_cameras, segmentation_picture
+    from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene
 
     if not chosen.object:
         raise UserError("segment: give --object: a mask, a point, a box or a pixel")

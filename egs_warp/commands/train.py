@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from egs_warp.cli_input import check_device
+from egs_warp.commands.flags import check_device
 from egs_warp.errors import UserError
 
 _SHEET_PHOTOS = 6
@@ -52,11 +52,11 @@ def _train(chosen: argparse.Namespace) -> int:
     wp.config.log_level = wp.LOG_ERROR
     check_device(chosen.device)
     try:
-        from egs_warp.training import train
+        from egs_warp.pipelines.train_capture import train
     except ImportError as error:
         raise UserError("train: PyTorch is not installed; pip install 'egs-warp[torch]'") from error
     from egs_warp.io import read_cameras, writable_folder
-    from egs_warp.report import write_report
+    from egs_warp.pipelines.report import write_report
 
     # Poses that cannot be read must not leave a new folder behind.
     read_cameras(chosen.posed)
@@ -151,7 +151,7 @@ def _writer(out: Path):
 
 
 def _report(chosen: argparse.Namespace, result, progress: _Progress, seconds: float) -> dict:
-    from egs_warp.report import versions
+    from egs_warp.pipelines.report import versions
 
     photo = result.views[0].camera
     means = {
@@ -181,7 +181,8 @@ def _report(chosen: argparse.Namespace, result, progress: _Progress, seconds: fl
 
 def _write_sheet(path: Path, result) -> None:
     """Photo beside render, of photos held out where there are any."""
-    from egs_warp.render import contact_sheet, render, write_png
+    from egs_warp.io.video import contact_sheet, write_png
+    from egs_warp.render import render
 
     pairs = list(zip(result.views, result.scores, strict=True))
     judged = [pair for pair in pairs if pair[1].held_out] or pairs

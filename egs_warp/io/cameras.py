@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from egs_warp.camera import Camera
 from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
 from egs_warp.io.colmap import read_colmap_model
 
 _IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".webp")

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.morton import morton_order
 from egs_warp.io.ply import PlyHeader, channel_major, coefficient_major, columns_as_float32, read_elements

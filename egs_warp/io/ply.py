@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.raw import RawCapture, property_names
 

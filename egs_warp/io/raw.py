@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.gaussians import unit_quaternions
+from egs_warp.geometry.gaussians import unit_quaternions
 
 EXTREME_LOGIT = 16.0
 """Stands for an opacity logit of infinity: 1 - opacity is then 1e-7, below half a step of float32 at 1."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from egs_warp.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.atomic import writable_folder
 from egs_warp.io.compressed_ply import write_compressed_ply
 from egs_warp.io.ply import write_ply

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from egs_warp.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.morton import morton_order
 from egs_warp.io.raw import byte, bytes_from_logits, largest_dropped

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.raw import RawCapture, byte, bytes_from_logits, logits_from_bytes
 

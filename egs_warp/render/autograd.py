@@ -9,9 +9,9 @@ from typing import Any
 import torch
 import warp as wp
 
-from egs_warp.camera import Camera
 from egs_warp.errors import UserError
-from egs_warp.gaussians import GaussianCloud
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.launching import available_threads
 from egs_warp.render.backward import backward
 from egs_warp.render.compositing import RenderedImage, composite

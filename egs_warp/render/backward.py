@@ -7,12 +7,11 @@ from typing import Any
 
 import warp as wp
 
-from egs_warp.gaussians import GaussianCloud
-from egs_warp.kernels.render_backward import pixel_gradients_kernel, project_backward_kernel
-from egs_warp.kernels.render_compositing import composite_backward_block_kernel, composite_backward_tile_kernel
-from egs_warp.kernels.render_ellipse import TILE_PIXELS
-from egs_warp.launching import launch_again, launch_rows
-from egs_warp.render.arrays import empty
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.kernels.render.backward import pixel_gradients_kernel, project_backward_kernel
+from egs_warp.kernels.render.compositing import composite_backward_block_kernel, composite_backward_tile_kernel
+from egs_warp.kernels.render.ellipse import TILE_PIXELS
+from egs_warp.launching import empty, launch_again, launch_rows
 from egs_warp.render.compositing import RenderedImage
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.tiles import TileLists

@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from egs_warp.gaussians import GaussianCloud
-from egs_warp.kernels.render_compositing import composite_tile_kernel
-from egs_warp.kernels.render_ellipse import TILE_PIXELS
-from egs_warp.kernels.render_geometry import composite_geometry_kernel, splat_normals_kernel
-from egs_warp.launching import launch_rows
-from egs_warp.render.arrays import empty
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.kernels.render.compositing import composite_tile_kernel
+from egs_warp.kernels.render.ellipse import TILE_PIXELS
+from egs_warp.kernels.render.geometry import composite_geometry_kernel, splat_normals_kernel
+from egs_warp.launching import empty, launch_rows
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.tiles import TileLists
 

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from egs_warp.camera import Camera
 from egs_warp.errors import UserError
-from egs_warp.gaussians import GaussianCloud
-from egs_warp.kernels.render_projection import NOT_FINITE, View, project_kernel
-from egs_warp.launching import launch_rows
-from egs_warp.render.arrays import empty
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.kernels.render.projection import NOT_FINITE, View, project_kernel
+from egs_warp.launching import empty, launch_rows
 
 _ATTRIBUTES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from egs_warp.camera import Camera
 from egs_warp.errors import UserError
-from egs_warp.gaussians import GaussianCloud
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.launching import available_threads
 from egs_warp.render.compositing import Background, RenderedImage, add_geometry, composite
 from egs_warp.render.projection import project, view_from_camera

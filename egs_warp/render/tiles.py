@@ -8,15 +8,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from egs_warp.kernels.render_ellipse import TILE
-from egs_warp.kernels.render_tiles import (
+from egs_warp.kernels.render.ellipse import TILE
+from egs_warp.kernels.render.tiles import (
     count_tiles_kernel,
     emit_tiles_kernel,
     fill_tiles_kernel,
     finish_lists_kernel,
 )
-from egs_warp.launching import launch_again, launch_rows
-from egs_warp.render.arrays import empty, zeros
+from egs_warp.launching import empty, launch_again, launch_rows, zeros
 from egs_warp.render.projection import ProjectedGaussians
 
 TILE_SIDE = int(TILE)

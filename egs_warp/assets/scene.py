@@ -1,0 +1,76 @@
+"""Built-in scenes: an object, the complete floor under it, and a camera that shows both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from egs_warp.assets.figurine import figurine
+from egs_warp.assets.object import BuiltInObject
+from egs_warp.assets.pawn import pawn
+from egs_warp.assets.rooms import bedroom, chess_board, cloth_table, joined
+from egs_warp.assets.stool import stool
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+
+
+@dataclass(frozen=True)
+class Scene:
+    """An object standing on its plane in a room. The object is one unit tall."""
+
+    name: str
+    object: GaussianCloud
+    """Scene units."""
+    background: GaussianCloud
+    """The whole room without the object: the truth for what inpainting must find under it."""
+    plane: Plane
+    """What the object stands on."""
+    eye: np.ndarray
+    """(3,) suggested camera position."""
+    target: np.ndarray
+    """(3,) what it looks at."""
+
+    @property
+    def up(self) -> np.ndarray:
+        """(3,) unit."""
+        return self.plane.normal
+
+    def whole(self) -> tuple[GaussianCloud, np.ndarray]:
+        """Object and room as one capture, and which of its Gaussians (n,) bool are the object's."""
+        mask = np.zeros(self.object.count + self.background.count, bool)
+        mask[: self.object.count] = True
+        return joined(self.object, self.background), mask
+
+    def camera(self, *, width: int = 512, height: int = 512) -> Camera:
+        """The suggested camera."""
+        return Camera.look_at(self.eye, self.target, self.up, width=width, height=height, vertical_fov_degrees=40.0)
+
+
+_MADE: Mapping[str, tuple[Callable[..., BuiltInObject], Callable[..., GaussianCloud], tuple, tuple]] = {
+    "pawn": (pawn, chess_board, (1.2, -3.6, 1.7), (0.55, 0.0, 0.42)),
+    "stool": (stool, bedroom, (1.5, -2.9, 1.75), (0.0, 0.1, 0.42)),
+    "figurine": (figurine, cloth_table, (0.9, -3.0, 1.55), (0.0, 0.0, 0.40)),
+}
+
+BUILT_IN_SCENES: tuple[str, ...] = tuple(_MADE)
+"""Names that ``scene`` knows."""
+
+
+def scene(name: str, *, seed: int = 0, device: str | None = None) -> Scene:
+    """A built-in scene by name; the same arguments give the same bits. Raises ``UserError`` for an unknown name."""
+    if name not in _MADE:
+        raise UserError(f"scene {name!r} is unknown; built in are {', '.join(BUILT_IN_SCENES)}")
+    make_object, make_room, eye, target = _MADE[name]
+    thing = make_object(seed=seed, device=device)
+    return Scene(
+        name=name,
+        object=thing.cloud,
+        background=make_room(seed=seed + 1, device=device),
+        plane=thing.plane,
+        eye=np.array(eye),
+        target=np.array(target),
+    )

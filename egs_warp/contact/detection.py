@@ -1,0 +1,273 @@
+"""Contact of the Gaussians' bidirectional embeddings with planes (Eq. 8-10): which points touch, and their frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+import warp as wp
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
+
+from egs_warp.contact.terrain import Solid
+from egs_warp.deformation.embedding import embed_points
+from egs_warp.errors import UserError
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.kernels.contact import gaps as kernels
+from egs_warp.precision import Vec3, Vec4, real
+
+LEAST_OUTSIDE = 0.1
+"""Share of the Gaussians above the ground that are outside of all solids at rest."""
+
+
+@dataclass(frozen=True)
+class ContactGeometry:
+    """Every point of the body that can ever be the lowest one of its tetrahedron. Constant."""
+
+    mesh: TetMesh
+    planes: tuple[Plane, ...]
+    friction: float
+    """Coulomb coefficient mu."""
+    tet_from_point: np.ndarray
+    """(P,) int32, tetrahedron of each point kept."""
+    weights: np.ndarray
+    """(P, 4) float64, barycentric weights in it (Eq. 2)."""
+    left_out: int
+    """Gaussians whose mean lies below a plane at rest."""
+    left_out_opacity: float
+    """Their share of the opacity mass."""
+    solid_from_plane: tuple[int, ...] = ()
+    """Which solid each plane is a face of, in ascending order; empty: each is a half space of its own."""
+
+    @property
+    def solid_of_each_plane(self) -> np.ndarray:
+        """(planes,) int32."""
+        return np.array(self.solid_from_plane or range(len(self.planes)), dtype=np.int32)
+
+
+@dataclass(frozen=True)
+class ContactSet:
+    """The n points that take part in one step."""
+
+    points: np.ndarray
+    """(n,) indices into the geometry's points."""
+    nodes: np.ndarray
+    """(n, 4) int32."""
+    weights: np.ndarray
+    """(n, 4) float64, sum 1."""
+    axes: np.ndarray
+    """(n, 3, 3): rows are the normal and two tangents, unit."""
+    gaps: np.ndarray
+    """(n,) signed distance at the start of the step, metres."""
+    frame: sparse.csr_matrix
+    """(3n, 3N): rows 3i, 3i+1, 3i+2 give the velocity of contact i along its normal and two tangents."""
+
+    @property
+    def count(self) -> int:
+        """n."""
+        return len(self.points)
+
+    def head(self, count: int) -> ContactSet:
+        """The first ``count`` contacts."""
+        return ContactSet(
+            self.points[:count],
+            self.nodes[:count],
+            self.weights[:count],
+            self.axes[:count],
+            self.gaps[:count],
+            self.frame[: 3 * count],
+        )
+
+    def end_gaps(self, dt: float, velocities: np.ndarray) -> np.ndarray:
+        """(n,) gap after a step of ``dt`` with nodal end velocities (N, 3)."""
+        return self.gaps + dt * (self.frame @ velocities.ravel())[0::3]
+
+
+def contact_geometry(
+    cloud: GaussianCloud,
+    mesh: TetMesh,
+    planes: tuple[Plane, ...],
+    *,
+    solids: tuple[Solid, ...] = (),
+    friction: float = 0.8,
+    gamma: float = 3.0,
+    device: str | None = None,
+) -> ContactGeometry:
+    """Points of all T+ and T- (Eq. 3); endpoints below a plane at rest are shortened to it (DESIGN 7).
+
+    ``planes`` bound half spaces, the first of them the ground; ``solids`` stand on it.
+    Only vertices of the convex hull of each tetrahedron's points are kept: a deformation is affine inside a tetrahedron, so
+    the deepest point of it is always one of those.
+
+    Raises ``UserError`` for a solid that holds the body.
+    """
+    means = cloud.means.numpy().astype(np.float64)
+    quaternions = cloud.rotations.numpy().astype(np.float64)
+    axes = Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix()
+    arms = gamma * np.exp(cloud.log_scales.numpy().astype(np.float64))[:, None, :] * axes
+    obstacles = [Solid((plane,)) for plane in planes] + list(solids)
+    above = np.all([plane.heights(means) >= 0.0 for plane in planes], axis=0)
+    least = LEAST_OUTSIDE * np.count_nonzero(above)
+    for number, solid in enumerate(solids, start=1):
+        above &= np.any([face.heights(means) >= 0.0 for face in solid.faces], axis=0)
+        if np.count_nonzero(above) < least:
+            raise UserError(
+                f"--terrain, solid {number}: the body is inside it; inside is where n.x + d < 0 for every face [nx, ny, nz, d]:"
+                " turn the signs of a face, or move the solid"
+            )
+    opacities = cloud.opacities()
+    points = [means[above]]
+    for sign in (1.0, -1.0):
+        for axis in range(3):
+            arm = sign * arms[above, :, axis]
+            reach = np.ones(len(arm))
+            for solid in obstacles:
+                rooms = np.stack([face.heights(means[above]) for face in solid.faces])
+                facing = np.argmax(rooms, axis=0)
+                normals = np.stack([face.normal for face in solid.faces])[facing]
+                drop, room = -(arm * normals).sum(axis=1), rooms.max(axis=0)
+                reach = np.minimum(reach, np.where(drop > room, room / np.where(drop > room, drop, 1.0), 1.0))
+            points.append(means[above] + reach[:, None] * arm)
+    embedding = embed_points(mesh, np.concatenate(points), device=device)
+    tet_from_point, weights = embedding.tets.numpy(), embedding.weights.numpy()
+    kept = _hull_points(tet_from_point, weights, len(mesh.tets))
+    return ContactGeometry(
+        mesh,
+        tuple(face for solid in obstacles for face in solid.faces),
+        friction,
+        tet_from_point[kept],
+        weights[kept],
+        int((~above).sum()),
+        float(opacities[~above].sum() / opacities.sum()),
+        tuple(index for index, solid in enumerate(obstacles) for _ in solid.faces),
+    )
+
+
+def _hull_points(tet_from_point: np.ndarray, weights: np.ndarray, tet_count: int) -> np.ndarray:
+    local = weights[:, 1:]
+    order = np.argsort(tet_from_point, kind="stable")
+    bounds = np.searchsorted(tet_from_point[order], np.arange(tet_count + 1))
+    kept = []
+    for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
+        members = order[start:stop]
+        if len(members) > 8:
+            try:
+                members = members[ConvexHull(local[members]).vertices]
+            except QhullError:  # all in one plane: each may matter
+                pass
+        kept.append(members)
+    return np.sort(np.concatenate(kept))
+
+
+class ContactDetector:
+    """Finds and keeps a temporally stable contact set."""
+
+    def __init__(self, geometry: ContactGeometry, *, device: str | None = None) -> None:
+        self.geometry = geometry
+        self._device = device
+        self._tet_from_point = wp.array(geometry.tet_from_point, dtype=int, device=device)
+        self._weights = wp.array(geometry.weights, dtype=Vec4, device=device)
+        self._tets = wp.array(geometry.mesh.tets, dtype=wp.vec4i, device=device)
+        rows = np.array([[*plane.normal, plane.offset] for plane in geometry.planes])
+        self._planes = wp.array(rows, dtype=Vec4, device=device)
+        self._solids = wp.array(geometry.solid_of_each_plane, dtype=int, device=device)
+        self._positions = wp.zeros(len(geometry.mesh.nodes), dtype=Vec3, device=device)
+        count = len(geometry.tet_from_point)
+        self._gaps = wp.zeros(count, dtype=real, device=device)
+        self._nearest = wp.zeros(count, dtype=int, device=device)
+
+    def gaps(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(P,) signed distance of every point at ``positions`` (N, 3) to the nearest solid, and (P,) its face's index.
+
+        Of a solid's faces the one counts that the point is furthest in front of, or least far behind.
+        """
+        self._positions.assign(np.ascontiguousarray(positions))
+        wp.launch(
+            kernels.point_gaps_kernel,
+            dim=len(self.geometry.tet_from_point),
+            inputs=[
+                self._tets,
+                self._tet_from_point,
+                self._weights,
+                self._planes,
+                self._solids,
+                self._positions,
+            ],
+            outputs=[self._gaps, self._nearest],
+            device=self._device,
+        )
+        return self._gaps.numpy().copy(), self._nearest.numpy().copy()
+
+    def points_within(self, positions: np.ndarray, distance: float) -> np.ndarray:
+        """(k, 3) contact points that are nearer than ``distance`` metres to a plane at ``positions`` (N, 3)."""
+        near = np.flatnonzero(self.gaps(positions)[0] < distance)
+        nodes = self.geometry.mesh.tets[self.geometry.tet_from_point[near]]
+        return np.einsum("kw,kwi->ki", self.geometry.weights[near], positions[nodes])
+
+    def contact_set(self, points: np.ndarray, positions: np.ndarray) -> ContactSet:
+        """The given points with their frames; ``positions`` (N, 3) at the start of the step."""
+        gaps, nearest = self.gaps(positions)
+        nodes = self.geometry.mesh.tets[self.geometry.tet_from_point[points]]
+        weights = self.geometry.weights[points]
+        axes = np.stack([np.stack([p.normal, *p.tangents()]) for p in self.geometry.planes])[nearest[points]]
+        count = len(points)
+        values = weights.reshape(-1, 1, 4, 1) * axes[:, :, None, :]
+        columns = np.broadcast_to(3 * nodes[:, None, :, None] + np.arange(3), values.shape)
+        frame = sparse.csr_matrix(
+            (values.ravel(), columns.ravel(), np.arange(0, 36 * count + 1, 12)),
+            shape=(3 * count, positions.size),
+        )
+        return ContactSet(points, nodes, weights, axes, gaps[points], frame)
+
+    def candidates(self, previous: np.ndarray, gaps: np.ndarray, near: float) -> np.ndarray:
+        """The lowest point of each tetrahedron that comes within ``near`` metres, last step's points first in line.
+
+        ``gaps`` (P,): predicted at the end of the step.
+        """
+        kept = previous[gaps[previous] < 2.0 * near]
+        close = np.flatnonzero(gaps < near)
+        close = close[np.lexsort((gaps[close], self.geometry.tet_from_point[close]))]
+        _, first = np.unique(self.geometry.tet_from_point[close], return_index=True)
+        lowest = close[first]
+        lowest = lowest[np.argsort(gaps[lowest], kind="stable")]
+        fresh = lowest[~np.isin(self.geometry.tet_from_point[lowest], self.geometry.tet_from_point[kept])]
+        return np.concatenate([kept, fresh])
+
+
+def independent_contacts(compliance: np.ndarray, kept: int, limit: int, tolerance: float) -> np.ndarray:
+    """Pivoted Cholesky of N S^-1 N^T (n, n): indices of at most ``limit`` well-conditioned points.
+
+    The first ``kept`` points go first in line. Stops at pivots below ``tolerance`` of the largest diagonal (DESIGN 7).
+    """
+    residual = np.diag(compliance).copy()
+    scale = residual.max(initial=0.0)
+    factors: list[np.ndarray] = []
+    chosen: list[int] = []
+    for group in (np.arange(kept), np.arange(kept, len(residual))):
+        available = np.zeros(len(residual), bool)
+        available[group] = True
+        while len(chosen) < limit and available.any():
+            pick = int(np.argmax(np.where(available, residual, -1.0)))
+            if residual[pick] <= tolerance * scale:
+                break
+            available[pick] = False
+            row = compliance[pick] - sum((f[pick] * f for f in factors), np.zeros_like(residual))
+            row = row / np.sqrt(residual[pick])
+            factors.append(row)
+            residual = residual - row**2
+            chosen.append(pick)
+    return np.array(chosen, dtype=int)
+
+
+def push_out_speeds(gaps: np.ndarray, dt: float, cap: float, factor: float = 0.5) -> np.ndarray:
+    """(n,) constant of the normal measure c = N^T u' + min(phi, 0) b / dt + max(phi, 0) / dt, the push-out capped (DESIGN 7)."""
+    return np.maximum(gaps, 0.0) / dt + np.maximum(np.minimum(gaps, 0.0) * factor / dt, -cap)
+
+
+def tangent_directions(count: int) -> np.ndarray:
+    """(count, 2) unit directions D of the friction pyramid, evenly spaced in the two tangents."""
+    angles = 2.0 * np.pi * np.arange(count) / count
+    return np.stack([np.cos(angles), np.sin(angles)], axis=1)

@@ -1,0 +1,196 @@
+"""Carry Gaussians with their cage (Eq. 14, 15) and measure how much the motion bends each (Eq. 16)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from egs_warp.deformation.embedding import CageLocator, GaussianEmbedding
+from egs_warp.errors import UserError
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.kernels.deformation import carried_cage
+from egs_warp.kernels.deformation import deformer as kernels
+from egs_warp.kernels.deformation import deformer_cuda as kernels_cuda
+from egs_warp.kernels.deformation.spherical_harmonics import rotate_sh_kernel
+from egs_warp.launching import launch_rows
+from egs_warp.precision import Vec3
+
+MAX_STRETCH = 1.5
+"""An arm may be stretched this many times more than the matter at its two ends; beyond that it would be a spike."""
+
+LEAST_BRIDGE = 1e-3
+"""Arms shorter than this, over the cage's diagonal, are never carried by a difference of positions: float32 is too coarse."""
+
+
+@dataclass(frozen=True)
+class DeformedGaussians:
+    """Gaussians as the cage has carried them."""
+
+    cloud: GaussianCloud
+    """(n,) at their new places. ``opacity_logits`` is the rest cloud's own array."""
+    turns: wp.array
+    """(n,) vec4, unit quaternions w, x, y, z: the rotation R_polar of F by which each Gaussian and its colour were turned."""
+
+
+@dataclass(frozen=True)
+class BendMeasure:
+    """How far a motion is from affine across each Gaussian: the most of each over all frames given."""
+
+    bend_degrees: np.ndarray
+    """(n,) theta of Eq. (16)."""
+    curl_degrees: np.ndarray
+    """(n, 3) angle between the two ends of each axis: by how much the motion bends or twists along it."""
+    fit_error: np.ndarray
+    """(n, 3) metres: what the affine F leaves out along each axis, at one standard deviation from the mean."""
+
+
+class CageCarrier:
+    """The map of every tetrahedron of a cage, frame after frame, in the same arrays."""
+
+    def __init__(self, cage: CageLocator) -> None:
+        self._cage = cage
+        tet_count = len(cage.mesh.tets)
+        with wp.ScopedDevice(cage.tets.device):
+            self._rest = wp.array(cage.mesh.nodes, dtype=Vec3)
+            self._carried = carried_cage.CarriedCage()
+            self._carried.maps = wp.empty(3 * tet_count, dtype=wp.vec4)
+            self._carried.frames = wp.empty(2 * tet_count, dtype=wp.vec4)
+
+    def carry(self, positions: wp.array | np.ndarray) -> Any:
+        """A ``CarriedCage`` for node ``positions``, as for ``Deformer.deform``."""
+        cage, device = self._cage, self._cage.tets.device
+        launch_rows(
+            carried_cage.carry_tets_kernel,
+            len(cage.mesh.tets),
+            inputs=[
+                node_positions(positions, len(cage.mesh.nodes), device),
+                self._rest,
+                cage.tets,
+                cage.inverse_edges,
+            ],
+            outputs=[self._carried],
+            device=device,
+        )
+        return self._carried
+
+
+class Deformer:
+    """Carries one cloud, frame after frame, into the same output arrays."""
+
+    def __init__(self, cloud: GaussianCloud, embedding: GaussianEmbedding, *, max_stretch: float = MAX_STRETCH) -> None:
+        # Kernels read whole rows at once.
+        self.rest = cloud = replace(cloud, rotations=cloud.rotations.contiguous(), sh=cloud.sh.contiguous())
+        self.embedding = embedding
+        self.max_stretch = max_stretch
+        self._degree = cloud.sh_degree
+        self._carrier = CageCarrier(embedding.cage)
+        with wp.ScopedDevice(cloud.device):
+            self._plan = carried_cage.ArmPlan()
+            self._plan.mean_tets = wp.empty(cloud.count, dtype=wp.int32)
+            self._plan.end_tets = wp.empty((6, cloud.count), dtype=wp.int32)
+            self._plan.shares = wp.empty((6, cloud.count), dtype=wp.float32)
+            self._plan.bulges = wp.empty((3, cloud.count), dtype=wp.float32)
+            self._deformed = DeformedGaussians(
+                GaussianCloud(
+                    means=wp.empty_like(cloud.means),
+                    rotations=wp.empty_like(cloud.rotations),
+                    log_scales=wp.empty_like(cloud.log_scales),
+                    opacity_logits=cloud.opacity_logits,
+                    # Band 0 never changes; without higher bands the colour is the rest cloud's own.
+                    sh=wp.clone(cloud.sh) if self._degree else cloud.sh,
+                ),
+                turns=wp.empty(cloud.count, dtype=wp.vec4),
+            )
+        points, cage = embedding.points, embedding.cage
+        launch_rows(
+            carried_cage.plan_arms_kernel,
+            cloud.count,
+            inputs=[
+                cloud.rotations,
+                cloud.log_scales,
+                points.tets,
+                points.weights,
+                embedding.arms,
+                cage.tets,
+                cage.inverse_edges,
+                LEAST_BRIDGE * cage.extent,
+            ],
+            outputs=[self._plan],
+            device=cloud.device,
+        )
+
+    def deform(self, positions: wp.array | np.ndarray) -> DeformedGaussians:
+        """The cloud for node positions (N, 3) or (N,) vec3d, metres (Eq. 14, 15); the next call overwrites it."""
+        deformed, cloud, rest = self._deformed, self._deformed.cloud, self.rest
+        inputs = self._carrying_inputs(positions)
+        outputs = [cloud.means, cloud.rotations, cloud.log_scales, deformed.turns]
+        if rest.device.is_cuda and self._degree == 3:
+            kernels_cuda.deform_with_colour(rest.count, [*inputs, rest.sh], [*outputs, cloud.sh], rest.device)
+            return deformed
+        launch_rows(kernels.deform_kernel, rest.count, inputs=inputs, outputs=outputs, device=rest.device)
+        if self._degree:
+            launch_rows(
+                rotate_sh_kernel,
+                rest.count,
+                inputs=[deformed.turns, rest.sh, self._degree],
+                outputs=[cloud.sh],
+                device=rest.device,
+            )
+        return deformed
+
+    def measure_bend(self, frames: Iterable[wp.array | np.ndarray]) -> BendMeasure:
+        """The most that any of ``frames``, each as ``positions`` of ``deform``, bends each Gaussian (Eq. 16)."""
+        count = self.rest.count
+        with wp.ScopedDevice(self.rest.device):
+            bend = wp.zeros(count, dtype=wp.float32)
+            curl = wp.zeros(count, dtype=wp.vec3)
+            error = wp.zeros(count, dtype=wp.vec3)
+        for positions in frames:
+            launch_rows(
+                kernels.measure_bend_kernel,
+                count,
+                inputs=[*self._carrying_inputs(positions), self.embedding.arms],
+                outputs=[bend, curl, error],
+                device=self.rest.device,
+            )
+        return BendMeasure(bend.numpy(), curl.numpy(), error.numpy())
+
+    def _carrying_inputs(self, positions: wp.array | np.ndarray) -> list[object]:
+        rest = self.rest
+        return [
+            rest.means,
+            rest.rotations,
+            rest.log_scales,
+            self.max_stretch,
+            self._carrier.carry(positions),
+            self._plan,
+        ]
+
+
+def deform(
+    cloud: GaussianCloud,
+    embedding: GaussianEmbedding,
+    positions: wp.array | np.ndarray,
+    *,
+    max_stretch: float = MAX_STRETCH,
+) -> DeformedGaussians:
+    """Carry ``cloud`` with its cage to node ``positions``, (N, 3) or (N,) vec3d, metres (Eq. 14, 15).
+
+    For many frames keep a ``Deformer``, which reuses its output arrays. Raises ``UserError`` if the node count differs
+    from the cage's.
+    """
+    return Deformer(cloud, embedding, max_stretch=max_stretch).deform(positions)
+
+
+def node_positions(positions: wp.array | np.ndarray, node_count: int, device: wp.Device) -> wp.array:
+    """(N,) vec3d on ``device`` from (N, 3) or (N,) vec3d; raises ``UserError`` unless N is ``node_count``."""
+    if len(positions) != node_count:
+        raise UserError(f"deformation: {len(positions)} node positions for a cage of {node_count} nodes")
+    if isinstance(positions, wp.array) and positions.dtype == Vec3 and positions.device == device:
+        return positions
+    values = positions.numpy() if isinstance(positions, wp.array) else np.asarray(positions, dtype=np.float64)
+    return wp.array(values, dtype=Vec3, device=device)

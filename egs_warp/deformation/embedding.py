@@ -1,0 +1,200 @@
+"""Embed points, and Gaussians with their axis end points, in a rest cage (Eq. 2, 3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.kernels.deformation import embedding as kernels
+from egs_warp.launching import launch_rows
+from egs_warp.precision import Mat33, Vec3, Vec4
+
+UNSCENTED_GAMMA = 3.0**0.5
+"""Arm length in standard deviations for which the seven points integrate cubics over the Gaussian exactly."""
+
+LEAST_ARM = 1e-6
+"""Shortest arm over the cage's diagonal: even float64 differences over a scale of e^-16 would be mostly rounding."""
+
+
+@dataclass(frozen=True)
+class PointEmbedding:
+    """Points as fixed combinations of the corners of one tetrahedron each (Eq. 2)."""
+
+    tets: wp.array
+    """(P,) int32, the containing tetrahedron, or the nearest one of a point outside all."""
+    nodes: wp.array
+    """(P,) vec4i, its corners, node indices."""
+    weights: wp.array
+    """(P,) vec4d, barycentric weights of sum 1; negative ones extrapolate."""
+    inside: wp.array
+    """(P,) bool, whether a tetrahedron contains the point."""
+
+    @property
+    def count(self) -> int:
+        """Number of points P."""
+        return self.tets.shape[0]
+
+    def interpolate(self, positions: wp.array) -> wp.array:
+        """(P,) vec3d: the points for node positions (N,) vec3d (Eq. 2)."""
+        points = wp.empty(self.count, dtype=Vec3, device=self.tets.device)
+        launch_rows(
+            kernels.interpolate_points_kernel,
+            self.count,
+            inputs=[self.nodes, self.weights, positions],
+            outputs=[points],
+            device=self.tets.device,
+        )
+        return points
+
+
+class CageLocator:
+    """Finds tetrahedra of one rest mesh by position: a bounding-volume hierarchy over them and one over the surface."""
+
+    def __init__(self, mesh: TetMesh, *, device: str | wp.Device | None = None) -> None:
+        self.mesh = mesh
+        self.device = wp.get_device(device)
+        lower, upper = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+        # The hierarchies are float32: measure from the middle so that a far-off origin costs no digits.
+        self._origin = 0.5 * (lower + upper)
+        self.extent = float(np.linalg.norm(upper - lower))
+        """Diagonal of the bounding box, metres."""
+        local = mesh.nodes - self._origin
+        corners = local[mesh.tets]
+        edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
+        margin = 1e-6 * self.extent
+        with wp.ScopedDevice(self.device):
+            self._nodes = wp.array(local, dtype=Vec3)
+            self.tets = wp.array(mesh.tets, dtype=wp.vec4i)
+            """(T,) vec4i node indices."""
+            self.inverse_edges = wp.array(np.linalg.inv(edges), dtype=Mat33)
+            """(T,) mat33d, D_m^-1 of each rest tetrahedron, 1/metre."""
+            self._box_lowers = wp.array((corners.min(axis=1) - margin).astype(np.float32), dtype=wp.vec3)
+            self._box_uppers = wp.array((corners.max(axis=1) + margin).astype(np.float32), dtype=wp.vec3)
+            self._boxes = wp.Bvh(self._box_lowers, self._box_uppers)
+            self._surface = wp.Mesh(
+                points=wp.array(local.astype(np.float32), dtype=wp.vec3),
+                indices=wp.array(mesh.boundary_faces().ravel(), dtype=wp.int32),
+            )
+
+    def locate(self, points: wp.array) -> PointEmbedding:
+        """Embed finite ``points`` (P,) vec3d of this device; see ``embed_points``."""
+        embedding = self._empty_embedding(points.shape[0])
+        launch_rows(
+            kernels.locate_points_kernel,
+            embedding.count,
+            inputs=[points, *self._search_inputs()],
+            outputs=[embedding.tets, embedding.nodes, embedding.weights, embedding.inside],
+            device=self.device,
+        )
+        return embedding
+
+    def locate_gaussians(self, cloud: GaussianCloud, gamma: float) -> tuple[PointEmbedding, wp.array]:
+        """Embed the seven points of each Gaussian; see ``embed_gaussians``. Returns (7n rows, arm lengths (n, 6))."""
+        embedding = self._empty_embedding(7 * cloud.count)
+        arms = wp.empty((cloud.count, 6), dtype=wp.float32, device=self.device)
+        launch_rows(
+            kernels.embed_gaussians_kernel,
+            embedding.count,
+            inputs=[
+                cloud.means,
+                cloud.rotations,
+                cloud.log_scales,
+                gamma,
+                LEAST_ARM * self.extent,
+                *self._search_inputs(),
+            ],
+            outputs=[embedding.tets, embedding.nodes, embedding.weights, embedding.inside, arms],
+            device=self.device,
+        )
+        return embedding, arms
+
+    def nearest_faces(self, points: wp.array) -> wp.array:
+        """(P,) int32, the row of ``mesh.boundary_faces()`` nearest to each of ``points`` (P,) vec3, in float32."""
+        faces = wp.empty(points.shape[0], dtype=wp.int32, device=self.device)
+        launch_rows(
+            kernels.nearest_face_kernel,
+            points.shape[0],
+            inputs=[points, Vec3(*self._origin), self.extent, self._surface.id],
+            outputs=[faces],
+            device=self.device,
+        )
+        return faces
+
+    def _empty_embedding(self, count: int) -> PointEmbedding:
+        with wp.ScopedDevice(self.device):
+            return PointEmbedding(
+                tets=wp.empty(count, dtype=wp.int32),
+                nodes=wp.empty(count, dtype=wp.vec4i),
+                weights=wp.empty(count, dtype=Vec4),
+                inside=wp.empty(count, dtype=wp.bool),
+            )
+
+    def _search_inputs(self) -> list[object]:
+        return [
+            Vec3(*self._origin),
+            self.extent,
+            self.tets,
+            self._nodes,
+            self.inverse_edges,
+            self._box_lowers,
+            self._box_uppers,
+            self._boxes.id,
+            self._surface.id,
+        ]
+
+
+def embed_points(mesh: TetMesh, points: np.ndarray, *, device: str | wp.Device | None = None) -> PointEmbedding:
+    """Barycentric weights of ``points`` (P, 3), metres, in the tetrahedra of the rest ``mesh`` (Eq. 2).
+
+    A point on a shared face belongs to the tetrahedron of lowest index. A point outside every tetrahedron is
+    extrapolated from the nearest one by true distance; where several are equally near, from the one whose least weight
+    is largest.
+
+    Raises ``UserError`` for a point that is not finite.
+    """
+    points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(bad):
+        raise UserError(f"embedding: {len(bad)} of {len(points)} points are not finite (first: number {bad[0]})")
+    locator = CageLocator(mesh, device=device)
+    return locator.locate(wp.array(points, dtype=Vec3, device=locator.device))
+
+
+@dataclass(frozen=True)
+class GaussianEmbedding:
+    """Bidirectional local embedding T+ and T- of every Gaussian (Eq. 3)."""
+
+    points: PointEmbedding
+    """7n rows. Row 7 i is the mean of Gaussian i, rows 7 i + 1 .. 3 the ends m + arm r_j of its axes, rows 7 i + 4 .. 6
+    the ends m - arm r_j."""
+    arms: wp.array
+    """(n, 6) float32, metres: arm lengths of the three ends of T+, then of T-; gamma s_j, or less where shortened."""
+    cage: CageLocator
+    """The rest cage."""
+    gamma: float
+    """Arm length in standard deviations, before shortening."""
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians n."""
+        return self.arms.shape[0]
+
+
+def embed_gaussians(
+    cloud: GaussianCloud, mesh: TetMesh | CageLocator, *, gamma: float = UNSCENTED_GAMMA
+) -> GaussianEmbedding:
+    """Embed the mean and the six axis ends m +- ``gamma`` s_j r_j of every Gaussian in the rest cage (Eq. 3).
+
+    The paper's gamma is 3. At sqrt 3 the seven points are the cubature of degree three for the Gaussian's mass, which
+    follows the kinks of a coarse cage better (measured in benchmarks/table1.py).
+    Where an end's barycentric weights would leave [-1, 2] its arm is shortened until they do not. Pass a
+    ``CageLocator`` to embed several clouds in one cage.
+    """
+    cage = mesh if isinstance(mesh, CageLocator) else CageLocator(mesh, device=cloud.device)
+    points, arms = cage.locate_gaussians(cloud, gamma)
+    return GaussianEmbedding(points, arms, cage, gamma)

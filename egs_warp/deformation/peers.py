@@ -1,0 +1,135 @@
+"""One function for every way of carrying Gaussians with a cage: the paper's and its peers' (Table 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import Enum
+
+import numpy as np
+import warp as wp
+
+from egs_warp.deformation.deformer import CageCarrier, DeformedGaussians, Deformer, node_positions
+from egs_warp.deformation.embedding import CageLocator, PointEmbedding, embed_gaussians
+from egs_warp.deformation.splitting import SPLIT_DEGREES, SplitRule, split_for_motion
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.kernels.deformation import peers as kernels
+from egs_warp.kernels.deformation.spherical_harmonics import rotate_sh_kernel
+from egs_warp.launching import launch_rows
+from egs_warp.precision import Vec3
+
+LOCAL_REACH = 3.0 / np.sqrt(3.0)
+"""The corners of a Gaussian's own tetrahedron lie 3 standard deviations out; it then holds the one-sigma ellipsoid."""
+
+
+class CarryMethod(Enum):
+    """How a Gaussian's F is found."""
+
+    SURFACE = "surface"
+    """From the nearest surface triangle (SuGaR, Guedon and Lepetit 2024)."""
+    MEAN_GRADIENT = "mean gradient"
+    """From the tetrahedron that holds the mean (PhysGaussian, Xie et al. 2024)."""
+    LOCAL_TETRAHEDRON = "local tetrahedron"
+    """From a tetrahedron around each Gaussian, embedded in the cage (VR-GS, Jiang et al. 2024)."""
+    BIDIRECTIONAL_NO_SPLIT = "bidirectional, no split"
+    """From T+ and T- (Eq. 14, 15)."""
+    BIDIRECTIONAL = "bidirectional"
+    """From T+ and T-, splitting what bends (Eq. 14-17)."""
+
+
+def carry(
+    cloud: GaussianCloud,
+    mesh: TetMesh | CageLocator,
+    frames: Sequence[wp.array | np.ndarray],
+    *,
+    method: CarryMethod = CarryMethod.BIDIRECTIONAL,
+    rule: SplitRule = SplitRule.MEASURED,
+    threshold_degrees: float = SPLIT_DEGREES,
+    min_error: float | None = None,
+    max_depth: int = 3,
+    max_growth: float = 4.0,
+) -> list[GaussianCloud]:
+    """The cloud in each of ``frames``: node positions (N, 3) or (N,) vec3d, metres, of the cage ``mesh``.
+
+    ``rule``, ``threshold_degrees``, ``min_error``, ``max_depth`` and ``max_growth`` are those of ``split_for_motion`` and
+    matter to ``BIDIRECTIONAL``.
+    """
+    cage = mesh if isinstance(mesh, CageLocator) else CageLocator(mesh, device=cloud.device)
+    if method in (CarryMethod.BIDIRECTIONAL, CarryMethod.BIDIRECTIONAL_NO_SPLIT):
+        embedding = embed_gaussians(cloud, cage)
+        if method is CarryMethod.BIDIRECTIONAL:
+            split = split_for_motion(
+                cloud,
+                embedding,
+                frames,
+                rule=rule,
+                threshold_degrees=threshold_degrees,
+                min_error=min_error,
+                max_depth=max_depth,
+                max_growth=max_growth,
+            )
+            cloud, embedding = split.cloud, split.embedding
+        # A Deformer of its own for each frame, since all results are kept.
+        return [Deformer(cloud, embedding).deform(positions).cloud for positions in frames]
+    peer = _Peer(cloud, cage, method)
+    return [peer.deform(positions).cloud for positions in frames]
+
+
+class _Peer:
+    """One embedding of another paper, made once and used for every frame."""
+
+    def __init__(self, cloud: GaussianCloud, cage: CageLocator, method: CarryMethod) -> None:
+        self._cloud, self._cage, self._method = cloud, cage, method
+        with wp.ScopedDevice(cloud.device):
+            if method is CarryMethod.SURFACE:
+                self._faces = wp.array(cage.mesh.boundary_faces(), dtype=wp.vec3i)
+                self._rest = wp.array(cage.mesh.nodes, dtype=Vec3)
+                self._face_from_gaussian = cage.nearest_faces(cloud.means)
+            elif method is CarryMethod.LOCAL_TETRAHEDRON:
+                corners = wp.empty(4 * cloud.count, dtype=Vec3)
+                self._launch(
+                    kernels.local_tetrahedron_kernel,
+                    [cloud.means, cloud.rotations, cloud.log_scales, LOCAL_REACH, self._least_length],
+                    [corners],
+                )
+                self._corners: PointEmbedding = cage.locate(corners)
+            else:
+                self._carrier = CageCarrier(cage)
+                means = wp.array(cloud.means.numpy().astype(np.float64), dtype=Vec3)
+                self._means: PointEmbedding = cage.locate(means)
+
+    @property
+    def _least_length(self) -> float:
+        return 1e-6 * self._cage.extent
+
+    def _launch(self, kernel: wp.Kernel, inputs: list[object], outputs: list[object]) -> None:
+        launch_rows(kernel, self._cloud.count, inputs=inputs, outputs=outputs, device=self._cloud.device)
+
+    def deform(self, positions: wp.array | np.ndarray) -> DeformedGaussians:
+        """The cloud for node ``positions``, in arrays of its own."""
+        rest = self._cloud
+        uploaded = node_positions(positions, len(self._cage.mesh.nodes), rest.device)
+        cloud = GaussianCloud(
+            means=wp.empty_like(rest.means),
+            rotations=wp.empty_like(rest.rotations),
+            log_scales=wp.empty_like(rest.log_scales),
+            opacity_logits=rest.opacity_logits,
+            sh=wp.clone(rest.sh),
+        )
+        turns = wp.empty(rest.count, dtype=wp.vec4, device=rest.device)
+        outputs = [cloud.means, cloud.rotations, cloud.log_scales, turns]
+        shape = [rest.rotations, rest.log_scales]
+        if self._method is CarryMethod.SURFACE:
+            bound = [self._rest, uploaded, self._faces, self._face_from_gaussian]
+            self._launch(kernels.carry_surface_kernel, [rest.means, *shape, *bound], outputs)
+        elif self._method is CarryMethod.LOCAL_TETRAHEDRON:
+            corners = self._corners.interpolate(uploaded)
+            inputs = [*shape, corners, LOCAL_REACH, self._least_length]
+            self._launch(kernels.carry_local_tetrahedron_kernel, inputs, outputs)
+        else:
+            means = self._means
+            inputs = [*shape, uploaded, means.nodes, means.weights, means.tets, self._carrier.carry(uploaded)]
+            self._launch(kernels.carry_gradient_kernel, inputs, outputs)
+        if rest.sh_degree:
+            self._launch(rotate_sh_kernel, [turns, rest.sh, rest.sh_degree], [cloud.sh])
+        return DeformedGaussians(cloud, turns)

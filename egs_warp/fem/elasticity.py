@@ -1,0 +1,199 @@
+"""Elastic energy of a tetrahedral body (Eq. 5) and its derivatives, assembled in a fixed order from Warp kernels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+import warp as wp
+
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.kernels.fem import elasticity as kernels
+from egs_warp.precision import Mat33, Vec3, real
+
+
+@dataclass(frozen=True)
+class Material:
+    """Isotropic Neo-Hookean material with stiffness-proportional damping."""
+
+    young_modulus: float
+    """E, pascals."""
+    poisson_ratio: float
+    density: float
+    """kg/m^3."""
+    damping_time: float
+    """beta of Rayleigh damping C = beta K at rest, seconds."""
+
+    @property
+    def mu(self) -> float:
+        """First Lame parameter of Eq. (5) (shear modulus), pascals."""
+        return self.young_modulus / (2.0 * (1.0 + self.poisson_ratio))
+
+    @property
+    def lam(self) -> float:
+        """Second Lame parameter of Eq. (5), pascals."""
+        nu = self.poisson_ratio
+        return self.young_modulus * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
+
+
+class ElasticAssembly:
+    """Kernels, index maps and scratch memory for one mesh. Node arrays go in and out as (N, 3) float64 on the host."""
+
+    def __init__(self, mesh: TetMesh, material: Material, *, device: str | None = None) -> None:
+        self.mesh, self.material, self.device = mesh, material, device
+        node_count, tet_count = len(mesh.nodes), len(mesh.tets)
+        corners = mesh.nodes[mesh.tets]
+        edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+        self._tets = wp.array(mesh.tets, dtype=wp.vec4i, device=device)
+        self._rest_inverses = wp.array(np.linalg.inv(edges), dtype=Mat33, device=device)
+        self._volumes = wp.array(mesh.volumes(), dtype=real, device=device)
+        self._start_gradients = wp.array(np.tile(np.eye(3), (tet_count, 1, 1)), dtype=Mat33, device=device)
+        self._positions = wp.zeros(node_count, dtype=Vec3, device=device)
+        self._energies = wp.zeros(tet_count, dtype=real, device=device)
+        self._determinants = wp.zeros(tet_count, dtype=real, device=device)
+        self._corner_gradients = wp.zeros((tet_count, 4), dtype=Vec3, device=device)
+        self._node_gradients = wp.zeros(node_count, dtype=Vec3, device=device)
+        self._blocks = wp.zeros((tet_count, 16), dtype=Mat33, device=device)
+        self._index_corners()
+        self._index_matrix()
+
+    def _index_corners(self) -> None:
+        flat = self.mesh.tets.ravel()
+        order = np.argsort(flat, kind="stable")
+        offsets = np.searchsorted(flat[order], np.arange(len(self.mesh.nodes) + 1))
+        self._corner_offsets = wp.array(offsets.astype(np.int32), dtype=int, device=self.device)
+        self._corner_from_slot = wp.array(order.astype(np.int32), dtype=int, device=self.device)
+
+    def _index_matrix(self) -> None:
+        tets, count = self.mesh.tets.astype(np.int64), len(self.mesh.nodes)
+        rows = np.repeat(tets, 4, axis=1).ravel()
+        columns = np.tile(tets, (1, 4)).ravel()
+        upper = np.flatnonzero(rows <= columns)
+        keys = rows[upper] * count + columns[upper]
+        blocks, inverse = np.unique(keys, return_inverse=True)
+        order = np.argsort(inverse, kind="stable")
+        offsets = np.searchsorted(inverse[order], np.arange(len(blocks) + 1))
+        block_rows, block_columns = blocks // count, blocks % count
+        i, k = np.divmod(np.arange(9), 3)
+        entry_rows = 3 * block_rows[:, None] + i
+        entry_columns = 3 * block_columns[:, None] + k
+        kept = entry_rows <= entry_columns
+        pattern = sparse.coo_matrix(
+            (np.arange(1, kept.sum() + 1, dtype=np.float64), (entry_rows[kept], entry_columns[kept])),
+            shape=(3 * count, 3 * count),
+        ).tocsc()
+        pattern.sort_indices()
+        entry_from_sequence = np.empty(pattern.nnz, dtype=np.int32)
+        entry_from_sequence[pattern.data.astype(np.int64) - 1] = np.arange(pattern.nnz)
+        entry_from_block = np.full(kept.shape, -1, dtype=np.int32)
+        entry_from_block[kept] = entry_from_sequence
+        self.upper_pattern = pattern
+        self.diagonal_entries = pattern.indptr[1:] - 1
+        self._block_keys = blocks
+        self._entry_from_block_host = entry_from_block
+        self._contribution_offsets = wp.array(offsets.astype(np.int32), dtype=int, device=self.device)
+        self._block_from_contribution = wp.array(upper[order].astype(np.int32), dtype=int, device=self.device)
+        self._entry_from_block = wp.array(entry_from_block, dtype=int, device=self.device)
+        self._entries = wp.zeros(pattern.nnz, dtype=real, device=self.device)
+
+    def entries_of_node_pairs(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """(m, 9) indices into the upper matrix's entries of the 3x3 blocks of node pairs first <= second; -1 where absent."""
+        keys = first.astype(np.int64) * len(self.mesh.nodes) + second
+        return self._entry_from_block_host[np.searchsorted(self._block_keys, keys)]
+
+    def _upload(self, target: wp.array, values: np.ndarray) -> None:
+        target.assign(np.ascontiguousarray(values, dtype=np.float64))
+
+    @property
+    def _model(self) -> list:
+        material = self.material
+        return [self._tets, self._rest_inverses, self._volumes, material.mu, material.lam, material.damping_time]
+
+    def begin_step(self, positions: np.ndarray) -> None:
+        """Remember the deformation gradients of the step's start: damping resists the change of strain from here (DESIGN 5)."""
+        self._upload(self._positions, positions)
+        wp.launch(
+            kernels.deformation_gradients_kernel,
+            dim=len(self.mesh.tets),
+            inputs=[self._tets, self._rest_inverses, self._positions],
+            outputs=[self._start_gradients],
+            device=self.device,
+        )
+
+    def determinants(self, positions: np.ndarray) -> np.ndarray:
+        """(T,) J = det F; not positive where an element is inverted."""
+        self.energy(positions)
+        return self._determinants.numpy().copy()
+
+    def energy(self, positions: np.ndarray, dt: float = 0.0) -> float:
+        """Psi(positions), joules; infinite if an element is inverted.
+
+        With ``dt``, plus dt beta/2 sum V E':C:E', where E' = (F^T F - F0^T F0) / (2 dt) is the mean strain rate since
+        ``begin_step``. It is blind to rotations however large, so a spin is not damped (DESIGN 5).
+        """
+        self._upload(self._positions, positions)
+        wp.launch(
+            kernels.element_energies_kernel,
+            dim=len(self.mesh.tets),
+            inputs=[*self._model, self._start_gradients, self._positions, dt],
+            outputs=[self._energies, self._determinants],
+            device=self.device,
+        )
+        return float(self._energies.numpy().sum())
+
+    def gradient(self, positions: np.ndarray, dt: float = 0.0) -> np.ndarray:
+        """(N, 3) newtons: the derivative of ``energy`` by the positions, minus the internal force."""
+        self._upload(self._positions, positions)
+        wp.launch(
+            kernels.element_gradients_kernel,
+            dim=len(self.mesh.tets),
+            inputs=[*self._model, self._start_gradients, self._positions, dt],
+            outputs=[self._corner_gradients],
+            device=self.device,
+        )
+        wp.launch(
+            kernels.gather_corners_kernel,
+            dim=len(self.mesh.nodes),
+            inputs=[self._corner_offsets, self._corner_from_slot, self._corner_gradients],
+            outputs=[self._node_gradients],
+            device=self.device,
+        )
+        return self._node_gradients.numpy().copy()
+
+    def matrix_entries(
+        self, positions: np.ndarray, dt: float = 0.0, *, factor: float = 1.0, projected: bool = False
+    ) -> np.ndarray:
+        """Entries of ``factor`` times the second derivative of ``energy`` in the order of ``upper_pattern``.
+
+        ``projected``: each element's part is made positive semi-definite.
+        """
+        self._upload(self._positions, positions)
+        hessian = kernels.element_projected_hessians_kernel if projected else kernels.element_hessians_kernel
+        wp.launch(
+            hessian,
+            dim=len(self.mesh.tets),
+            inputs=[*self._model, self._start_gradients, self._positions, dt],
+            outputs=[self._blocks],
+            device=self.device,
+        )
+        wp.launch(
+            kernels.gather_matrix_kernel,
+            dim=len(self._block_keys),
+            inputs=[
+                self._contribution_offsets,
+                self._block_from_contribution,
+                self._entry_from_block,
+                self._blocks,
+                factor,
+            ],
+            outputs=[self._entries],
+            device=self.device,
+        )
+        return self._entries.numpy().copy()
+
+    def matrix(self, entries: np.ndarray) -> sparse.csc_matrix:
+        """Upper triangle (3N, 3N) with the given entries."""
+        return sparse.csc_matrix(
+            (entries, self.upper_pattern.indices, self.upper_pattern.indptr), shape=self.upper_pattern.shape
+        )

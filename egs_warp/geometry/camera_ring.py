@@ -1,0 +1,72 @@
+"""Cameras around an object, where a capture comes without any; and their file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.plane import Plane
+from egs_warp.io.atomic import atomic_write
+
+ELEVATIONS = (12.0, 30.0, 52.0)
+"""Degrees above the plane."""
+
+
+def ring_cameras(
+    plane: Plane,
+    centre: np.ndarray,
+    radius: float,
+    *,
+    count: int = 18,
+    elevations: Sequence[float] = ELEVATIONS,
+    size: int = 384,
+    vertical_fov_degrees: float = 40.0,
+    margin: float = 1.25,
+) -> list[Camera]:
+    """``count`` cameras on rings above ``plane`` that hold the ball of ``radius`` about ``centre`` (3,) with a margin.
+
+    The elevations take turns, so that neighbours differ in both angles. ``size`` is in pixels, both sides.
+    """
+    first, second = plane.tangents()
+    distance = margin * radius / np.sin(np.radians(vertical_fov_degrees / 2.0))
+    cameras = []
+    for number in range(count):
+        azimuth = 2.0 * np.pi * number / count
+        elevation = np.radians(elevations[number % len(elevations)])
+        level = np.cos(azimuth) * first + np.sin(azimuth) * second
+        eye = centre + distance * (np.cos(elevation) * level + np.sin(elevation) * plane.normal)
+        cameras.append(
+            Camera.look_at(
+                eye,
+                centre,
+                plane.normal,
+                width=size,
+                height=size,
+                vertical_fov_degrees=vertical_fov_degrees,
+                near=0.02 * distance,
+            )
+        )
+    return cameras
+
+
+def write_cameras(path: Path | str, cameras: Sequence[Camera], names: Sequence[str]) -> None:
+    """INRIA ``cameras.json``, which ``read_cameras`` and most tools read; principal points must be in the middle."""
+    entries = [
+        {
+            "id": number,
+            "img_name": name,
+            "width": camera.width,
+            "height": camera.height,
+            "position": camera.centre.tolist(),
+            "rotation": camera.rotation.T.tolist(),
+            "fx": camera.fx,
+            "fy": camera.fy,
+        }
+        for number, (camera, name) in enumerate(zip(cameras, names, strict=True))
+    ]
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(entries, indent=1))

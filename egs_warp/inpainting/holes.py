@@ -1,0 +1,184 @@
+"""Where the floor is missing: under the object's foot, where no view sees it, or where the user says."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy import ndimage
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.bitmaps import depth_inside, distance_to
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.inpainting.rectified import PlaneWindow, rectify
+from egs_warp.segmentation.votes import MaskedView, check_size
+
+_TEXELS = 256
+"""Across the window in which a hole is drawn."""
+_CONTACT = 0.05
+"""Of the object's height: what of it lies lower hides the floor from every side."""
+
+
+_BRIDGED = 0.1
+"""Of the footprint's span: gaps twice as wide are bridged."""
+
+
+@dataclass(frozen=True)
+class Hole:
+    """A region of a plane, drawn on a window of it."""
+
+    window: PlaneWindow
+    mask: np.ndarray
+    """(rows, columns) bool; none of it on the window's edge."""
+
+    def __post_init__(self) -> None:
+        if not self.mask.any():
+            raise UserError("inpaint: the hole is empty; give the object, a mask, or a place on the plane")
+
+    @property
+    def plane(self) -> Plane:
+        """What it is a hole in."""
+        return self.window.plane
+
+    @property
+    def area(self) -> float:
+        """Scene units squared."""
+        return float(self.mask.sum()) * self.window.texel**2
+
+    def bounds(self) -> tuple[np.ndarray, float]:
+        """Middle (3,) of its bounding square on the plane and that square's side, scene units."""
+        rows, columns = np.nonzero(self.mask)
+        middle = np.array([[columns.min() + columns.max() + 1, rows.min() + rows.max() + 1]]) / 2.0
+        side = max(np.ptp(rows), np.ptp(columns)) + 1
+        return self.window.points(middle)[0], float(side) * self.window.texel
+
+    def facts(self) -> dict[str, Any]:
+        """What ``plane.json`` says of it: its outlines, in columns and rows of the window, whose middle is ``centre``."""
+        outlines, _ = cv2.findContours(self.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+        return {
+            "centre": self.window.centre.tolist(),
+            "texel": self.window.texel,
+            "texels": list(self.mask.shape),
+            "outlines": [outline[:, 0].tolist() for outline in outlines],
+        }
+
+    @classmethod
+    def from_facts(cls, plane: Plane, facts: dict[str, Any]) -> Hole:
+        """The hole in ``plane`` that ``facts`` tells of. Raises ``UserError`` where something is amiss in them."""
+        try:
+            rows, columns = (int(count) for count in facts["texels"])
+            centre = np.array(facts["centre"], dtype=float).reshape(3)
+            mask = np.zeros((rows, columns), np.uint8)
+            for outline in facts["outlines"]:
+                cv2.fillPoly(mask, [np.array(outline, np.int32).reshape(-1, 2)], (1,))
+            return cls(PlaneWindow(plane, centre, float(facts["texel"]), rows, columns), mask > 0)
+        except (TypeError, KeyError, ValueError, cv2.error) as error:
+            raise UserError("plane.json: its hole is damaged; make it again with egs-warp segment") from error
+
+    def drawn_on(self, window: PlaneWindow) -> np.ndarray:
+        """(rows, columns) bool: the hole on another window of the same plane."""
+        columns, rows = np.meshgrid(np.arange(window.columns) + 0.5, np.arange(window.rows) + 0.5)
+        places = window.points(np.stack([columns.ravel(), rows.ravel()], axis=1))
+        at = self.window.pixels(places) - 0.5
+        values = ndimage.map_coordinates(self.mask.astype(np.float32), at[:, ::-1].T, order=1, mode="constant")
+        return (values > 0.5).reshape(window.rows, window.columns)
+
+
+def disc(plane: Plane, centre: np.ndarray, radius: float) -> Hole:
+    """A round hole about ``centre`` (3,), dropped onto the plane. Raises ``UserError`` unless the radius is positive."""
+    if not (np.isfinite(radius) and radius > 0.0 and np.isfinite(centre).all()):
+        raise UserError(f"inpaint: the hole's radius {radius:g} must be a positive number and its centre finite")
+    window = _window(plane, np.asarray(centre, float), 2.0 * radius)
+    columns, rows = np.meshgrid(np.arange(_TEXELS) + 0.5, np.arange(_TEXELS) + 0.5)
+    return Hole(window, np.hypot(columns - 0.5 * _TEXELS, rows - 0.5 * _TEXELS) * window.texel < radius)
+
+
+def footprint(thing: GaussianCloud, plane: Plane) -> Hole:
+    """What an object that stands on ``plane`` hides from every side: its lowest part, seen from above, and what that
+    encloses. Raises ``UserError`` where the object does not reach down to the plane."""
+    means, opacity = thing.means.numpy(), thing.opacities()
+    heights = plane.heights(means)
+    solid = opacity > 0.3
+    if not solid.any():
+        raise UserError("inpaint: the object has no opaque Gaussian; give another object, a mask, or a place")
+    top = float(np.quantile(heights[solid], 0.99))
+    low = solid & (heights < _CONTACT * top) & (heights > -0.5 * top)
+    if top <= 0.0 or not low.any():
+        raise UserError(
+            f"inpaint: the object does not touch the plane (lowest part at {heights[solid].min():.3g}, highest at"
+            f" {top:.3g} scene units above it); check the plane"
+        )
+    middle = 0.5 * (means[low].min(axis=0) + means[low].max(axis=0))
+    # Splats reach beyond their means.
+    margin = 3.0 * float(np.exp(np.quantile(np.max(thing.log_scales.numpy()[low], axis=1), 0.9)))
+    first, second = plane.tangents()
+    span = max(np.ptp(means[low] @ first), np.ptp(means[low] @ second)) + 2.0 * margin
+    window = _window(plane, middle, float(span))
+    covered = np.pad(rectify(thing.subset(low), window, thickness=np.inf).alpha > 0.5, _TEXELS // 2)
+    # Feet stay apart, but a sole is whole, though its Gaussians, which nobody has seen, are a sieve.
+    reach = _BRIDGED * _TEXELS
+    wide = distance_to(covered) <= reach
+    closed = (depth_inside(wide) > reach) | covered
+    inner = (slice(_TEXELS // 2, -(_TEXELS // 2)),) * 2
+    return Hole(window, np.asarray(ndimage.binary_fill_holes(closed))[inner])
+
+
+def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
+    """The floor that stands behind the object in every view that has it in sight, which more than half of them must.
+
+    Raises ``UserError`` for masks that do not fit their cameras, are all empty, or between them hide no common floor.
+    """
+    for view in views:
+        check_size(view)
+    name = views[0].name
+    # Where the object is out of sight its mask is empty, and says nothing.
+    views = [view for view in views if view.mask.any()]
+    if not views:
+        raise UserError(f"{name}: the mask is empty; mark the object in it")
+    shadows = [_on_plane(plane, view.camera, view.mask) for view in views]
+    if any(len(shadow) == 0 for shadow in shadows):
+        raise UserError("inpaint: the floor is not in sight inside a mask; the hole is off the plane, check the plane")
+    # The common floor lies inside every shadow's bounds; the smallest shadow has the finest window.
+    smallest = min(shadows, key=lambda shadow: float(np.ptp(shadow, axis=0).max()))
+    middle = 0.5 * (smallest.min(axis=0) + smallest.max(axis=0))
+    first, second = plane.tangents()
+    window = _window(plane, middle, float(max(np.ptp(smallest @ first), np.ptp(smallest @ second))))
+    columns, rows = np.meshgrid(np.arange(_TEXELS) + 0.5, np.arange(_TEXELS) + 0.5)
+    places = window.points(np.stack([columns.ravel(), rows.ravel()], axis=1))
+    hidden, looks = np.ones(len(places), bool), np.zeros(len(places), int)
+    for view in views:
+        camera, mask = view.camera, view.mask
+        seen = places @ camera.rotation.T + camera.translation
+        ahead = seen[:, 2] > camera.near
+        depth = np.where(ahead, seen[:, 2], 1.0)
+        column = np.floor(camera.fx * seen[:, 0] / depth + camera.cx).astype(int)
+        row = np.floor(camera.fy * seen[:, 1] / depth + camera.cy).astype(int)
+        inside = ahead & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        hidden[inside] &= mask[row[inside], column[inside]]
+        looks += inside
+    found = (hidden & (2 * looks > len(views))).reshape(_TEXELS, _TEXELS)
+    if not found.any():
+        raise UserError("inpaint: the masks hide no floor in common; check that they show one object and the plane")
+    return Hole(window, found)
+
+
+def _on_plane(plane: Plane, camera: Camera, mask: np.ndarray) -> np.ndarray:
+    """(n, 3) points of the plane behind the pixels of ``mask``; none for those that miss it."""
+    rows, columns = np.nonzero(mask)
+    rays = np.stack([(columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy, np.ones(len(rows))])
+    rays = rays.T @ camera.rotation
+    slope = rays @ plane.normal
+    height = float(plane.heights(camera.centre))
+    meets = slope * height < 0.0
+    return camera.centre - (height / slope[meets])[:, None] * rays[meets]
+
+
+def _window(plane: Plane, middle: np.ndarray, span: float) -> PlaneWindow:
+    centre = middle - float(plane.heights(middle)) * plane.normal
+    # A few texels stay free all around.
+    return PlaneWindow(plane, centre, span / (_TEXELS - 16), _TEXELS, _TEXELS)

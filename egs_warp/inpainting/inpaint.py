@@ -1,0 +1,292 @@
+"""New floor where the object stood: flat Gaussians on the plane, coloured by a 2D inpainter on the plane seen face-on.
+
+Paper section 3.7: depth of the hole from the plane, Eq. (18), a dense cloud of flat Gaussians there, then about 100
+steps of training against the one inpainted picture.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+from scipy import ndimage
+
+from egs_warp.assets.rooms import joined
+from egs_warp.errors import UserError
+from egs_warp.geometry.bitmaps import connected_parts, depth_inside, distance_to
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.inpainting.holes import Hole
+from egs_warp.inpainting.inpainters import Inpainter
+from egs_warp.inpainting.new_floor import flat_gaussians, rim_heights, with_gloss
+from egs_warp.inpainting.patch_synthesis import PatchSynthesis
+from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, matte, near_plane, rectify
+
+_MARGIN = 0.01
+"""Of the hole's side: the floor at its very edge is stained by the object and by its shadow; gaps in the floor that touch
+the hole join it anyway. With 0.03 and more, a sheet under a plush toy lost part of its edge."""
+_THICKNESS = 0.15
+"""Of the hole's side: what lies nearer to the plane is floor."""
+_HAZE = 0.25
+"""Of the hole's side: what lies lower over the hole is floor or haze at the object's foot."""
+_KNOWN = 0.6
+"""Opacity of the floor above which its colour is trusted."""
+_SOLID = 0.3
+"""Opacity from which a Gaussian counts as floor."""
+_TEXELS_ACROSS = 120.0
+"""On the side of the hole, whatever its size: so does the time not depend on it."""
+_WINDOW = 3.0
+"""Side of the window, in sides of the hole: the hole and what may be copied from."""
+_SHARPNESS = 0.5
+"""Spacing of the new Gaussians, in widths of the floor's own fine ones."""
+_MOST_SPACING = 3
+"""Texels."""
+_RIM = 12
+"""Texels around the hole that take part in the training."""
+_GAP_REACH = 0.25
+"""Of the hole's side: gaps in the floor are followed this far from the hole."""
+_GAP_EDGE = 6.0
+"""Texels around such a gap that are not trusted either."""
+_CHANNEL = 9.0
+"""Half width, in texels, up to which a gap does not count as open to what lies beyond the floor."""
+_LEAST_RIM = 0.4
+"""Of the hole's edge must be floor."""
+_SHRED = 0.15
+"""Of the hole's area: floor that the hole encloses is given up if it is smaller."""
+_LEASH = 4.0
+"""Weight of the squared distance of a Gaussian's colour from what was painted there."""
+
+
+@dataclass(frozen=True)
+class InpaintOptions:
+    """What may be chosen."""
+
+    steps: int = 100
+    """Of training against the inpainted picture; 0 leaves it out, and PyTorch is not needed."""
+    margin: float = _MARGIN
+    """By how much the hole is made larger, of its side."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.steps < 0:
+            raise UserError(f"--steps {self.steps}: give a whole number of at least 0")
+        if not 0.0 <= self.margin <= 1.0:
+            raise UserError(f"--margin {self.margin}: give a number from 0 to 1, of the hole's side")
+
+
+@dataclass(frozen=True)
+class InpaintResult:
+    """A background with new floor."""
+
+    cloud: GaussianCloud
+    """Scene units; what was kept, then what is new."""
+    is_new: np.ndarray
+    """(n,) bool."""
+    removed: int
+    """Gaussians of the background that lay in the hole."""
+    window: PlaneWindow
+    """Where the floor was looked at face-on."""
+    hole: np.ndarray
+    """(rows, columns) bool, on the window."""
+    before: RectifiedImage
+    """The floor with its hole."""
+    painted: np.ndarray
+    """(rows, columns, 3) float32: what the inpainter made of it."""
+    seconds: dict[str, float]
+    """Of each stage."""
+    notes: tuple[str, ...]
+    """For the user."""
+
+
+def inpaint(
+    background: GaussianCloud,
+    hole: Hole,
+    *,
+    inpainter: Inpainter | None = None,
+    options: InpaintOptions | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> InpaintResult:
+    """Close ``hole`` in the floor of ``background`` (scene units); what lies in it or just above and below is replaced.
+
+    Raises ``UserError`` for a hole that is off the floor or that leaves nothing of the floor to learn from.
+    """
+    options = options or InpaintOptions()
+    inpainter = inpainter or PatchSynthesis(seed=options.seed, device=str(background.device))
+    clock = _Clock()
+    window, grown, spacing = _look(background, hole, options.margin)
+    thickness = _THICKNESS * hole.bounds()[1]
+    junk = _in_hole(background, window, grown, hole.bounds()[1])
+    if junk.all():
+        raise UserError("inpaint: the hole takes the whole capture; make it smaller")
+    kept = background.subset(~junk)
+    before = rectify(kept, window, thickness=thickness)
+    grown, known = _closed(grown, before.alpha)
+    _check(grown, known)
+    # The gaps that joined the hole hold some haze, too.
+    junk = _in_hole(background, window, grown, hole.bounds()[1])
+    kept = background.subset(~junk)
+    clock.lap("rectify")
+    painted = inpainter.fill(np.where(known[..., None], before.colour, 0.0), grown, known)
+    clock.lap("inpaint")
+    new = flat_gaussians(
+        window,
+        grown,
+        known,
+        painted,
+        rim_heights(before, grown, known),
+        spacing=spacing,
+        device=str(background.device),
+    )
+    if options.steps > 0:
+        new = _trained(kept, new, window, grown, painted, thickness, options, progress)
+    clock.lap("train")
+    floor = near_plane(kept, window.plane, thickness) & (kept.opacities() > _SOLID)
+    new = with_gloss(new, kept.subset(floor), window)
+    cloud = joined(kept, new)
+    clock.lap("join")
+    notes = (
+        f"{int(junk.sum())} Gaussians in the hole were replaced by {new.count} on the plane",
+        f"the hole is {grown.sum() * window.texel**2:.3g} square scene units, {window.texel:.3g} a texel",
+    )
+    is_new = np.arange(cloud.count) >= kept.count
+    return InpaintResult(cloud, is_new, int(junk.sum()), window, grown, before, painted, clock.seconds, notes)
+
+
+def _look(background: GaussianCloud, hole: Hole, margin: float) -> tuple[PlaneWindow, np.ndarray, int]:
+    """A window about the hole; the hole, made larger by its margin, on it; and how many texels apart new Gaussians are,
+    so that they are as sharp as the floor."""
+    plane = hole.plane
+    centre, side = hole.bounds()
+    full = side * (1.0 + 2.0 * margin)
+    across = round(_WINDOW * _TEXELS_ACROSS)
+    window = PlaneWindow(plane, centre, full / _TEXELS_ACROSS, across, across)
+    mask = distance_to(hole.drawn_on(window)) <= margin * side / window.texel
+    means = background.means.numpy()
+    floor = near_plane(background, plane, _THICKNESS * side) & (background.opacities() > _SOLID)
+    floor &= window.sample(np.ones(mask.shape, bool), means)
+    if not floor.any():
+        raise UserError("inpaint: the hole is off the floor: nothing lies on the plane around it; check plane and hole")
+    # The smallest axis of a floor's Gaussian stands upright; the middle one tells what detail it can show.
+    width = float(np.exp(np.quantile(np.sort(background.log_scales.numpy()[floor], axis=1)[:, 1], 0.25)))
+    return window, mask, int(np.clip(round(_SHARPNESS * width / window.texel), 1, _MOST_SPACING))
+
+
+def _in_hole(background: GaussianCloud, window: PlaneWindow, mask: np.ndarray, side: float) -> np.ndarray:
+    """(n,) bool: Gaussians of the floor or of haze over the hole, not what hangs higher; and those under it, as deep as
+    it is wide, which show beyond a thin floor's edge."""
+    means = background.means.numpy()
+    heights = window.plane.heights(means)
+    return window.sample(mask, means) & (heights > -side) & (heights < _HAZE * side)
+
+
+def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The hole with the gaps in the floor that touch it and the shreds between them, and where the floor is known; both
+    (rows, columns) bool."""
+    # Pinholes between splats are no gaps.
+    closed: Any = ndimage.binary_closing(np.pad(alpha > _KNOWN, 4, mode="edge"), iterations=2)
+    solid = np.asarray(closed[4:-4, 4:-4])
+    near = distance_to(mask) < _GAP_REACH * _TEXELS_ACROSS
+    gaps, _ = connected_parts(mask | (~solid & near & ~_void(~solid & ~mask)))
+    touching = np.isin(gaps, np.unique(gaps[mask])) & ~mask
+    # Where the floor thins out, it is stained.
+    hole = mask | (distance_to(touching) < _GAP_EDGE if touching.any() else touching)
+    parts, count = connected_parts(~hole)
+    sizes = np.bincount(parts.ravel(), minlength=count + 1)
+    shreds = (sizes < _SHRED * hole.sum()) & (np.arange(count + 1) > 0)
+    hole |= shreds[parts]
+    return hole, solid & ~hole
+
+
+def _void(missing: np.ndarray) -> np.ndarray:
+    """(rows, columns) bool: the part of ``missing`` floor that lies beyond the floor's edge. What hangs together with it
+    by a thin channel only is a gap."""
+    wide, _ = connected_parts(depth_inside(np.pad(missing, 1, mode="edge")) > _CHANNEL)
+    edges = np.concatenate([wide[0], wide[-1], wide[:, 0], wide[:, -1]])
+    outside = np.isin(wide, np.unique(edges[edges > 0]))[1:-1, 1:-1]
+    return missing & (distance_to(outside) <= _CHANNEL + 1.0)
+
+
+def _check(hole: np.ndarray, known: np.ndarray) -> None:
+    if known.sum() < 0.1 * hole.sum():
+        raise UserError("inpaint: the hole covers nearly all of the floor; make it smaller or show more of the floor")
+    ring = ndimage.binary_dilation(hole, iterations=4) & ~hole
+    share = float(known[ring].mean()) if ring.any() else 0.0
+    if share < _LEAST_RIM:
+        raise UserError(
+            f"inpaint: the hole is off the floor: only {100 * share:.0f} % of its edge touches visible floor;"
+            " check plane and hole"
+        )
+
+
+def _trained(kept, new, window, hole, painted, thickness, options, progress) -> GaussianCloud:
+    """``new`` after training against the inpainted picture, between what lies around the hole; degree 0."""
+    try:
+        from egs_warp.training.finetune import FinetuneOptions, GaussianTensors, Rates, TrainingView, finetune
+    except ImportError as error:
+        raise UserError("inpaint: training needs PyTorch; install egs-warp[torch] or give --steps 0") from error
+
+    crop, box = _crop(window, hole)
+    nearby = near_plane(kept, window.plane, thickness) & (
+        np.abs(crop.pixels(kept.means.numpy()) - 0.5 * np.array([crop.columns, crop.rows])).max(axis=1)
+        < max(crop.rows, crop.columns)
+    )
+    around = matte(kept.subset(nearby), window.plane) if nearby.any() else None
+    whole = joined(around, new) if around is not None else new
+    trainable = np.arange(whole.count) >= whole.count - new.count
+    wanted = wp.to_torch(new.sh)
+
+    def leash(tensors: GaussianTensors) -> Any:
+        return _LEASH * SH_BAND_0**2 * (tensors.sh_band_0[-new.count :] - wanted).square().mean()
+
+    weight = ndimage.gaussian_filter(hole[box].astype(np.float32), 1.0)
+    result = finetune(
+        whole,
+        [TrainingView(crop.camera(), painted[box], weight=(weight > 0.02) * (0.2 + 0.8 * weight))],
+        options=FinetuneOptions(
+            iterations=options.steps,
+            # Places and directions are the plane's; only how it is painted is learnt.
+            rates=Rates(means=0.0, rotations=0.0, log_scales=5e-3, opacity_logits=2e-2, sh_band_0=2e-2, sh_rest=0.0),
+            background=(0.5, 0.5, 0.5),
+            seed=options.seed,
+        ),
+        extra_loss=leash,
+        trainable=trainable,
+        progress=progress,
+    )
+    trained = result.cloud.subset(trainable)
+    # Thickness does not show face-on, so what training did to it is noise.
+    log_scales = trained.log_scales.numpy()
+    log_scales[:, 2] = new.log_scales.numpy()[:, 2]
+    return GaussianCloud.from_numpy(
+        trained.means.numpy(),
+        trained.rotations.numpy(),
+        log_scales,
+        trained.opacity_logits.numpy(),
+        trained.sh.numpy(),
+        device=str(kept.device),
+    )
+
+
+def _crop(window: PlaneWindow, hole: np.ndarray) -> tuple[PlaneWindow, tuple[slice, slice]]:
+    """The part of the window that holds the hole and its rim."""
+    rows, columns = np.nonzero(hole)
+    low = np.maximum([rows.min() - _RIM, columns.min() - _RIM], 0)
+    high = np.minimum([rows.max() + 1 + _RIM, columns.max() + 1 + _RIM], hole.shape)
+    middle = window.points(np.array([[low[1] + high[1], low[0] + high[0]]]) / 2.0)[0]
+    size = high - low
+    crop = replace(window, centre=middle, rows=int(size[0]), columns=int(size[1]))
+    return crop, (slice(low[0], high[0]), slice(low[1], high[1]))
+
+
+class _Clock:
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        now = time.perf_counter()
+        self.seconds[stage] = now - self._last
+        self._last = now

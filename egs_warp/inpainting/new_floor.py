@@ -1,0 +1,110 @@
+"""Flat Gaussians that make a piece of floor: where they lie, and what gloss they have."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import warp as wp
+from scipy import ndimage
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, mean_colours
+from egs_warp.inpainting.soap_film import soap_film
+
+_WIDTH = 0.62
+"""Standard deviation along the plane, in spacings."""
+_OPACITY = 0.97
+_SKIRT = 2
+"""Spacings by which the new floor runs on under the old one, so that no gap shows between them."""
+_SKIRT_DROP = 0.5
+"""Spacings by which it lies lower there."""
+_RIM_SMOOTHING = 3.0
+"""Texels: the floor's height at the rim is taken from about this far around."""
+_OUTLIER = 2.0
+"""Deviations from the tilted plane through the rim beyond which heights are clipped: cracks and blades of grass."""
+_NEIGHBOURS = 32
+"""Gaussians of the old floor that a new one takes its gloss from."""
+
+
+def rim_heights(before: RectifiedImage, hole: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """(rows, columns) height of the new floor above the plane: what its rim has, carried inwards as a soap film.
+
+    A real floor is not quite the fitted plane; without this its edge would be a step that a low view shows.
+    """
+    ring = ndimage.binary_dilation(hole, iterations=round(3 * _RIM_SMOOTHING)) & known
+    rows, columns = np.indices(hole.shape) / max(hole.shape) - 0.5
+    basis = np.stack([np.ones(hole.shape), rows, columns], axis=-1)
+    at, values = basis[ring], before.height[ring].astype(np.float64)
+    weight = np.ones(len(at))
+    tilted, scale = np.zeros(3), 0.0
+    for _ in range(10):
+        tilted = np.linalg.lstsq(at * weight[:, None], values * weight, rcond=None)[0]
+        off = np.abs(values - at @ tilted)
+        scale = 1.4826 * float(np.median(off))
+        weight = 1.0 / np.sqrt(1.0 + (off / max(scale, 1e-9)) ** 2)
+    level = basis @ tilted
+    rest = np.where(known, np.clip(before.height - level, -_OUTLIER * scale, _OUTLIER * scale), 0.0)
+    share = ndimage.gaussian_filter(known.astype(np.float64), _RIM_SMOOTHING)
+    rim = ndimage.gaussian_filter(rest, _RIM_SMOOTHING) / np.maximum(share, 0.05)
+    return level + soap_film(rim, hole)
+
+
+def flat_gaussians(
+    window: PlaneWindow,
+    hole: np.ndarray,
+    known: np.ndarray,
+    painted: np.ndarray,
+    heights: np.ndarray,
+    *,
+    spacing: int,
+    device: str | None = None,
+) -> GaussianCloud:
+    """Gaussians of SH degree 0 every ``spacing`` texels over ``hole`` (rows, columns) and its ``known`` rim, in the colours of
+    ``painted`` (rows, columns, 3), at ``heights`` (rows, columns) above the plane; those of the rim a little lower,
+    where they only show through gaps."""
+    size = (np.array(hole.shape) // spacing) * spacing
+
+    def blocks(values: np.ndarray) -> np.ndarray:
+        whole = values[: size[0], : size[1]].astype(np.float64)
+        return whole.reshape(size[0] // spacing, spacing, size[1] // spacing, spacing, -1).mean(axis=(1, 3))
+
+    inner = blocks(hole)[..., 0] > 0.5
+    coloured = blocks(hole | known)[..., 0] == 1.0
+    rows, columns = np.nonzero(ndimage.binary_dilation(inner, iterations=_SKIRT) & coloured)
+    count = len(rows)
+    first, second = window.plane.tangents()
+    step = spacing * window.texel
+    log_scales = np.full((count, 3), np.log(_WIDTH * step))
+    # The paper's thickness, unless the scene is so small that this were no longer flat.
+    log_scales[:, 2] = min(-10.0, float(np.log(0.05 * step)))
+    height = blocks(heights)[rows, columns] - np.where(inner[rows, columns], 0.0, _SKIRT_DROP * step)[:, None]
+    places = window.points((np.stack([columns, rows], axis=1) + 0.5) * spacing)
+    x, y, z, w = Rotation.from_matrix(np.stack([first, second, window.plane.normal], axis=1)).as_quat()
+    return GaussianCloud.from_numpy(
+        places + height * window.plane.normal,
+        np.tile([w, x, y, z], (count, 1)),
+        log_scales,
+        np.full(count, np.log(_OPACITY / (1.0 - _OPACITY))),
+        ((blocks(painted)[rows, columns] - 0.5) / SH_BAND_0)[:, None],
+        device=device,
+    )
+
+
+def with_gloss(new: GaussianCloud, floor: GaussianCloud, window: PlaneWindow) -> GaussianCloud:
+    """``new`` (SH degree 0) with the gloss of ``floor``: the higher bands of its nearest Gaussians, while the mean
+    colour from all around stays."""
+    coefficients = floor.sh.shape[1]
+    if coefficients == 1:
+        return new
+    neighbours = min(_NEIGHBOURS, floor.count)
+    distance, index = cKDTree(floor.means.numpy()).query(new.means.numpy(), k=neighbours)
+    weight = 1.0 / np.maximum(np.reshape(distance, (new.count, neighbours)), window.texel)
+    weight /= weight.sum(axis=1, keepdims=True)
+    sh = np.zeros((new.count, coefficients, 3), np.float32)
+    sh[:, 1:] = np.einsum("nk,nkcd->ncd", weight, floor.sh.numpy()[np.reshape(index, weight.shape), 1:])
+    glossy = replace(new, sh=wp.array(sh, dtype=wp.vec3, device=new.device))
+    sh[:, 0] = (mean_colours(new, window.plane) - mean_colours(glossy, window.plane)) / SH_BAND_0
+    return replace(new, sh=wp.array(sh, dtype=wp.vec3, device=new.device))

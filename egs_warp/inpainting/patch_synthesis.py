@@ -1,0 +1,243 @@
+"""Holes filled from the rest of the same picture: patch search and voting over a pyramid.
+
+Wexler, Shechtman, Irani 2007 (voting over scales); Barnes et al. 2009 (PatchMatch); He and Sun 2012 (few good offsets
+as a start); Darabi et al. 2012 (a colour shift for each patch, so that light may change across the hole).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import warp as wp
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import splu
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.bitmaps import depth_inside, nearest_set
+from egs_warp.inpainting.offset_labels import labelled_sources
+from egs_warp.kernels.inpainting.patch_synthesis import RADIUS, search_kernel, vote_kernel
+from egs_warp.launching import launch_rows, zeros
+
+_COARSEST_HALF_WIDTH = 16.0
+"""Half width, in pixels, of the hole at the coarsest level, where offsets are chosen."""
+_STRIDES = (8, 4, 2, 1, 8, 4, 2, 1)
+"""Of the neighbours that are asked in one search."""
+_TOLERANCE = 0.5
+"""Patches this many times worse than the median one count 1 / e."""
+_SCREEN = 0.01
+"""Pull of the voted colours against the gradients of the sources: within about 1 / sqrt of it, in pixels, they hold."""
+_STRICT_TOLERANCE = 0.25
+"""The same for the last vote of each level, so that the result is as sharp as its sources."""
+
+
+@dataclass(frozen=True)
+class PatchSynthesis:
+    """The default inpainter; see ``Inpainter``."""
+
+    rounds: int = 4
+    """Of search and voting at each level."""
+    shift_limit: float = 0.02
+    """Largest change of colour of a patch, 0 to 1. A large one turns one colour of a pattern into the other."""
+    seed: int = 0
+    device: str | None = None
+
+    def fill(self, image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """As ``Inpainter.fill``. Raises ``UserError`` where no whole patch is known outside the hole."""
+        work = None
+        wide = _with_half_turn(image, hole, known)
+        for depth, level in enumerate(reversed(_pyramid(*wide))):
+            if not level.is_source.any():
+                continue
+            # The picture of each level is first copied by the offsets of the one before: enlarging that one's would
+            # blur it, and a blurred guess attracts blurred patches.
+            sources = _start(level, self.shift_limit) if work is None else _doubled(work.sources(), level)
+            work = _Work(level, sources, self)
+            work.copy()
+            for number in range(self.rounds):
+                work.search(seed=self.seed + 100 * depth + number)
+                work.vote(_TOLERANCE if number < self.rounds - 1 else _STRICT_TOLERANCE)
+        if work is None:
+            raise UserError(
+                f"inpaint: no piece of {2 * RADIUS + 1} x {2 * RADIUS + 1} texels is known around the hole;"
+                " make the hole smaller or show more of the floor"
+            )
+        _, wide_hole, wide_known = wide
+        melded = meld(work.picture, wide_hole, wide_known | wide_hole, work.sources())[:, : hole.shape[1]]
+        return np.where(hole[..., None], np.clip(melded, 0.0, 1.0), image).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class _Level:
+    image: np.ndarray
+    hole: np.ndarray
+    known: np.ndarray
+    is_source: np.ndarray
+    targets: np.ndarray
+    confidence: np.ndarray
+
+    @classmethod
+    def of(cls, image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> _Level:
+        square = np.ones((2 * RADIUS + 1, 2 * RADIUS + 1), bool)
+        usable = known & ~hole
+        is_source = ndimage.binary_erosion(usable, square, border_value=0)
+        targets = ndimage.binary_dilation(hole, square)
+        # Deep in the hole the guess counts less than what stands near its rim.
+        confidence = np.where(hole, 1.3 ** -depth_inside(hole), np.where(known, 1.0, 0.0))
+        return cls(image, hole, known, is_source, targets, np.maximum(confidence, 1e-4).astype(np.float32))
+
+
+def _pyramid(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[_Level]:
+    """Finest first; each half the size of the one before."""
+    levels = [_Level.of(image.astype(np.float32), hole, known)]
+    while depth_inside(np.pad(levels[-1].hole, 1)).max() > _COARSEST_HALF_WIDTH:
+        fine = levels[-1]
+        size = (-(-fine.hole.shape[0] // 2), -(-fine.hole.shape[1] // 2))
+        weight = (fine.known & ~fine.hole).astype(np.float32)
+        share = cv2.resize(weight, size[::-1], interpolation=cv2.INTER_AREA)
+        colour = cv2.resize(fine.image * weight[..., None], size[::-1], interpolation=cv2.INTER_AREA)
+        coarse_hole = cv2.resize(fine.hole.astype(np.float32), size[::-1], interpolation=cv2.INTER_AREA) > 0.25
+        coarse_known = (share > 0.5) & ~coarse_hole
+        coarse = np.where(coarse_known[..., None], colour / np.maximum(share, 1e-3)[..., None], 0.0)
+        levels.append(_Level.of(coarse.astype(np.float32), coarse_hole, coarse_known))
+    return levels
+
+
+def _with_half_turn(
+    image: np.ndarray, hole: np.ndarray, known: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The picture and, to copy from, the same turned by 180 degrees beside it: the like of an edge or a corner is often
+    found only the other way round. A strip between the two keeps patches apart."""
+
+    def beside(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        strip = np.zeros((first.shape[0], 2 * RADIUS, *first.shape[2:]), first.dtype)
+        return np.concatenate([first, strip, second[::-1, ::-1]], axis=1)
+
+    return beside(image, image), beside(hole, np.zeros_like(hole)), beside(known, known & ~hole)
+
+
+def _start(level: _Level, shift_limit: float) -> np.ndarray:
+    """(H, W, 2) int32: a source with a whole known patch for every pixel, from the offsets that explain the rim."""
+    sources = labelled_sources(level.image, level.hole, level.known, level.is_source, shift_limit=shift_limit)
+    return _with_whole_patches(sources, level)
+
+
+def _doubled(sources: np.ndarray, level: _Level) -> np.ndarray:
+    """The sources of the coarser level, carried over."""
+    rows, columns = np.indices(level.hole.shape)
+    coarse = sources[np.minimum(rows // 2, sources.shape[0] - 1), np.minimum(columns // 2, sources.shape[1] - 1)]
+    return _with_whole_patches(2 * coarse + np.stack([rows % 2, columns % 2], axis=-1), level)
+
+
+def _with_whole_patches(sources: np.ndarray, level: _Level) -> np.ndarray:
+    """Each source, or the nearest one around which a whole patch is known."""
+    nearest = nearest_set(level.is_source)
+    inside = np.clip(sources, 0, np.array(level.hole.shape) - 1)
+    return np.stack([nearest[k][inside[..., 0], inside[..., 1]] for k in (0, 1)], axis=-1).astype(np.int32)
+
+
+def meld(picture: np.ndarray, hole: np.ndarray, known: np.ndarray, sources: np.ndarray) -> np.ndarray:
+    """(H, W, 3): ``picture`` (H, W, 3) in the hole with the gradients of its ``sources`` (H, W, 2), so that pieces from
+    differently lit places join without a seam: a screened Poisson equation (Bhat et al. 2008)."""
+    at = np.argwhere(hole)
+    index = np.full(hole.shape, -1)
+    index[hole] = np.arange(len(at))
+    source = sources[hole]
+    matrix_rows, matrix_columns, matrix_values = [np.arange(len(at))], [np.arange(len(at))], [np.full(len(at), _SCREEN)]
+    right = _SCREEN * picture[hole].astype(np.float64)
+    limit = np.array(hole.shape) - 1
+    for step in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+        there = np.clip(at + step, 0, limit)
+        inside = (there == at + step).all(axis=1) & known[there[:, 0], there[:, 1]]
+        ahead = np.clip(source + step, 0, limit)
+        rise = picture[ahead[:, 0], ahead[:, 1]].astype(np.float64) - picture[source[:, 0], source[:, 1]]
+        other = index[there[:, 0], there[:, 1]]
+        free = inside & (other >= 0)
+        # Between two pixels of the hole both sources have a say.
+        from_other = sources[there[:, 0], there[:, 1]]
+        behind = np.clip(from_other - step, 0, limit)
+        of_other = picture[from_other[:, 0], from_other[:, 1]].astype(np.float64) - picture[behind[:, 0], behind[:, 1]]
+        rise = np.where(free[:, None], 0.5 * (rise + of_other), rise)
+        right -= np.where(inside[:, None], rise, 0.0)
+        fixed = inside & (other < 0)
+        right[fixed] += picture[there[fixed, 0], there[fixed, 1]]
+        row = np.flatnonzero(inside)
+        matrix_rows += [row, np.flatnonzero(free)]
+        matrix_columns += [row, other[free]]
+        matrix_values += [np.ones(len(row)), np.full(int(free.sum()), -1.0)]
+    matrix = sparse.coo_array(
+        (np.concatenate(matrix_values), (np.concatenate(matrix_rows), np.concatenate(matrix_columns))),
+        shape=(len(at), len(at)),
+    )
+    melded = picture.copy()
+    melded[hole] = splu(sparse.csc_array(matrix)).solve(right)
+    return melded
+
+
+class _Work:
+    """The arrays of one level on the device."""
+
+    def __init__(self, level: _Level, sources: np.ndarray, options: PatchSynthesis) -> None:
+        self._device = wp.get_device(options.device)
+        self._shift_limit = options.shift_limit
+        self._reach = max(level.hole.shape)
+        self._holes_at, self._targets_at = np.argwhere(level.hole), np.argwhere(level.targets)
+        self.picture = level.image.copy()
+        """(H, W, 3) float32."""
+
+        def upload(values: np.ndarray, dtype: type) -> wp.array:
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self._device)
+
+        self._image = upload(self.picture, wp.vec3)
+        self._confidence = upload(level.confidence, wp.float32)
+        self._is_source = upload(level.is_source.astype(np.int32), wp.int32)
+        self._is_target = upload(level.targets.astype(np.int32), wp.int32)
+        self._targets = upload(self._targets_at.astype(np.int32), wp.vec2i)
+        self._holes = upload(self._holes_at.astype(np.int32), wp.vec2i)
+        self._sources = upload(sources, wp.vec2i)
+        self._next = wp.clone(self._sources)
+        self._cost = zeros(level.hole.shape, wp.float32, self._device)
+        self._shift = zeros(level.hole.shape, wp.vec3, self._device)
+        self._voted = zeros(len(self._holes_at), wp.vec3, self._device)
+
+    def copy(self) -> None:
+        """Paint the hole with the colours of its sources."""
+        sources = self._sources.numpy()[self._holes_at[:, 0], self._holes_at[:, 1]]
+        self.picture[self._holes_at[:, 0], self._holes_at[:, 1]] = self.picture[sources[:, 0], sources[:, 1]]
+        self._image = wp.array(self.picture, dtype=wp.vec3, device=self._device)
+
+    def search(self, *, seed: int) -> None:
+        """Better sources, if there are any."""
+        for number, stride in enumerate(_STRIDES):
+            launch_rows(
+                search_kernel,
+                len(self._targets_at),
+                inputs=[
+                    *(self._image, self._confidence, self._is_source, self._targets, self._is_target, self._sources),
+                    *(stride, self._reach if stride == 1 else 0, self._shift_limit, 7919 * seed + number),
+                ],
+                outputs=[self._next, self._cost, self._shift],
+                device=self._device,
+            )
+            self._sources, self._next = self._next, self._sources
+
+    def vote(self, tolerance: float) -> None:
+        """Paint the hole by what the sources say; ``tolerance`` is in median costs."""
+        costs = self._cost.numpy()[self._targets_at[:, 0], self._targets_at[:, 1]]
+        launch_rows(
+            vote_kernel,
+            len(self._holes_at),
+            inputs=[
+                *(self._image, self._confidence, self._holes, self._is_target, self._sources, self._cost, self._shift),
+                max(tolerance * float(np.median(costs)), 1e-6),
+            ],
+            outputs=[self._voted],
+            device=self._device,
+        )
+        self.picture[self._holes_at[:, 0], self._holes_at[:, 1]] = self._voted.numpy()
+        self._image = wp.array(self.picture, dtype=wp.vec3, device=self._device)
+
+    def sources(self) -> np.ndarray:
+        """(H, W, 2) int32."""
+        return self._sources.numpy()

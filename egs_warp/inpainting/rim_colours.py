@@ -1,0 +1,92 @@
+"""Which colours a hole may have where, judged by what its rim has."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy import ndimage
+
+from egs_warp.geometry.bitmaps import connected_parts, nearest_set
+from egs_warp.inpainting.soap_film import soap_film
+
+_SHADE = 0.1
+"""Colours nearer to each other than this are the same."""
+_LINE = 5
+"""Pixels: what is narrower than half of this is not judged, for lines cross a hole though little of its rim has their
+colour."""
+_COMMON = 0.55
+"""A colour at least this likely, compared with the likeliest, may stand alone."""
+_PATTERN = 0.5
+"""Where no colour is likelier than this, the floor has a pattern and nothing is unusual."""
+_TOUCH = 2
+"""Pixels around an island in which the rim is looked at."""
+_MOST_ADDED = 12
+"""Offsets, for one hole."""
+
+
+class RimColours:
+    """The colours of a picture (H, W, 3) in shades, and how likely each shade is at the pixels ``domain`` (n, 2) of a hole:
+    as likely as a walker that sets out there at random ends on a rim of that shade."""
+
+    def __init__(self, image: np.ndarray, usable: np.ndarray, domain: np.ndarray) -> None:
+        """``usable`` (H, W) bool is where the picture is known."""
+        rows, columns = nearest_set(usable)
+        self._broad = cv2.medianBlur(image[rows, columns], _LINE)
+        shades, index = np.unique(np.rint(self._broad / _SHADE).astype(int).reshape(-1, 3), axis=0, return_inverse=True)
+        self._shade, self._usable, self._domain = index.reshape(usable.shape), usable, domain
+        like = [np.linalg.norm(self._broad - shade, axis=-1) < 1.5 * _SHADE for shade in _SHADE * shades]
+        film = soap_film(np.stack(like, axis=-1).astype(float), ~usable)[domain[:, 0], domain[:, 1]]
+        top = film.max(axis=1, keepdims=True)
+        self._common = (film > _COMMON * top) | (top < _PATTERN)
+
+    def common(self, place: np.ndarray) -> np.ndarray:
+        """(n, k) bool: whether the colour at ``place`` (n, k, 2) is nothing unusual at each pixel of the domain."""
+        return np.take_along_axis(self._common, self._shade[place[..., 0], place[..., 1]], axis=1)
+
+    def islands(self, place: np.ndarray) -> np.ndarray:
+        """(n,) bool: pixels of an unusual colour that are part of an island, or of a tongue longer than it is wide, if each
+        pixel of the domain is painted as ``place`` (n, 2). What reaches the rim in two places is none."""
+        rows, columns = self._domain.T
+        painted = self._broad.copy()
+        painted[rows, columns] = self._broad[place[:, 0], place[:, 1]]
+        odd, hole = np.zeros((2, *self._usable.shape), bool)
+        odd[rows, columns] = ~self.common(place[:, None])[:, 0]
+        hole[rows, columns] = True
+        hole &= ~self._usable
+        odd &= hole
+        found = np.zeros_like(odd)
+        parts, count = connected_parts(odd, corners=True)
+        for part in range(1, count + 1):
+            here = parts == part
+            alike = np.linalg.norm(painted - np.median(painted[here], axis=0), axis=-1) < 2.0 * _SHADE
+            regions, _ = connected_parts(hole & (alike | here), corners=True)
+            region = regions == regions[here][0]
+            contact = ndimage.binary_dilation(region, np.ones((3, 3)), iterations=_TOUCH) & self._usable & alike
+            _, contacts = connected_parts(contact, corners=True)
+            if contacts == 0 or (contacts == 1 and (contact.sum() / _TOUCH) ** 2 < region.sum()):
+                found |= here
+        return found[rows, columns]
+
+    def offsets_for(self, uncovered: np.ndarray, is_source: np.ndarray) -> list[np.ndarray]:
+        """(2,) int offsets under which the ``uncovered`` (n,) bool pixels find common colours at ``is_source`` (H, W), in
+        pieces as large as can be."""
+        uncovered, found = uncovered.copy(), []
+        while uncovered.any() and len(found) < _MOST_ADDED:
+            at, common = self._domain[uncovered], self._common[uncovered]
+            low, size = at.min(axis=0), np.ptp(at, axis=0) + 1
+            if (size > is_source.shape).any():
+                break
+            total: np.ndarray | float = 0.0
+            for shade in np.flatnonzero(common.any(axis=0)):
+                wanted = np.zeros(size, np.float32)
+                wanted[tuple((at[common[:, shade]] - low).T)] = 1.0
+                there = (is_source & (self._shade == shade)).astype(np.float32)
+                total = total + cv2.matchTemplate(there, wanted, cv2.TM_CCORR)
+            step = np.array(np.unravel_index(np.argmax(total), np.shape(total))) - low
+            row, column = (at + step).T
+            fits = is_source[row, column] & common[np.arange(len(at)), self._shade[row, column]]
+            if not fits.any():
+                break
+            found.append(step)
+            uncovered[np.flatnonzero(uncovered)[fits]] = False
+        return found

@@ -1,0 +1,237 @@
+"""Carry Gaussians with the cage (Eq. 14, 15), measure how much each is bent (Eq. 16)."""
+
+import warp as wp
+
+from egs_warp.kernels.deformation.carried_cage import (
+    RIGID,
+    ArmPlan,
+    CarriedCage,
+    affine_of,
+    carried_arms,
+    exponential,
+    load_row,
+    reach_of,
+    store_row,
+    turn_of_tet,
+)
+from egs_warp.kernels.deformation.decomposition import (
+    chosen,
+    column,
+    matched_order,
+    orthogonal_columns,
+    proper_frame,
+    quaternion_of,
+    rotation_of,
+    rotation_part,
+    scaled_columns,
+    signed_as,
+    turn_of,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+LEAST_SCALE = wp.constant(wp.float32(1.0e-12))
+
+
+@wp.struct
+class CarriedShape:
+    rotation: wp.vec4
+    log_scales: wp.vec3
+
+
+@wp.func
+def carried_shape(stretched: wp.mat33, scales: wp.vec3, carried: wp.mat33) -> CarriedShape:
+    """Eq. (15) for ``stretched`` = F R: the SVD of F R S, its axes matched in order and sign to R_polar r_i."""
+    factor = scaled_columns(stretched, scales)
+    m = orthogonal_columns(column(factor, 0), column(factor, 1), column(factor, 2))
+    frame = proper_frame(m.a, m.b, m.c)
+    columns = wp.matrix_from_cols(m.a, m.b, m.c)
+    order = matched_order(frame, carried)
+    result = CarriedShape()
+    result.rotation = quaternion_of(signed_as(frame, order, carried))
+    result.log_scales = wp.vec3(
+        wp.log(wp.max(wp.length(chosen(columns, order[0])), LEAST_SCALE)),
+        wp.log(wp.max(wp.length(chosen(columns, order[1])), LEAST_SCALE)),
+        wp.log(wp.max(wp.length(chosen(columns, order[2])), LEAST_SCALE)),
+    )
+    return result
+
+
+@wp.func
+def write_gaussian(
+    row: wp.int32,
+    stretched: wp.mat33,
+    axes: wp.mat33,
+    scales: wp.vec3,
+    rotations_out: wp.array[wp.vec4],
+    log_scales_out: wp.array[wp.vec3],
+    turns_out: wp.array[wp.vec4],
+):
+    """Shape and turn of Eq. (15) for ``stretched`` = F R."""
+    carried = rotation_part(column(stretched, 0), column(stretched, 1), column(stretched, 2))
+    shape = carried_shape(stretched, scales, carried)
+    rotations_out[row] = shape.rotation
+    log_scales_out[row] = shape.log_scales
+    turns_out[row] = quaternion_of(carried * wp.transpose(axes))
+
+
+@wp.struct
+class CarriedGaussian:
+    mean: wp.vec3
+    rotation: wp.vec4
+    log_scales: wp.vec3
+    turn: wp.vec4
+
+
+@wp.func
+def carried_gaussian(
+    row: wp.int32,
+    mean: wp.vec3,
+    rotation: wp.vec4,
+    log_scales: wp.vec3,
+    max_stretch: wp.float32,
+    cage: CarriedCage,
+    plan: ArmPlan,
+) -> CarriedGaussian:
+    """F = (F+ + F-)/2 (Eq. 14), or the F of the mean's tetrahedron where det F <= 0, then Eq. (15).
+
+    The mean goes where the Gaussian's mass goes, to second order (beyond the paper, which carries the mean as a point):
+    E[x(m + sum z_k s_k r_k)] = x(m) + sum s_k^2 x_kk / 2, and x_kk is seen from the difference of the two arms.
+    """
+    axes = turn_of(rotation)
+    scales = exponential(log_scales)
+    both = carried_arms(row, mean, axes, max_stretch, cage, plan)
+    result = CarriedGaussian()
+    result.mean = both.mean
+    stretched = both.through
+    # Alone in one tetrahedron, far outside, or where F is turned inside out: the rotation of that tetrahedron, found once
+    # for all.
+    own = wp.bool(True)
+    if both.straddles:
+        bulge = wp.vec3(0.0)
+        for k in range(3):
+            bulge += plan.bulges[k, row] * (column(both.plus, k) - column(both.minus, k))
+        result.mean += bulge
+        average = 0.5 * (both.plus + both.minus)
+        if wp.determinant(average) > 0.0:
+            stretched = average
+            own = wp.bool(False)
+    turned = wp.mat33()
+    if own:
+        result.turn = turn_of_tet(cage, both.tet)
+        turned = turn_of(result.turn) * axes
+    else:
+        turned = rotation_of(stretched)
+        result.turn = quaternion_of(turned * wp.transpose(axes))
+    shape = carried_shape(stretched, scales, turned)
+    result.rotation = shape.rotation
+    result.log_scales = shape.log_scales
+    return result
+
+
+@wp.kernel
+def deform_kernel(
+    first_row: wp.int32,
+    # In:
+    means: wp.array[wp.vec3],
+    rotations: wp.array[wp.vec4],
+    log_scales: wp.array[wp.vec3],
+    max_stretch: wp.float32,
+    cage: CarriedCage,
+    plan: ArmPlan,
+    # Out:
+    means_out: wp.array[wp.vec3],
+    rotations_out: wp.array[wp.vec4],
+    log_scales_out: wp.array[wp.vec3],
+    turns_out: wp.array[wp.vec4],
+):
+    """Each Gaussian as the cage has carried it (Eq. 14, 15)."""
+    row = first_row + wp.tid()
+    result = carried_gaussian(
+        row,
+        means[row],
+        load_row(rotations, row),
+        log_scales[row],
+        max_stretch,
+        cage,
+        plan,
+    )
+    means_out[row] = result.mean
+    store_row(rotations_out, row, result.rotation)
+    log_scales_out[row] = result.log_scales
+    store_row(turns_out, row, result.turn)
+
+
+@wp.func
+def angle_between(a: wp.vec3, b: wp.vec3) -> wp.float32:
+    return wp.atan2(wp.length(wp.cross(a, b)), wp.dot(a, b))
+
+
+@wp.func
+def bend_frame(side: wp.mat33, scales: wp.vec3) -> wp.mat33:
+    """Eigenframe of Sigma'+- that stays defined where scales are equal: the rotation part of [F R] S^2.
+
+    It differs from the eigenframe by terms of order (s_j/s_i)^2 where s_i >> s_j, follows the long axes and not the
+    short ones, and does not spin freely in the plane of a round disc, as eigenvectors do.
+    """
+    longest = wp.max(scales)
+    relative = scales / longest
+    weighted = scaled_columns(side, wp.cw_mul(relative, relative))
+    return rotation_part(column(weighted, 0), column(weighted, 1), column(weighted, 2))
+
+
+@wp.kernel
+def measure_bend_kernel(
+    first_row: wp.int32,
+    # In:
+    means: wp.array[wp.vec3],
+    rotations: wp.array[wp.vec4],
+    log_scales: wp.array[wp.vec3],
+    max_stretch: wp.float32,
+    cage: CarriedCage,
+    plan: ArmPlan,
+    arms: wp.array2d[wp.float32],
+    # In and out:
+    bend_out: wp.array[wp.float32],
+    curl_out: wp.array[wp.vec3],
+    error_out: wp.array[wp.vec3],
+):
+    """The most of each measure so far: the angle of Eq. (16), and, along each axis, how far the motion is from affine.
+
+    With arms reaching L on both sides of axis k, the second derivative of the motion along axes k and j is about
+    (F_k+ - F_k-) r_j / 2L; ``curl`` is the angle between the two vectors F_k+- r_j, the largest over j, and ``error``
+    the displacement that F leaves out at one standard deviation along both axes.
+    """
+    row = first_row + wp.tid()
+    if plan.mean_tets[row] < 0 and plan.shares[0, row] == RIGID:
+        return
+    scales = exponential(log_scales[row])
+    axes = turn_of(rotations[row])
+    both = carried_arms(row, means[row], axes, max_stretch, cage, plan)
+    between = wp.transpose(bend_frame(both.plus, scales)) * bend_frame(both.minus, scales)
+    twice_sine = wp.length(
+        wp.vec3(between[2, 1] - between[1, 2], between[0, 2] - between[2, 0], between[1, 0] - between[0, 1])
+    )
+    theta = wp.atan2(twice_sine, wp.trace(between) - 1.0)
+    bend_out[row] = wp.max(bend_out[row], wp.degrees(theta))
+    curl = curl_out[row]
+    error = error_out[row]
+    for k in range(3):
+        f_plus = affine_of(cage, plan.end_tets[k, row]).gradient * axes
+        f_minus = affine_of(cage, plan.end_tets[3 + k, row]).gradient * axes
+        reach = reach_of(arms, row, k, scales[k])
+        for j in range(3):
+            # Along the axis itself the ends' own positions are known; across it only the gradients at the ends are.
+            a = wp.where(j == k, column(both.plus, k), column(f_plus, j))
+            b = wp.where(j == k, column(both.minus, k), column(f_minus, j))
+            missed = scales[k] * scales[j] * wp.length(a - b) / reach
+            angle = wp.degrees(angle_between(a, b))
+            # The mixed derivative is the same both ways round; the longer baseline sees it better.
+            if scales[j] > scales[k]:
+                missed = 0.0
+            # An axis too short to be seen bends nothing.
+            if missed > 0.25 * error[k]:
+                curl[k] = wp.max(curl[k], angle)
+            error[k] = wp.max(error[k], missed)
+    curl_out[row] = curl
+    error_out[row] = error

@@ -1,0 +1,23 @@
+"""Colour of Gaussians as seen from several directions at once."""
+
+import warp as wp
+
+from egs_warp.kernels.render.projection import sh_sum
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def mean_colour_kernel(
+    # In:
+    sh: wp.array2d[wp.vec3],
+    directions: wp.array[wp.vec3],
+    # Out:
+    colour_out: wp.array[wp.vec3],
+):
+    """Mean over unit viewing ``directions`` (from the camera) of each Gaussian's colour, before it is clipped."""
+    g = wp.tid()
+    colour = wp.vec3()
+    for k in range(directions.shape[0]):
+        colour += sh_sum(sh, g, sh.shape[1], directions[k])
+    colour_out[g] = colour / float(directions.shape[0]) + wp.vec3(0.5, 0.5, 0.5)

@@ -1,0 +1,229 @@
+"""Tiles to pixels, and back: what blends is in ``composite_cpu`` and ``composite_cuda``."""
+
+import warp as wp
+
+from egs_warp.kernels.render import composite_cpu, composite_cuda
+from egs_warp.kernels.render.backward import pixel_gradient
+from egs_warp.kernels.render.ellipse import TILE, TILE_PIXELS
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+
+def _by_device(*, cpu: str = "", cuda: str = "") -> str:
+    return f"""
+#if defined(__CUDA_ARCH__)
+{cuda}
+#else
+{cpu}
+#endif
+"""
+
+
+@wp.func_native(_by_device(cpu=composite_cpu.FORWARD, cuda=composite_cuda.FORWARD))
+def composite_tile(
+    width: wp.int32,
+    height: wp.int32,
+    left: wp.int32,
+    top: wp.int32,
+    start: wp.int32,
+    end: wp.int32,
+    gaussians: wp.array[wp.int32],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    colour_depth: wp.array[wp.vec4],
+    flat_background: wp.vec3,
+    background: wp.array[wp.vec3],
+    colour: wp.array2d[wp.vec3],
+    alpha_out: wp.array2d[wp.float32],
+    depth: wp.array2d[wp.float32],
+):
+    """Front-to-back blend of one tile by its thread (CPU) or block (CUDA)."""
+    ...
+
+
+@wp.func_native(_by_device(cpu=composite_cpu.BACKWARD))
+def composite_backward_tile(
+    width: wp.int32,
+    height: wp.int32,
+    left: wp.int32,
+    top: wp.int32,
+    start: wp.int32,
+    end: wp.int32,
+    gaussians: wp.array[wp.int32],
+    slots: wp.array[wp.int32],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    colour_depth: wp.array[wp.vec4],
+    sum_gradient: wp.array[wp.vec4],
+    remaining: wp.array[wp.float32],
+    moments: wp.array2d[wp.vec4],
+):
+    """Gradient sums of one tile's splats (CPU); the same walk and rounding as ``composite_tile``."""
+    ...
+
+
+@wp.func_native(_by_device(cuda=composite_cuda.BACKWARD))
+def composite_backward_block(
+    width: wp.int32,
+    height: wp.int32,
+    left: wp.int32,
+    top: wp.int32,
+    start: wp.int32,
+    end: wp.int32,
+    gaussians: wp.array[wp.int32],
+    slots: wp.array[wp.int32],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    colour_depth: wp.array[wp.vec4],
+    sum_gradient: wp.vec4,
+    remaining: wp.float32,
+    moments: wp.array2d[wp.vec4],
+):
+    """Gradient sums of one tile's splats by its block (CUDA); the same walk and rounding as ``composite_tile``.
+
+    ``sum_gradient`` and ``remaining`` are those of the thread's own pixel.
+    """
+    ...
+
+
+@wp.kernel
+def composite_tile_kernel(
+    first: wp.int32,
+    # In:
+    width: wp.int32,
+    height: wp.int32,
+    tile_start: wp.array[wp.int32],
+    gaussian_from_intersection: wp.array[wp.int32],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    colour_depth: wp.array[wp.vec4],
+    flat_background: wp.vec3,
+    background: wp.array[wp.vec3],
+    # Out:
+    colour_out: wp.array2d[wp.vec3],
+    alpha_out: wp.array2d[wp.float32],
+    depth_out: wp.array2d[wp.float32],
+):
+    """One thread composites one tile (CPU), or one block of ``TILE_PIXELS`` threads (CUDA)."""
+    tile = (wp.tid() + first) / wp.block_dim()
+    columns = (width + TILE - 1) / TILE
+    composite_tile(
+        width,
+        height,
+        (tile % columns) * TILE,
+        (tile / columns) * TILE,
+        tile_start[tile],
+        tile_start[tile + 1],
+        gaussian_from_intersection,
+        ellipse,
+        falloff,
+        colour_depth,
+        flat_background,
+        background,
+        colour_out,
+        alpha_out,
+        depth_out,
+    )
+
+
+@wp.kernel
+def composite_backward_tile_kernel(
+    first: wp.int32,
+    # In:
+    width: wp.int32,
+    height: wp.int32,
+    tile_start: wp.array[wp.int32],
+    gaussian_from_intersection: wp.array[wp.int32],
+    slot_from_intersection: wp.array[wp.int32],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    colour_depth: wp.array[wp.vec4],
+    sum_gradient: wp.array[wp.vec4],
+    remaining: wp.array[wp.float32],
+    # Out:
+    moments_out: wp.array2d[wp.vec4],
+):
+    """One thread walks one tile again and sums each splat's gradient over its pixels.
+
+    With k = alpha dL/dalpha per pixel, ``moments_out[slot]`` holds (sum k, k u, k dy, k u^2), (k u dy, k dy^2, by depth, 0)
+    and (by colour, 0).
+    """
+    tile = wp.tid() + first
+    columns = (width + TILE - 1) / TILE
+    composite_backward_tile(
+        width,
+        height,
+        (tile % columns) * TILE,
+        (tile / columns) * TILE,
+        tile_start[tile],
+        tile_start[tile + 1],
+        gaussian_from_intersection,
+        slot_from_intersection,
+        ellipse,
+        falloff,
+        colour_depth,
+        sum_gradient,
+        remaining,
+        moments_out,
+    )
+
+
+@wp.kernel
+def composite_backward_block_kernel(
+    # In:
+    width: wp.int32,
+    height: wp.int32,
+    tile_start: wp.array[wp.int32],
+    gaussian_from_intersection: wp.array[wp.int32],
+    slot_from_intersection: wp.array[wp.int32],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    colour_depth: wp.array[wp.vec4],
+    colour: wp.array2d[wp.vec3],
+    alpha: wp.array2d[wp.float32],
+    depth: wp.array2d[wp.float32],
+    colour_gradient: wp.array2d[wp.vec3],
+    alpha_gradient: wp.array2d[wp.float32],
+    depth_gradient: wp.array2d[wp.float32],
+    # Out:
+    moments_out: wp.array2d[wp.vec4],
+):
+    """A block of 256 threads does for one tile what ``composite_backward_tile_kernel`` does with one."""
+    tile = wp.tid() / TILE_PIXELS
+    columns = (width + TILE - 1) / TILE
+    left = (tile % columns) * TILE
+    top = (tile / columns) * TILE
+    # A warp has 8 x 4 pixels; two such parts stand side by side.
+    i = wp.tid() % TILE_PIXELS
+    part = i / 32
+    column = left + (part % 2) * 8 + i % 8
+    row = top + (part / 2) * 4 + (i % 32) / 8
+    by_sums = wp.vec4()
+    remaining = wp.float32(0.0)
+    if column < width and row < height:
+        by_sums, remaining = pixel_gradient(
+            row,
+            column,
+            colour,
+            alpha,
+            depth,
+            colour_gradient,
+            alpha_gradient,
+            depth_gradient,
+        )
+    composite_backward_block(
+        width,
+        height,
+        left,
+        top,
+        tile_start[tile],
+        tile_start[tile + 1],
+        gaussian_from_intersection,
+        slot_from_intersection,
+        ellipse,
+        falloff,
+        colour_depth,
+        by_sums,
+        remaining,
+        moments_out,
+    )

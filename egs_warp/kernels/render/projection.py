@@ -1,0 +1,189 @@
+"""Projection of 3D Gaussians to screen-space ellipses (EWA splatting; Kerbl et al. 2023)."""
+
+import warp as wp
+
+from egs_warp.kernels.render.ellipse import LOG_255, LOW_PASS, tile_columns, tile_rows
+
+wp.set_module_options({"enable_backward": False})
+
+
+NOT_FINITE = wp.constant(wp.int64(2**36))
+"""Stands for the number of tiles of a Gaussian with a value that is not finite; more than any image has."""
+
+
+@wp.struct
+class View:
+    """One pinhole camera in single precision."""
+
+    rotation: wp.mat33
+    translation: wp.vec3
+    centre: wp.vec3
+    fx: wp.float32
+    fy: wp.float32
+    cx: wp.float32
+    cy: wp.float32
+    near: wp.float32
+    far: wp.float32
+    slope_low: wp.vec2
+    slope_high: wp.vec2
+    width: wp.int32
+    height: wp.int32
+
+
+@wp.func
+def rotation_matrix(q: wp.vec4) -> wp.mat33:
+    """Rotation of the quaternion w, x, y, z, which is normalised first; identity for a zero one."""
+    length = wp.length(q)
+    w = wp.float32(1.0)
+    x = wp.float32(0.0)
+    y = wp.float32(0.0)
+    z = wp.float32(0.0)
+    if length > 0.0:
+        w = q[0] / length
+        x = q[1] / length
+        y = q[2] / length
+        z = q[3] / length
+    return wp.mat33(
+        1.0 - 2.0 * (y * y + z * z),
+        2.0 * (x * y - w * z),
+        2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z),
+        1.0 - 2.0 * (x * x + z * z),
+        2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y),
+        2.0 * (y * z + w * x),
+        1.0 - 2.0 * (x * x + y * y),
+    )
+
+
+@wp.func
+def sh_sum(sh: wp.array2d[wp.vec3], g: wp.int32, coefficients: wp.int32, d: wp.vec3) -> wp.vec3:
+    """Spherical harmonics of Gaussian ``g`` towards the unit direction ``d``, INRIA signs, without the +0.5."""
+    x = d[0]
+    y = d[1]
+    z = d[2]
+    c = 0.28209479177387814 * sh[g, 0]
+    if coefficients > 1:
+        c = c + 0.4886025119029199 * (-y * sh[g, 1] + z * sh[g, 2] - x * sh[g, 3])
+    if coefficients > 4:
+        xx = x * x
+        yy = y * y
+        zz = z * z
+        c = c + 1.0925484305920792 * (x * y) * sh[g, 4]
+        c = c - 1.0925484305920792 * (y * z) * sh[g, 5]
+        c = c + 0.31539156525252005 * (2.0 * zz - xx - yy) * sh[g, 6]
+        c = c - 1.0925484305920792 * (x * z) * sh[g, 7]
+        c = c + 0.5462742152960396 * (xx - yy) * sh[g, 8]
+    if coefficients > 9:
+        xx = x * x
+        yy = y * y
+        zz = z * z
+        c = c - 0.5900435899266435 * y * (3.0 * xx - yy) * sh[g, 9]
+        c = c + 2.890611442640554 * (x * y) * z * sh[g, 10]
+        c = c - 0.4570457994644658 * y * (4.0 * zz - xx - yy) * sh[g, 11]
+        c = c + 0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * sh[g, 12]
+        c = c - 0.4570457994644658 * x * (4.0 * zz - xx - yy) * sh[g, 13]
+        c = c + 1.445305721320277 * z * (xx - yy) * sh[g, 14]
+        c = c - 0.5900435899266435 * x * (xx - 3.0 * yy) * sh[g, 15]
+    return c
+
+
+@wp.func
+def screen_axes(view: View, p: wp.vec3, q: wp.vec4, log_scale: wp.vec3) -> tuple[wp.vec3, wp.vec3]:
+    """Rows x and y of J W R S at the camera-space point ``p``: the screen covariance is their Gram matrix."""
+    inv_z = 1.0 / p[2]
+    # As gsplat and Kerbl et al. do, the Jacobian is taken no further out than 15 % beyond the image: it grows without
+    # bound there.
+    tx = wp.clamp(p[0] * inv_z, view.slope_low[0], view.slope_high[0])
+    ty = wp.clamp(p[1] * inv_z, view.slope_low[1], view.slope_high[1])
+    axes = view.rotation * rotation_matrix(q)
+    right = wp.vec3(axes[0, 0], axes[0, 1], axes[0, 2])
+    down = wp.vec3(axes[1, 0], axes[1, 1], axes[1, 2])
+    forward = wp.vec3(axes[2, 0], axes[2, 1], axes[2, 2])
+    scale = wp.vec3(wp.exp(log_scale[0]), wp.exp(log_scale[1]), wp.exp(log_scale[2]))
+    row_x = view.fx * inv_z * (right - tx * forward)
+    row_y = view.fy * inv_z * (down - ty * forward)
+    return wp.cw_mul(row_x, scale), wp.cw_mul(row_y, scale)
+
+
+@wp.kernel
+def project_kernel(
+    first: wp.int32,
+    # In:
+    view: View,
+    antialiased: wp.int32,
+    means: wp.array[wp.vec3],
+    rotations: wp.array[wp.vec4],
+    log_scales: wp.array[wp.vec3],
+    opacity_logits: wp.array[wp.float32],
+    sh: wp.array2d[wp.vec3],
+    # Out:
+    ellipse_out: wp.array[wp.vec4],
+    falloff_out: wp.array[wp.vec2],
+    colour_depth_out: wp.array[wp.vec4],
+    tile_count_out: wp.array[wp.int64],
+):
+    """Screen ellipse, falloff and colour of every Gaussian; a Gaussian that cannot show reaches no tile.
+
+    The ellipse is kept in its Cholesky form: with u = dx + shear dy, -ln(alpha / opacity) = a u^2 + v dy^2. Its terms
+    are all
+    positive, where the usual conic cancels for long thin splats.
+    """
+    g = wp.tid() + first
+    mean = means[g]
+    q = rotations[g]
+    log_scale = log_scales[g]
+    logit = opacity_logits[g]
+    tile_count_out[g] = wp.int64(0)
+    # -inf is a legal logarithm of a flat Gaussian's scale, but the file readers never make one.
+    if not (wp.isfinite(mean) and wp.isfinite(q) and wp.isfinite(log_scale) and wp.isfinite(logit)):
+        tile_count_out[g] = NOT_FINITE
+        return
+    p = view.rotation * mean + view.translation
+    if p[2] < view.near or p[2] > view.far:
+        return
+    row_x, row_y = screen_axes(view, p, q, log_scale)
+    sharp_xx = wp.dot(row_x, row_x)
+    sharp_yy = wp.dot(row_y, row_y)
+    var_xy = wp.dot(row_x, row_y)
+    var_xx = sharp_xx + LOW_PASS
+    var_yy = sharp_yy + LOW_PASS
+    # Cauchy-Binet: a sum of positive terms, exact where var_xx var_yy - var_xy^2 cancels.
+    sharp_determinant = wp.length_sq(wp.cross(row_x, row_y))
+    determinant = sharp_determinant + LOW_PASS * (sharp_xx + sharp_yy) + LOW_PASS * LOW_PASS
+    log_opacity = -wp.log(1.0 + wp.exp(-logit))
+    if logit < -15.0:
+        log_opacity = logit
+    if antialiased != 0:
+        log_opacity = log_opacity + 0.5 * wp.log(wp.max(sharp_determinant / determinant, 1.0e-12))
+    cut = log_opacity + LOG_255
+    # The reach is compared with the image before anything else is worked out: most Gaussians of a large scene end here.
+    if cut <= 0.0 or not wp.isfinite(determinant):
+        return
+    x = view.fx * p[0] / p[2] + view.cx
+    y = view.fy * p[1] / p[2] + view.cy
+    reach_x = wp.sqrt(2.0 * cut * var_xx)
+    reach_y = wp.sqrt(2.0 * cut * var_yy)
+    if x + reach_x < 0.5 or y + reach_y < 0.5:
+        return
+    if x - reach_x > wp.float32(view.width) - 0.5 or y - reach_y > wp.float32(view.height) - 0.5:
+        return
+    ellipse = wp.vec4(x, y, 0.5 * var_yy / determinant, -var_xy / var_yy)
+    falloff = wp.vec2(0.5 / var_yy, log_opacity)
+    rows = tile_rows(ellipse, falloff, view.height)
+    tiles = wp.int32(0)
+    for row in range(rows[0], rows[1] + 1):
+        span = tile_columns(ellipse, falloff, row, view.width, view.height)
+        tiles += span[1] - span[0] + 1
+    if tiles == 0:
+        return
+    colour = sh_sum(sh, g, sh.shape[1], wp.normalize(mean - view.centre))
+    if not wp.isfinite(colour):
+        tile_count_out[g] = NOT_FINITE
+        return
+    tile_count_out[g] = wp.int64(tiles)
+    ellipse_out[g] = ellipse
+    falloff_out[g] = falloff
+    colour_depth_out[g] = wp.vec4(
+        wp.max(colour[0] + 0.5, 0.0), wp.max(colour[1] + 0.5, 0.0), wp.max(colour[2] + 0.5, 0.0), p[2]
+    )

@@ -1,0 +1,163 @@
+"""The Gaussians of every tile from front to back.
+
+A *slot* numbers the (Gaussian, tile) pairs Gaussian by Gaussian, row by row of tiles; an *intersection* numbers the same pairs
+tile by tile, nearest first. Gradients are written by slot, so that each Gaussian finds its own side by side.
+"""
+
+import warp as wp
+
+from egs_warp.kernels.render.ellipse import TILE, tile_columns, tile_rows
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def count_tiles_kernel(
+    first_chunk: wp.int32,
+    # In:
+    width: wp.int32,
+    height: wp.int32,
+    chunk_start: wp.array[wp.int32],
+    gaussian_from_rank: wp.array[wp.int32],
+    slot_end: wp.array[wp.int64],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    # Out:
+    tile_from_slot_out: wp.array[wp.int32],
+    count_out: wp.array2d[wp.int32],
+):
+    """One thread walks one chunk of the Gaussians, from front to back, and counts them tile by tile (CPU)."""
+    chunk = wp.tid() + first_chunk
+    columns = (width + TILE - 1) / TILE
+    for rank in range(chunk_start[chunk], chunk_start[chunk + 1]):
+        g = gaussian_from_rank[rank]
+        slot = wp.int32(0)
+        if g > 0:
+            slot = wp.int32(slot_end[g - 1])
+        e = ellipse[g]
+        f = falloff[g]
+        rows = tile_rows(e, f, height)
+        for row in range(rows[0], rows[1] + 1):
+            span = tile_columns(e, f, row, width, height)
+            for column in range(span[0], span[1] + 1):
+                tile = row * columns + column
+                tile_from_slot_out[slot] = tile
+                count_out[chunk, tile] = count_out[chunk, tile] + 1
+                slot += 1
+
+
+@wp.kernel
+def fill_tiles_kernel(
+    first_chunk: wp.int32,
+    # In:
+    chunk_start: wp.array[wp.int32],
+    gaussian_from_rank: wp.array[wp.int32],
+    slot_end: wp.array[wp.int64],
+    tile_from_slot: wp.array[wp.int32],
+    # Out:
+    cursor_out: wp.array2d[wp.int32],
+    gaussian_from_intersection_out: wp.array[wp.int32],
+    slot_from_intersection_out: wp.array[wp.int32],
+):
+    """The same walk appends each Gaussian to its tiles; ``cursor_out`` begins where the chunk's part of a tile does."""
+    chunk = wp.tid() + first_chunk
+    for rank in range(chunk_start[chunk], chunk_start[chunk + 1]):
+        g = gaussian_from_rank[rank]
+        slot = wp.int32(0)
+        if g > 0:
+            slot = wp.int32(slot_end[g - 1])
+        end = wp.int32(slot_end[g])
+        while slot < end:
+            tile = tile_from_slot[slot]
+            i = cursor_out[chunk, tile]
+            cursor_out[chunk, tile] = i + 1
+            gaussian_from_intersection_out[i] = g
+            slot_from_intersection_out[i] = slot
+            slot += 1
+
+
+@wp.kernel
+def emit_tiles_kernel(
+    # In:
+    width: wp.int32,
+    height: wp.int32,
+    pair_count: wp.int32,
+    nearest_bits: wp.int32,
+    dropped_bits: wp.int32,
+    kept_bits: wp.int32,
+    slot_end: wp.array[wp.int64],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    colour_depth: wp.array[wp.vec4],
+    # Out:
+    key_out: wp.array[wp.uint32],
+    slot_and_gaussian_out: wp.array[wp.int32],
+):
+    """Sort key (tile, then the leading bits of the depth) of every slot, its number, and from 2 ``pair_count`` its Gaussian."""
+    g = wp.tid()
+    # Written side by side by neighbouring threads, which the loop below cannot do.
+    for i in range(g, pair_count, slot_end.shape[0]):
+        slot_and_gaussian_out[i] = i
+    slot = wp.int32(0)
+    if g > 0:
+        slot = wp.int32(slot_end[g - 1])
+    if slot == wp.int32(slot_end[g]):
+        return
+    columns = (width + TILE - 1) / TILE
+    e = ellipse[g]
+    f = falloff[g]
+    # Positive floats order as their bits do; counted from those of the near plane they need fewer.
+    depth_key = wp.uint32((wp.cast(colour_depth[g][3], wp.int32) - nearest_bits) >> dropped_bits)
+    rows = tile_rows(e, f, height)
+    for row in range(rows[0], rows[1] + 1):
+        span = tile_columns(e, f, row, width, height)
+        for column in range(span[0], span[1] + 1):
+            key_out[slot] = (wp.uint32(row * columns + column) << wp.uint32(kept_bits)) | depth_key
+            slot_and_gaussian_out[2 * pair_count + slot] = g
+            slot += 1
+
+
+@wp.kernel
+def finish_lists_kernel(
+    # In:
+    intersection_count: wp.int32,
+    kept_bits: wp.int32,
+    key: wp.array[wp.uint32],
+    slot_and_gaussian: wp.array[wp.int32],
+    colour_depth: wp.array[wp.vec4],
+    # Out:
+    tile_start_out: wp.array[wp.int32],
+    gaussian_from_intersection_out: wp.array[wp.int32],
+    slot_from_intersection_out: wp.array[wp.int32],
+):
+    """Start of each tile's run in the sorted pairs, and the exact order of the few whose leading depth bits are equal.
+
+    Thread i fills the starts of the tiles after that of pair i-1 up to that of pair i.
+    """
+    i = wp.tid()
+    before = wp.int32(-1)
+    if i > 0:
+        before = wp.int32(key[i - 1] >> wp.uint32(kept_bits))
+    here = tile_start_out.shape[0] - 1
+    if i < intersection_count:
+        own = key[i]
+        here = wp.int32(own >> wp.uint32(kept_bits))
+        slot = slot_and_gaussian[i]
+        gaussians = 2 * intersection_count
+        g = slot_and_gaussian[gaussians + slot]
+        # Pairs of equal keys stand in the order of their slots, which is that of equal depths.
+        place = i
+        j = i - 1
+        while j >= 0 and key[j] == own:
+            if colour_depth[slot_and_gaussian[gaussians + slot_and_gaussian[j]]][3] > colour_depth[g][3]:
+                place -= 1
+            j -= 1
+        j = i + 1
+        while j < intersection_count and key[j] == own:
+            if colour_depth[slot_and_gaussian[gaussians + slot_and_gaussian[j]]][3] < colour_depth[g][3]:
+                place += 1
+            j += 1
+        gaussian_from_intersection_out[place] = g
+        slot_from_intersection_out[place] = slot
+    for tile in range(before + 1, here + 1):
+        tile_start_out[tile] = i

@@ -1,0 +1,87 @@
+"""Gaussians against a plane: how far they reach across it, and the half that stays on one side."""
+
+import warp as wp
+
+from egs_warp.kernels.deformation.deformer import orthogonal_columns, proper_frame
+from egs_warp.kernels.render.projection import rotation_matrix
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def reach_kernel(
+    first_row: wp.int32,
+    # In:
+    normal: wp.vec3,
+    offset: wp.float32,
+    means: wp.array[wp.vec3],
+    rotations: wp.array[wp.vec4],
+    log_scales: wp.array[wp.vec3],
+    # Out:
+    height_out: wp.array[wp.float32],
+    axis_reach_out: wp.array[wp.float32],
+    deviation_out: wp.array[wp.float32],
+):
+    """Height of each mean over the plane, the largest |N.(s_i r_i)| (Eq. 20 over gamma) and the deviation along N."""
+    row = first_row + wp.tid()
+    along = wp.transpose(rotation_matrix(rotations[row])) * normal
+    s = log_scales[row]
+    w = wp.vec3(wp.abs(along[0]) * wp.exp(s[0]), wp.abs(along[1]) * wp.exp(s[1]), wp.abs(along[2]) * wp.exp(s[2]))
+    height_out[row] = wp.dot(normal, means[row]) + offset
+    axis_reach_out[row] = wp.max(w)
+    deviation_out[row] = wp.length(w)
+
+
+@wp.kernel
+def half_space_kernel(
+    first_row: wp.int32,
+    # In:
+    normal: wp.vec3,
+    offset: wp.float32,
+    source: wp.array[wp.int32],
+    means: wp.array[wp.vec3],
+    rotations: wp.array[wp.vec4],
+    log_scales: wp.array[wp.vec3],
+    opacity_logits: wp.array[wp.float32],
+    # Out:
+    mean_out: wp.array[wp.vec3],
+    rotation_out: wp.array[wp.vec4],
+    log_scale_out: wp.array[wp.vec3],
+    opacity_logit_out: wp.array[wp.float32],
+):
+    """Mass, mean and covariance of what Gaussian ``source`` has on the side that the normal points to.
+
+    With A = R S and w = A^T N / sigma, Sigma - c Sigma N N^T Sigma / sigma^2 = A' A'^T for
+    A' = A (I - (1 - sqrt(1 - c)) w w^T): the factor is decomposed, because the square would lose flat splats.
+    """
+    row = first_row + wp.tid()
+    g = source[row]
+    turn = rotation_matrix(rotations[g])
+    s = log_scales[g]
+    scale = wp.vec3(wp.exp(s[0]), wp.exp(s[1]), wp.exp(s[2]))
+    w = wp.cw_mul(scale, wp.transpose(turn) * normal)
+    sigma = wp.length(w)
+    w = w / sigma
+    t = -(wp.dot(normal, means[g]) + offset) / sigma
+    kept = 0.5 * wp.erfc(t * 0.70710678)
+    # The hazard pdf / (1 - cdf); far above the plane both tend to 0, far below to t.
+    hazard = wp.where(t < 6.0, 0.3989422804 * wp.exp(-0.5 * t * t) / wp.max(kept, 1.0e-9), t)
+    narrowed = wp.sqrt(wp.clamp(1.0 - hazard * (hazard - t), 1.0e-6, 1.0))
+    mean_out[row] = means[g] + hazard * (turn * wp.cw_mul(scale, w))
+    factor = (turn * wp.diag(scale)) * (wp.identity(n=3, dtype=wp.float32) - (1.0 - narrowed) * wp.outer(w, w))
+    m = orthogonal_columns(
+        wp.vec3(factor[0, 0], factor[1, 0], factor[2, 0]),
+        wp.vec3(factor[0, 1], factor[1, 1], factor[2, 1]),
+        wp.vec3(factor[0, 2], factor[1, 2], factor[2, 2]),
+    )
+    q = wp.quat_from_matrix(proper_frame(m.a, m.b, m.c))
+    rotation_out[row] = wp.vec4(q[3], q[0], q[1], q[2])
+    log_scale_out[row] = wp.vec3(
+        wp.log(wp.max(wp.length(m.a), 1.0e-20)),
+        wp.log(wp.max(wp.length(m.b), 1.0e-20)),
+        wp.log(wp.max(wp.length(m.c), 1.0e-20)),
+    )
+    # Seen along the plane, mass is opacity times width.
+    opacity = 1.0 / (1.0 + wp.exp(-opacity_logits[g]))
+    peak = wp.clamp(opacity * wp.min(kept / narrowed, 1.0), 1.0e-6, 0.999999)
+    opacity_logit_out[row] = wp.log(peak / (1.0 - peak))

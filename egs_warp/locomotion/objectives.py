@@ -1,0 +1,248 @@
+"""What a motion asks of the end velocity: weighted squares of linear functions of v (DESIGN 9)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.spatial import ConvexHull
+
+from egs_warp.contact.detection import ContactSet
+from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.geometry.plane import square_to
+
+
+@dataclass(frozen=True)
+class Objective:
+    """weight |rows v - target|^2, all in m/s so that weights compare."""
+
+    name: str
+    rows: sparse.csr_matrix
+    """(k, 3N)."""
+    target: np.ndarray
+    """(k,) m/s."""
+    weight: float
+    lifted: tuple[int, ...] = ()
+    """Nodes whose contacts ought to let go: the first guess of their state is that they separate. Stage 1 keeps last step's
+    activations, so it cannot foresee a foot that the muscles are about to lift."""
+
+
+def centre_of_mass_velocity(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
+    """Velocity (3,) of the centre of mass."""
+    shares = body.node_mass / body.mass
+    return Objective("com", sparse.csr_matrix(np.kron(shares, np.eye(3))), np.asarray(target, float), weight)
+
+
+@dataclass(frozen=True)
+class SpinObjective:
+    """weight |L+ - target|^2 / (m r)^2, r the radius of gyration, for the angular momentum about the centre of mass at the end of the step.
+
+    The stepper keeps L+ = L + dt sum (x - c) x f (DESIGN 5), so contact forces alone steer it.
+    """
+
+    target: np.ndarray
+    """(3,) kg m^2/s."""
+    weight: float
+
+
+def lifted_contacts(contacts: ContactSet, objectives: Sequence[Objective | SpinObjective]) -> np.ndarray:
+    """(n,) bool: contacts on nodes that an objective lifts."""
+    lifted = [node for wish in objectives if isinstance(wish, Objective) for node in wish.lifted]
+    nearest = contacts.nodes[np.arange(contacts.count), np.argmax(contacts.weights, axis=1)]
+    return np.isin(nearest, lifted)
+
+
+def node_velocities(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
+    """Velocities (N, 3) of all nodes, each weighted by its share of the mass: a pose to move towards."""
+    shares = np.sqrt(np.repeat(body.node_mass / body.mass, 3))
+    return Objective("pose", sparse.diags(shares).tocsr(), shares * target.ravel(), weight)
+
+
+@dataclass(frozen=True)
+class BodyPart:
+    """The whole body or a part of it (a foot, the head, the base): some nodes and their masses."""
+
+    name: str
+    nodes: np.ndarray
+    """(k,)."""
+    masses: np.ndarray
+    """(k,) kg."""
+
+    @classmethod
+    def of(cls, body: SoftBody, name: str, nodes: np.ndarray) -> BodyPart:
+        """The part made of ``nodes``."""
+        return cls(name, nodes, body.node_mass[nodes])
+
+    @classmethod
+    def whole(cls, body: SoftBody) -> BodyPart:
+        """All of it."""
+        return cls.of(body, "body", np.arange(len(body.node_mass)))
+
+    @classmethod
+    def base(cls, body: SoftBody, heights: np.ndarray) -> BodyPart:
+        """What stands on the ground: nodes whose height (N,) at rest is at most 0.06 H above the lowest."""
+        return cls.of(body, "base", np.flatnonzero(heights < heights.min() + 0.06 * body.height))
+
+    @classmethod
+    def head(cls, body: SoftBody, heights: np.ndarray) -> BodyPart:
+        """The topmost part: nodes whose height (N,) at rest is at most 0.15 H below the highest."""
+        return cls.of(body, "head", np.flatnonzero(heights > heights.max() - 0.15 * body.height))
+
+    def centre(self, points: np.ndarray) -> np.ndarray:
+        """(3,) mass-weighted mean of ``points`` (N, 3) over the part."""
+        return self.masses @ points[self.nodes] / self.masses.sum()
+
+    def spread(self, points: np.ndarray) -> np.ndarray:
+        """(3, 3) kg m^2, inertia about the part's centre at ``points`` (N, 3)."""
+        arms = points[self.nodes] - self.centre(points)
+        second = np.einsum("n,ni,nj->ij", self.masses, arms, arms)
+        return np.trace(second) * np.eye(3) - second
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """Axes in which an objective is told, and whether relative to the centre of mass."""
+
+    axes: np.ndarray
+    """(3, 3) rows are unit vectors; a target's components are along them."""
+    relative: bool
+    """Whether the origin moves with the centre of mass of the whole body."""
+
+
+WORLD = Coordinates(np.eye(3), False)
+
+
+def part_velocity(
+    body: SoftBody, part: BodyPart, target: np.ndarray, weight: float, coordinates: Coordinates = WORLD
+) -> Objective:
+    """Velocity (3,) m/s of the centre of ``part``; of the base, relative to the centre of mass, it steers a landing."""
+    shares = np.zeros(len(body.node_mass))
+    shares[part.nodes] = part.masses / part.masses.sum()
+    if coordinates.relative:
+        shares -= body.node_mass / body.mass
+    rows = sparse.csr_matrix(np.kron(shares, coordinates.axes))
+    return Objective(f"{part.name} velocity", rows, np.asarray(target, float), weight)
+
+
+def part_position(
+    body: SoftBody,
+    part: BodyPart,
+    state: BodyState,
+    target: np.ndarray,
+    weight: float,
+    rate: float,
+    coordinates: Coordinates = WORLD,
+) -> Objective:
+    """Position (3,) metres of the centre of ``part``, approached at ``rate`` 1/s; 1/dt means at the end of the step."""
+    place = part.centre(state.positions)
+    if coordinates.relative:
+        place = place - body.centre_of_mass(state.positions)
+    return part_velocity(body, part, rate * (target - coordinates.axes @ place), weight, coordinates)
+
+
+def part_acceleration(
+    body: SoftBody,
+    part: BodyPart,
+    state: BodyState,
+    target: np.ndarray,
+    weight: float,
+    dt: float,
+    coordinates: Coordinates = WORLD,
+) -> Objective:
+    """Acceleration (3,) m/s^2 of the centre of ``part`` over the step of ``dt`` seconds."""
+    velocity = part.centre(state.velocities)
+    if coordinates.relative:
+        velocity = velocity - body.centre_of_mass(state.velocities)
+    return part_velocity(body, part, coordinates.axes @ velocity + dt * np.asarray(target), weight, coordinates)
+
+
+def part_angular_momentum(
+    body: SoftBody,
+    part: BodyPart,
+    state: BodyState,
+    target: np.ndarray,
+    weight: float,
+    coordinates: Coordinates = WORLD,
+) -> Objective:
+    """Angular momentum (3,) kg m^2/s of ``part`` about its own centre; in relative coordinates about the centre of mass of the body,
+    with velocities relative to its.
+
+    Told in m/s: over mass x radius of gyration. For the whole body ``SpinObjective`` is exact, this is linear in the arms.
+    """
+    if coordinates.relative:
+        pivot, moving = body.centre_of_mass(state.positions), body.node_mass / body.mass
+    else:
+        pivot, moving = part.centre(state.positions), np.zeros(len(body.node_mass))
+        moving[part.nodes] = part.masses / part.masses.sum()
+    arms = state.positions[part.nodes] - pivot
+    crosses = np.zeros((len(body.node_mass), 3, 3))
+    crosses[part.nodes] = part.masses[:, None, None] * _cross_matrices(arms)
+    crosses -= moving[:, None, None] * crosses.sum(axis=0)
+    unit = _gyration(part, state.positions) * part.masses.sum()
+    rows = np.einsum("ij,njk->ink", coordinates.axes, crosses).reshape(3, -1) / unit
+    return Objective(f"{part.name} momentum", sparse.csr_matrix(rows), np.asarray(target, float) / unit, weight)
+
+
+def part_turning(
+    body: SoftBody,
+    part: BodyPart,
+    state: BodyState,
+    target: np.ndarray,
+    weight: float,
+    coordinates: Coordinates = WORLD,
+) -> Objective:
+    """Angular velocity (3,) rad/s of ``part``, that of the rigid body with its momentum: the rate of its orientation."""
+    momentum = part_angular_momentum(body, part, state, np.zeros(3), weight)
+    unit = _gyration(part, state.positions) * part.masses.sum()
+    radius = _gyration(part, state.positions)
+    rows = coordinates.axes @ np.linalg.inv(part.spread(state.positions)) * unit * radius
+    return Objective(
+        f"{part.name} turning", sparse.csr_matrix(rows @ momentum.rows), radius * np.asarray(target, float), weight
+    )
+
+
+def base_area(part: BodyPart, state: BodyState, up: np.ndarray, target: float, weight: float, rate: float) -> Objective:
+    """Area (m^2) of the convex hull of ``part`` seen along ``up`` (3,), approached at ``rate`` 1/s.
+
+    Told in m/s: dA/dt over the hull's perimeter is the speed at which its sides move outwards.
+    """
+    plane = np.stack(square_to(up))
+    hull = ConvexHull(state.positions[part.nodes] @ plane.T)
+    corners = part.nodes[hull.vertices]  # anticlockwise in two dimensions
+    flat = state.positions[corners] @ plane.T
+    ahead, behind = np.roll(flat, -1, axis=0), np.roll(flat, 1, axis=0)
+    perimeter = float(np.linalg.norm(ahead - flat, axis=1).sum())
+    slopes = 0.5 * np.stack([ahead[:, 1] - behind[:, 1], behind[:, 0] - ahead[:, 0]], axis=1) @ plane
+    rows = np.zeros((len(state.positions), 3))
+    rows[corners] = slopes / perimeter
+    return Objective(
+        f"{part.name} area",
+        sparse.csr_matrix(rows.reshape(1, -1)),
+        np.array([rate * (target - hull.volume) / perimeter]),
+        weight,
+    )
+
+
+def part_nodes(body: SoftBody, part: BodyPart, target: np.ndarray, weight: float) -> Objective:
+    """Velocities (k, 3) m/s of every node of ``part``, each with the same share of the weight: place and shape at once."""
+    count = len(part.nodes)
+    columns = (3 * part.nodes[:, None] + np.arange(3)).ravel()
+    share = np.sqrt(1.0 / count)
+    rows = sparse.csr_matrix(
+        (np.full(3 * count, share), (np.arange(3 * count), columns)), shape=(3 * count, 3 * len(body.node_mass))
+    )
+    return Objective(f"{part.name} nodes", rows, share * np.asarray(target, float).ravel(), weight)
+
+
+def _cross_matrices(arms: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) matrices X with X v = arm x v, for arms (n, 3)."""
+    x, y, z = arms.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+
+
+def _gyration(part: BodyPart, points: np.ndarray) -> float:
+    """Metres."""
+    return float(np.sqrt(0.5 * np.trace(part.spread(points)) / part.masses.sum()))

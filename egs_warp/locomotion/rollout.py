@@ -1,0 +1,127 @@
+"""A body, its muscles and its ground, ready to move; and the loop that moves it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from egs_warp.contact.corrector import contact_step
+from egs_warp.contact.detection import ContactGeometry
+from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.fem.factorisation import Factorisation
+from egs_warp.fem.implicit_step import ImplicitStep
+from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
+from egs_warp.locomotion.trajectory import Trajectory, record
+
+FRAME_RATE = 60
+"""Frames of a video, 1/s."""
+REST_FRAMES = 20
+"""Frames shown after the last motion has come to rest."""
+
+
+class Motion(Protocol):
+    """Anything that writes objectives from the measured state."""
+
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[Objective | SpinObjective]:
+        """Objectives of the step of ``dt`` seconds that starts at ``state``; ``report`` is of the step before."""
+        ...
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A finished simulation."""
+
+    trajectory: Trajectory
+    reports: tuple[StepReport, ...]
+    frames: np.ndarray
+    """(n,) index into the trajectory's times for each frame of the video."""
+
+
+def steps_per_frame(body: SoftBody) -> int:
+    """Solver steps a frame, so that a step is at most sqrt(H / g) / 19 (DESIGN 4)."""
+    longest = np.sqrt(body.height / np.linalg.norm(body.gravity)) / 19.0
+    return int(np.ceil(1.0 / (FRAME_RATE * longest) - 1e-3))
+
+
+def settle(stepper: LocomotionStepper) -> BodyState:
+    """The body at rest on its ground: contact steps from rest, long ones, each begun without velocity.
+
+    One that gives way is not followed to the ground: it is returned once a node has gone 0.2 H in one step, or its centre of
+    mass 0.1 H in all.
+    """
+    body = stepper.body
+    state = BodyState(body.mesh.nodes.copy(), np.zeros_like(body.mesh.nodes))
+    dt = 0.25 * np.sqrt(body.height / np.linalg.norm(body.gravity))
+    force = body.node_mass[:, None] * body.gravity
+    factorisation = Factorisation(body)
+    memory = stepper.initial_memory()
+    for _ in range(12):
+        step = ImplicitStep(body, state, dt, factorisation)
+        points = stepper.choose_contacts(step, memory)
+        result = contact_step(
+            step,
+            stepper.detector,
+            points,
+            force,
+            start_velocities=np.zeros_like(state.positions),
+            start_forces=stepper.matched_forces(memory, points),
+            push_out_cap=0.0,
+            penetration_tolerance=stepper.settings.penetration_tolerance * body.height,
+        )
+        moved = dt * float(np.abs(result.velocities).max())
+        state = BodyState(step.end_positions(result.velocities), np.zeros_like(state.positions))
+        memory = stepper.remember(result, memory.activations)
+        gone = body.centre_of_mass(state.positions) - body.centre_of_mass(body.mesh.nodes)
+        gives_way = moved > 0.2 * body.height or np.linalg.norm(gone) > 0.1 * body.height
+        if gives_way or moved < 2e-4 * body.height:
+            break
+    return state
+
+
+def simulate(
+    stepper: LocomotionStepper,
+    geometry: ContactGeometry,
+    start: BodyState,
+    motion: Motion,
+    *,
+    frames: int,
+    step: float | None = None,
+    finished: Callable[[], bool] = lambda: False,
+    progress: Callable[[int], object] = lambda frame: None,
+) -> Simulation:
+    """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``.
+
+    ``step``: seconds of a solver step, if not the usual (DESIGN 4); one longer than a frame makes the frame as long. ``progress`` is
+    told each frame done.
+    """
+    per_frame = steps_per_frame(stepper.body) if step is None else max(round(1.0 / (FRAME_RATE * step)), 1)
+    dt = step or 1.0 / (FRAME_RATE * per_frame)
+    state, memory = start, stepper.initial_memory()
+    reports: list[StepReport] = []
+    shown = [0]
+    resting = 0
+    for frame in range(frames):
+        for _ in range(per_frame):
+            objectives = motion.objectives(state, reports[-1] if reports else None, dt)
+            state, memory, done = stepper.advance(state, memory, objectives, dt)
+            reports.extend(done)
+        shown.append(len(reports))
+        progress(frame)
+        resting = resting + 1 if finished() else 0
+        if resting == REST_FRAMES:
+            break
+    gaps, _ = stepper.detector.gaps(start.positions)
+    trajectory = record(
+        stepper.body,
+        geometry,
+        start,
+        float(gaps.min()),
+        reports,
+        drag=stepper.settings.drag,
+        segments=stepper.muscles.segment_count,
+    )
+    return Simulation(trajectory, tuple(reports), np.array(shown))

@@ -1,0 +1,264 @@
+"""The cage: a coarse tetrahedral mesh around the object's visible volume, flat where it stands on its plane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+import warp as wp
+from scipy import ndimage
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.kernels.meshing.occupancy import inside_mesh_kernel
+from egs_warp.meshing.occupancy import LatticeSolid, solid_from_gaussians
+from egs_warp.meshing.stuffing import stuff
+from egs_warp.meshing.tetwild import tetwild
+
+_MIN_DIHEDRAL_DEGREES = 8.0
+_ENCLOSED_AIM = 0.9993
+_MAX_GROWTH_STEPS = 6
+_GROWTH_SAMPLE = 20000
+_FINER_PER_STEP = 0.15
+_THIN_RADIUS = 0.56
+"""In lattice cells: a rod of this radius cannot slip between the points of a body-centred cubic lattice, whose covering
+radius is sqrt(5)/4."""
+
+
+class CageMethod(Enum):
+    """Which mesher makes the tetrahedra."""
+
+    VOXEL = "voxel"
+    """Isosurface stuffing of the voxel solid: the same bits in every run; dihedral angles of 10 degrees and more, but where
+    the surface meets the floor (7.6 degrees at the least in 400 random solids)."""
+    TETWILD = "tetwild"
+    """fTetWild, for thin parts with fewer nodes. It seeds its random numbers from the system, so two runs give two
+    meshes; where it fails or leaves a sliver, VOXEL takes its place."""
+
+
+@dataclass(frozen=True)
+class Cage:
+    """A tetrahedral mesh around an object, and what it holds."""
+
+    mesh: TetMesh
+    """In the capture's units."""
+    method: CageMethod
+    """The mesher that made it."""
+    min_dihedral_degrees: float
+    """Smallest dihedral angle of any tetrahedron."""
+    enclosed_opacity_mass: float
+    """Share, by opacity, of the object's Gaussian means inside the mesh; floaters and means below the plane do not
+    count."""
+    floater_opacity_mass: float
+    """Share, by opacity, of all Gaussians that hang in the air apart from the object."""
+    below_plane_opacity_mass: float
+    """Share, by opacity, of all Gaussians whose mean lies below the plane."""
+    dilation: float
+    """How far the cage was grown around the occupied space, scene units."""
+
+    def height(self, plane: Plane) -> float:
+        """Body height H above ``plane``, in the mesh's units."""
+        return float(plane.heights(self.mesh.nodes).max())
+
+    def scaled(self, factor: float) -> Cage:
+        """The same cage after all lengths are multiplied by ``factor``."""
+        return replace(self, mesh=TetMesh(self.mesh.nodes * factor, self.mesh.tets), dilation=self.dilation * factor)
+
+
+def build_cage(
+    cloud: GaussianCloud,
+    plane: Plane,
+    *,
+    target_nodes: int = 500,
+    dilation: float = 0.005,
+    method: CageMethod = CageMethod.VOXEL,
+) -> Cage:
+    """Cage of about ``target_nodes`` nodes around the opaque part of ``cloud`` above ``plane``, which it never crosses.
+
+    ``dilation`` is in units of the object's longest side; it is raised, and the mesh refined (up to 1.75 times the
+    nodes), until all but 0.07 % of the object's opacity mass is inside.
+    The same input gives the same bits (``CageMethod.VOXEL``). DESIGN section 4.
+
+    Raises ``UserError`` for an object without volume (flat, tiny, nothing opaque above the plane).
+    """
+    if not 50 <= target_nodes <= 20000:
+        raise UserError(f"cage: {target_nodes} nodes asked; give a number from 50 to 20000")
+    solid = solid_from_gaussians(cloud, plane)
+    _refuse_flat(solid)
+    weights = np.where(solid.belongs, cloud.opacities(), 0.0)
+    distance = _Distance(solid)
+    # Two nodes a cell inside, about as many again on the surface.
+    cell = (4.0 * np.count_nonzero(solid.inside) / target_nodes) ** (1.0 / 3.0)
+    # Large captures are judged by a regular sample while the cage grows, and by all in the end.
+    sample = np.arange(0, cloud.count, max(1, cloud.count // _GROWTH_SAMPLE))
+    best: tuple[float, float, TetMesh, CageMethod] | None = None
+    for growth in range(_MAX_GROWTH_STEPS):
+        grown = dilation + 0.006 * growth
+        # Growth alone does not reach the tips of curled thin parts; a finer lattice does.
+        finer = round(target_nodes * (1.0 + _FINER_PER_STEP * growth))
+        mesh, used, cell = _mesh(solid, distance, finer, grown, method, cell)
+        enclosed = _enclosed_share(cloud, mesh, weights, sample)
+        if best is None or enclosed > best[0]:
+            best = (enclosed, grown, mesh, used)
+        if enclosed >= _ENCLOSED_AIM:
+            break
+    if best is None:
+        raise UserError("cage: no mesh was made; choose another object")
+    _, grown, mesh, used = best
+    return Cage(
+        mesh=mesh,
+        method=used,
+        min_dihedral_degrees=mesh.min_dihedral_degrees(),
+        enclosed_opacity_mass=_enclosed_share(cloud, mesh, weights, np.arange(cloud.count)),
+        floater_opacity_mass=_share(cloud, ~solid.belongs & ~solid.below_plane),
+        below_plane_opacity_mass=_share(cloud, solid.below_plane),
+        dilation=grown * solid.longest_side,
+    )
+
+
+def _share(cloud: GaussianCloud, chosen: np.ndarray) -> float:
+    opacities = cloud.opacities()
+    return float(np.sum(opacities[chosen]) / np.sum(opacities))
+
+
+def _refuse_flat(solid: LatticeSolid) -> None:
+    """A sheet is at most the lattice's own blur thick, wherever one looks."""
+    thickest = float(_edt(np.pad(solid.inside, 1)[:, :, 1:]).max())
+    size = np.ptp(np.argwhere(solid.inside), axis=0) + 1
+    if thickest < 2.0 or size.min() < 4:
+        raise UserError(
+            "object: it is flat (no part is thicker than 1/20 of its longest side), so it has no volume to move; "
+            "choose another object, or check --plane and --up"
+        )
+
+
+def _mesh(
+    solid: LatticeSolid, distance: _Distance, target_nodes: int, dilation: float, method: CageMethod, cell: float
+) -> tuple[TetMesh, CageMethod, float]:
+    """The mesh, who made it, and the lattice cell that gives the asked node count (``cell`` if no lattice was made)."""
+    if method is CageMethod.TETWILD:
+        mesh = tetwild(_Field(distance, dilation, thin_radius=0.0), target_nodes)
+        if mesh is not None and mesh.min_dihedral_degrees() >= _MIN_DIHEDRAL_DEGREES:
+            nodes, tets = _main_piece(mesh.nodes, mesh.tets)
+            return TetMesh.oriented(solid.world(nodes), tets), CageMethod.TETWILD, cell
+    nodes, tets, cell = _stuffed(distance, target_nodes, dilation, cell)
+    return TetMesh.oriented(solid.world(nodes), tets), CageMethod.VOXEL, cell
+
+
+def _stuffed(
+    distance: _Distance, target_nodes: int, dilation: float, cell: float
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Nodes (lattice spacings), tetrahedra and cell of the lattice mesh whose node count comes nearest to the target.
+
+    Secant steps on the cell's size, from ``cell``.
+    """
+    best: tuple[float, np.ndarray, np.ndarray, float] | None = None
+    for _ in range(6):
+        field = _Field(distance, dilation, thin_radius=_THIN_RADIUS * cell)
+        nodes, tets = stuff(field, *field.bounds(), cell)
+        if len(tets) == 0:
+            cell *= 0.7
+            continue
+        nodes, tets = _main_piece(nodes, tets)
+        miss = abs(float(np.log(len(nodes) / target_nodes)))
+        if best is None or miss < best[0]:
+            best = (miss, nodes, tets, cell)
+        if miss < 0.08:
+            break
+        cell *= (len(nodes) / target_nodes) ** 0.45
+    if best is None:
+        raise UserError("object: it is too thin to be given a volume; choose another object")
+    return best[1:]
+
+
+class _Distance:
+    """Distances of the solid and its mirror image below the plane, which no dilation changes."""
+
+    def __init__(self, solid: LatticeSolid) -> None:
+        self.pad = int(np.ceil(0.25 * solid.longest_side / solid.spacing))
+        mirrored = np.pad(np.concatenate([solid.inside[:, :, :0:-1], solid.inside], axis=2), self.pad)
+        sharp = _edt(~mirrored) - _edt(mirrored)
+        self.sharp = sharp - 0.5 * np.sign(sharp)
+        """Signed distance, in lattice spacings."""
+        self.smooth = np.asarray(ndimage.gaussian_filter(self.sharp, 0.9))
+        """The same without the lattice's steps."""
+        self.longest_side = solid.longest_side / solid.spacing
+        """In lattice spacings."""
+
+
+class _Field:
+    """Smooth signed distance of the grown solid, in lattice spacings: negative inside."""
+
+    def __init__(self, distance: _Distance, dilation: float, *, thin_radius: float) -> None:
+        """``dilation`` in longest sides; parts thinner than ``thin_radius`` (spacings) are thickened to it."""
+        smooth = distance.smooth
+        value = np.minimum(smooth, distance.sharp + 0.3) - dilation * distance.longest_side
+        if thin_radius > 0.0:
+            # Medial points of thin parts: the distance to the surface has a crest there (it has none at corners).
+            crest = (smooth < -0.2) & (smooth <= ndimage.minimum_filter(smooth, 3)) & (-value < thin_radius)
+            if crest.any():
+                value = np.minimum(value, _edt(~crest) - thin_radius)
+        self._value = value[:, :, value.shape[2] // 2 - 1 :]
+        self._offset = np.array([distance.pad, distance.pad, 1.0])
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        return ndimage.map_coordinates(self._value, (points + self._offset).T, order=1, mode="nearest", prefilter=False)
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Box (3,), (3,) of the solid, in lattice spacings."""
+        where = np.argwhere(self._value < 0.0) - self._offset
+        return where.min(axis=0) - 1.0, where.max(axis=0) + 1.0
+
+    def samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """The lattice of values from layer 0 up, and the position (3,) of its first point."""
+        return self._value[:, :, 1:], np.append(-self._offset[:2], 0.0)
+
+
+def _edt(mask: np.ndarray) -> np.ndarray:
+    """Distance of every True point to the nearest False one, in lattice spacings."""
+    return np.asarray(ndimage.distance_transform_edt(mask))
+
+
+def _main_piece(nodes: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The largest part (by volume) that hangs together through faces; loose crumbs are dropped."""
+    faces = np.sort(tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
+    _, face = np.unique(faces, axis=0, return_inverse=True)
+    order = np.argsort(face, kind="stable")
+    shared = face[order][1:] == face[order][:-1]
+    a, b = order[:-1][shared] // 4, order[1:][shared] // 4
+    graph = coo_matrix((np.ones(len(a)), (a, b)), shape=(len(tets), len(tets)))
+    _, label = connected_components(graph, directed=False)
+    x = nodes[tets]
+    volume = np.abs(np.einsum("ti,ti->t", x[:, 1] - x[:, 0], np.cross(x[:, 2] - x[:, 0], x[:, 3] - x[:, 0])))
+    tets = tets[label == np.argmax(np.bincount(label, weights=volume))]
+    used, compact = np.unique(tets, return_inverse=True)
+    return nodes[used], compact.reshape(-1, 4)
+
+
+def _enclosed_share(cloud: GaussianCloud, mesh: TetMesh, weights: np.ndarray, sample: np.ndarray) -> float:
+    """Share of ``weights`` (n,) inside the mesh, of the means numbered ``sample`` (m,)."""
+    centre = mesh.nodes.mean(axis=0)
+    size = float(np.ptp(mesh.nodes, axis=0).max())
+    surface = wp.Mesh(
+        points=wp.array(((mesh.nodes - centre) / size).astype(np.float32), dtype=wp.vec3, device=cloud.device),
+        indices=wp.array(mesh.boundary_faces().ravel(), dtype=wp.int32, device=cloud.device),
+        support_winding_number=True,
+    )
+    sample = sample[weights[sample] > 0.0]
+    if len(sample) == 0:
+        return 0.0
+    inside = wp.zeros(len(sample), dtype=wp.uint8, device=cloud.device)
+    points = ((cloud.means.numpy()[sample] - centre) / size).astype(np.float32)
+    wp.launch(
+        inside_mesh_kernel,
+        dim=len(sample),
+        inputs=[surface.id, wp.array(points, dtype=wp.vec3, device=cloud.device)],
+        outputs=[inside],
+        device=cloud.device,
+    )
+    return float(np.sum(weights[sample] * inside.numpy()) / np.sum(weights[sample]))

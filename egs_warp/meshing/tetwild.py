@@ -1,0 +1,71 @@
+"""fTetWild behind one function."""
+
+from __future__ import annotations
+
+import sys
+import types
+from typing import Protocol
+
+import numpy as np
+from skimage import measure
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.tetmesh import TetMesh
+
+
+class SampledField(Protocol):
+    """A signed distance known at lattice points."""
+
+    def samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """Values (nx, ny, nz), negative inside, layer 0 in the plane; position (3,) of the first point."""
+        ...
+
+
+def flat_bottomed_surface(field: SampledField) -> tuple[np.ndarray, np.ndarray]:
+    """Marching-cubes vertices (v, 3) and outward faces (f, 3) of the field, closed by an exactly flat bottom at z = 0."""
+    values, start = field.samples()
+    closed = np.concatenate([np.full_like(values[:, :, :1], 2.0), values], axis=2)
+    vertices, faces, _, _ = measure.marching_cubes(closed, 0.0)
+    vertices = vertices.astype(np.float64) + start - [0.0, 0.0, 1.0]
+    vertices[:, 2] = np.maximum(vertices[:, 2], 0.0)
+    return vertices, faces[:, ::-1].astype(np.int32)
+
+
+def tetwild(field: SampledField, target_nodes: int) -> TetMesh | None:
+    """A mesh of about ``target_nodes`` nodes by fTetWild, or None where it fails; not the same in two runs."""
+    vertices, faces = flat_bottomed_surface(field)
+    tetrahedralize = _tetrahedralize()
+    edge_length = 0.05 * (600.0 / target_nodes) ** 0.5
+    try:
+        nodes, tets = tetrahedralize(
+            vertices,
+            faces,
+            edge_length_fac=edge_length,
+            coarsen=True,
+            epsilon=5e-3,
+            stop_energy=10.0,
+            num_opt_iter=40,
+            num_threads=1,
+        )
+        # The envelope lets the bottom wander; what it moved is put back into the plane.
+        diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+        nodes[np.abs(nodes[:, 2]) < 6e-3 * diagonal, 2] = 0.0
+        return TetMesh.oriented(nodes, tets)
+    except (RuntimeError, ValueError, UserError):
+        return None
+
+
+def _tetrahedralize():
+    """pytetwild's function. Its 0.4.2 imports pyvista (and with it all of VTK) for an accessor that is not used here,
+    though its metadata call pyvista optional: an empty module takes its place while it is imported."""
+    try:
+        import pyvista  # noqa: F401
+    except ImportError:
+        sys.modules["pyvista"] = types.ModuleType("pyvista")
+        try:
+            import pytetwild
+        finally:
+            del sys.modules["pyvista"]
+    else:
+        import pytetwild
+    return pytetwild.tetrahedralize

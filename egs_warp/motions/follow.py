@@ -1,0 +1,246 @@
+"""Follow a user's own key frames as nearly as the muscles and the ground allow (DESIGN 9)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import Enum
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from egs_warp.errors import UserError
+from egs_warp.fem.body import BodyState, best_turn
+from egs_warp.locomotion.objectives import (
+    BodyPart,
+    Coordinates,
+    Objective,
+    SpinObjective,
+    centre_of_mass_velocity,
+    node_velocities,
+    part_angular_momentum,
+    part_turning,
+    part_velocity,
+)
+from egs_warp.locomotion.stepper import StepReport
+from egs_warp.motions.feet import find_feet
+from egs_warp.motions.keyframes import Channel, Key, Quantity, channels
+from egs_warp.motions.leap import CALM
+from egs_warp.motions.sequence import Place
+from egs_warp.motions.stance import PoseFamily, Weights
+
+MISSED = 0.1
+"""Of the largest value of its channel: a key missed by more is noted."""
+AHEAD = np.radians(15.0)
+"""A foot that is less than this to the right of straight ahead counts as straight ahead."""
+CALM_TIME = 0.3
+"""Of sqrt(H / g): for how long the body is slow, after the last key, before it is at rest; as after a jump."""
+LONGEST_HOLD = 9.0
+"""Of sqrt(H / g): at most for how long that is waited for."""
+
+
+class FollowPhase(Enum):
+    """Phases of a trajectory."""
+
+    FOLLOW = "follow"
+    HOLD = "hold"
+    REST = "rest"
+
+
+class Follow:
+    """The keys' own objectives, and beside them a standing body: balance, no spin, its shape, each unless a key rules it."""
+
+    def __init__(self, place: Place, keys: Sequence[Key], *, weights: Weights | None = None) -> None:
+        """Raises ``UserError`` for a key of a part that the body does not have."""
+        self.body, self.ground, self.weights = place.body, place.ground, weights or Weights()
+        self.keys, self.channels = tuple(keys), channels(keys)
+        self.parts = {part.name: part for part in parts_of_body(place)}
+        for key in self.keys:
+            if key.part not in self.parts:
+                raise UserError(f"{key.where}: the body has no part {key.part!r}; it has {', '.join(self.parts)}")
+        self.pose = PoseFamily(self.body, place.ground, place.standing, place.touching)
+        self.phase = FollowPhase.FOLLOW
+        self._standing = place.standing
+        self._gravity = float(np.linalg.norm(self.body.gravity))
+        self._rate = 6.0 * float(np.sqrt(self._gravity / self.body.height))
+        self._began: float | None = None
+        self._end = max(key.time for key in self.keys)
+        self._calm_since: float | None = None
+        self._restless = False
+        self._reached: dict[int, np.ndarray] = {}
+        self._turned = {name: np.zeros(3) for name in self.parts}
+
+    def planned(self) -> dict[str, float]:
+        """How many keys there are, how long they take (seconds), and the worst miss so far, in the unit of its quantity."""
+        misses = [float(np.linalg.norm(self._miss(index))) for index in self._reached]
+        return {"keys": float(len(self.keys)), "duration": self._end, "worst_miss": max(misses, default=0.0)}
+
+    def notes(self) -> list[str]:
+        """Which keys were missed, and whether the body never came to rest."""
+        notes = []
+        for index, key in enumerate(self.keys):
+            group = [np.linalg.norm(k.value) for k in self.keys if (k.part, k.quantity) == (key.part, key.quantity)]
+            name = f"{key.where}: {key.part} {key.quantity.value} at {key.time:g} s"
+            if index not in self._reached:
+                notes.append(f"{name} was not reached in time")
+            elif np.linalg.norm(self._miss(index)) > MISSED * max(group):
+                told = ", ".join(f"{value:.3g}" for value in self._reached[index])
+                notes.append(f"{name}: reached ({told})")
+        if self._restless:
+            notes.append("the body was not yet at rest when the time for it, after the last key, was up")
+        return notes
+
+    def _miss(self, index: int) -> np.ndarray:
+        """(3,) from a key's value to that at its time, in its unit; of an orientation, the rotation between the two."""
+        key, reached = self.keys[index], self._reached[index]
+        if key.quantity is Quantity.ORIENTATION:
+            return turn_between(np.array(key.value), reached)
+        return reached - np.array(key.value)
+
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
+        """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
+        if self._began is None:
+            self._began = state.time
+        elapsed = state.time - self._began
+        for index, key in enumerate(self.keys):
+            if index not in self._reached and elapsed >= key.time - 0.5 * dt:
+                self._reached[index] = self._measured(key.part, key.quantity, state)
+        self._advance_phase(state, elapsed)
+        # Where a part is, is held after its last key; how fast it goes, is not.
+        ruling = [c for c in self.channels if c.quantity in _HELD or elapsed < c.times[-1] - 0.5 * dt]
+        return [
+            *self._standing_objectives(state, report, dt, {(channel.part, channel.quantity) for channel in ruling}),
+            *(self._keyed(channel, state, elapsed, dt) for channel in ruling),
+        ]
+
+    def _advance_phase(self, state: BodyState, elapsed: float) -> None:
+        """After the last key the body holds still until its centre of mass has been slow for a while, or time is up."""
+        if self.phase is FollowPhase.FOLLOW and elapsed > self._end:
+            self.phase = FollowPhase.HOLD
+        if self.phase is not FollowPhase.HOLD:
+            return
+        time_unit, speed = np.sqrt(self.body.height / self._gravity), self.body.centre_of_mass(state.velocities)
+        if np.linalg.norm(speed) > CALM * np.sqrt(self._gravity * self.body.height):
+            self._calm_since = None
+        elif self._calm_since is None:
+            self._calm_since = elapsed
+        calm = self._calm_since is not None and elapsed - self._calm_since > CALM_TIME * time_unit
+        late = elapsed - self._end > LONGEST_HOLD * time_unit
+        if calm or late:
+            self.phase, self._restless = FollowPhase.REST, not calm
+
+    def _standing_objectives(
+        self, state: BodyState, report: StepReport | None, dt: float, ruled: set[tuple[str, Quantity]]
+    ) -> list[Objective | SpinObjective]:
+        seen = self.pose.measure(state, report)
+        balance = np.array([*(seen.base - self.pose.base_offset), self.pose.standing_height])
+        rules: list[Objective | SpinObjective] = []
+        velocity = self._rate / 3.0 * (balance - seen.com)
+        acceleration = (velocity - seen.velocity) / dt
+        level = self.pose.balanced_acceleration(seen, acceleration[:2], float(acceleration[2]), self._gravity)
+        velocity[:2] = seen.velocity[:2] + dt * level
+        if not {("body", Quantity.POSITION), ("body", Quantity.VELOCITY)} & ruled:
+            rules.append(centre_of_mass_velocity(self.body, self.ground.axes.T @ velocity, self.weights.com))
+        if not {("body", Quantity.ORIENTATION), ("body", Quantity.ANGULAR_MOMENTUM)} & ruled:
+            pose = self.pose.over_base(seen.com, seen.base, seen.heading)
+            spin = self.body.inertia(state.positions) @ (self.pose.turn_towards(state, pose) * 0.7 * self._rate)
+            rules.append(SpinObjective(spin, self.weights.spin))
+        # The shape at rest goes along with the centre of mass.
+        arms = self._standing - self.body.centre_of_mass(self._standing)
+        now = state.positions - self.body.centre_of_mass(state.positions)
+        drift = self.body.centre_of_mass(state.velocities)
+        rules.append(node_velocities(self.body, drift + self._rate * (arms - now), self.weights.pose))
+        return rules
+
+    def _keyed(self, channel: Channel, state: BodyState, elapsed: float, dt: float) -> Objective | SpinObjective:
+        part, body, whole = self.parts[channel.part], self.body, channel.part == "body"
+        axes = Coordinates(self.ground.axes, False)
+        value, rate = channel.at(elapsed + dt)
+        now = self._measured(channel.part, channel.quantity, state)
+        # Sums of steps may end a hair after their key, so the middle of the step says on the way to which key it is.
+        weight = channel.weight_at(elapsed + 0.5 * dt)
+        weight *= self.weights.com if channel.quantity in _LINEAR else self.weights.spin
+        if channel.quantity is Quantity.POSITION:
+            target = body.height * (rate + self._rate * (value - now - dt * rate))
+            return part_velocity(body, part, target, weight, axes)
+        if channel.quantity is Quantity.VELOCITY:
+            return part_velocity(body, part, body.height * value, weight, axes)
+        if channel.quantity is Quantity.ORIENTATION:
+            before = value - dt * rate
+            turning = np.radians(turn_between(before, value) / dt + self._rate * turn_between(now, before))
+            if whole:
+                return SpinObjective(body.inertia(state.positions) @ (self.ground.axes.T @ turning), weight)
+            return part_turning(body, part, state, turning, weight, axes)
+        momentum = body.mass * body.height**2 * value
+        if whole:
+            return SpinObjective(self.ground.axes.T @ momentum, weight)
+        return part_angular_momentum(body, part, state, momentum, weight, axes)
+
+    def _measured(self, name: str, quantity: Quantity, state: BodyState) -> np.ndarray:
+        """(3,) in the unit of the quantity, axes of the ground; of a turn, the one that the body came by since the last look at it."""
+        part, axes, height = self.parts[name], self.ground.axes, self.body.height
+        if quantity is Quantity.POSITION:
+            return axes @ (part.centre(state.positions) - part.centre(self._standing)) / height
+        if quantity is Quantity.VELOCITY:
+            return axes @ part.centre(state.velocities) / height
+        if quantity is Quantity.ORIENTATION:
+            before, after = (x[part.nodes] - part.centre(x) for x in (self._standing, state.positions))
+            turn = best_turn(part.masses, before, after)
+            shorter = axes @ Rotation.from_matrix(turn).as_rotvec(degrees=True)
+            self._turned[name] = _lift_near(shorter, self._turned[name])
+            return self._turned[name]
+        arms = state.positions[part.nodes] - part.centre(state.positions)
+        spin = (part.masses[:, None] * np.cross(arms, state.velocities[part.nodes])).sum(axis=0)
+        return axes @ spin / (self.body.mass * height**2)
+
+
+_LINEAR = (Quantity.POSITION, Quantity.VELOCITY)
+_HELD = (Quantity.POSITION, Quantity.ORIENTATION)
+
+
+def parts_of_body(place: Place) -> list[BodyPart]:
+    """The parts that keys may name: the whole body, its base, its head and its feet.
+
+    A single foot is the base. Several are numbered anticlockwise as seen from above, from straight ahead on.
+    """
+    body, ground, standing = place.body, place.ground, place.standing
+    heights = (standing - ground.origin) @ ground.surface_normal
+    base = BodyPart.base(body, heights)
+    found = [BodyPart.whole(body), base, BodyPart.head(body, ground.local(standing)[:, 2])]
+    feet = find_feet(body.mesh, heights, body.height)
+    if len(feet) == 1:
+        return [*found, BodyPart("foot", base.nodes, base.masses)]
+    soles = np.array([ground.local(standing[foot.sole])[:, :2].mean(axis=0) for foot in feet])
+    ahead, left = (soles - soles.mean(axis=0)).T
+    # A foot straight ahead is the first, even if a little to the right.
+    order = np.argsort((np.arctan2(left, ahead) + AHEAD) % (2.0 * np.pi))
+    legs = [feet[index].leg for index in order]
+    return found + [
+        BodyPart.of(body, f"foot {number}", base.nodes[leg[base.nodes] > 0.0])
+        for number, leg in enumerate(legs, start=1)
+    ]
+
+
+def turn_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """(3,) the rotation that leads from one orientation to another, all rotation vectors in degrees.
+
+    Its angle is at most 360: orientations a whole turn apart are told apart, those two turns apart are not.
+    """
+    (a, *u), (b, *v) = _quaternion(first), _quaternion(second)
+    w, axis = a * b + np.dot(u, v), a * np.array(v) - b * np.array(u) - np.cross(v, u)
+    sine = float(np.linalg.norm(axis))
+    return np.degrees(2.0 * np.arctan2(sine, w)) * (axis / sine if sine > 0.0 else np.array([0.0, 0.0, 1.0]))
+
+
+def _quaternion(turn: np.ndarray) -> np.ndarray:
+    """(4,) scalar first, of a rotation vector (3,) in degrees; of opposite sign for turns that differ by 360."""
+    half = 0.5 * np.radians(turn)
+    angle = float(np.linalg.norm(half))
+    return np.array([np.cos(angle), *(np.sinc(angle / np.pi) * half)])
+
+
+def _lift_near(turn: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """(3,) ``turn``, a rotation vector of at most 180 degrees, or the same rotation the longer way round if that is nearer to ``last``."""
+    if _quaternion(turn) @ _quaternion(last) >= 0.0:
+        return turn
+    angle = float(np.linalg.norm(turn))
+    return turn * (1.0 - 360.0 / angle) if angle > 0.0 else np.array([0.0, 0.0, 360.0])

@@ -1,0 +1,66 @@
+"""Where feet stood and how far they slipped, from a trajectory alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.feet import Foot, foot_of_node
+
+_STANDS = 0.05
+"""Share of the weight above which a foot supports the body; below it, it is being set down or lifted."""
+
+
+@dataclass(frozen=True)
+class Footfalls:
+    """What the feet of a walk did; lengths over the stride."""
+
+    slip: float
+    """Longest way along the ground that the loaded contact points of a foot slid while it stood: in each step the mean over the
+    foot's contacts, weighted by their normal forces, added up from landing to lift-off."""
+    sole_shift: float
+    """Largest distance of the middle of a sole from where it came to stand, while it stood: slip and rolling together."""
+    landings: int
+    """Times that a foot came to stand again."""
+
+
+def footfalls(
+    trajectory: Trajectory, feet: Sequence[Foot], *, stride: float, first: int = 0, last: int = -1
+) -> Footfalls:
+    """Measure between two states of the trajectory (indices into ``time``); ``stride`` in metres."""
+    t = trajectory
+    last = last % len(t.time)
+    up = -t.gravity / np.linalg.norm(t.gravity)
+    flat = np.eye(3) - np.outer(up, up)
+    weight = t.node_mass.sum() * np.linalg.norm(t.gravity)
+    within = (t.contact_step >= first) & (t.contact_step < last)
+    step, nodes, shares = t.contact_step[within], t.contact_nodes[within], t.contact_weights[within]
+    moved = t.positions[step[:, None] + 1, nodes] - t.positions[step[:, None], nodes]
+    slid = np.einsum("cw,cwi->ci", shares, moved) @ flat
+    normal = np.einsum("ci,ci->c", t.contact_force[within], t.contact_normal[within])
+    foot = foot_of_node(feet)[nodes[np.arange(len(nodes)), np.argmax(shares, axis=1)]]
+    slip = shift = 0.0
+    landings = 0
+    for index, one in enumerate(feet):
+        mine = foot == index
+        load = np.bincount(step[mine] - first, normal[mine], last - first)
+        way = np.stack(
+            [np.bincount(step[mine] - first, normal[mine] * slid[mine, k], last - first) for k in range(3)], 1
+        )
+        lengths = np.linalg.norm(way, axis=1) / np.where(load > 0.0, load, 1.0)
+        middle = t.positions[first : last + 1, one.sole].mean(axis=1) @ flat
+        for begin, end in _runs(load > _STANDS * weight):
+            landings += begin > 0
+            slip = max(slip, float(lengths[begin:end].sum()))
+            stood = middle[begin + 1 : end + 1]
+            shift = max(shift, float(np.linalg.norm(stood - stood[0], axis=1).max()))
+    return Footfalls(slip / stride, shift / stride, landings)
+
+
+def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
+    """Begin and end (one past the last) of each run of true flags."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return [(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)]

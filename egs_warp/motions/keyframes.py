@@ -1,0 +1,212 @@
+"""Key frames of a user's own trajectory, from JSON or CSV: what a part of the body shall do, and when (DESIGN 9).
+
+JSON: a list of keys, ``[{"time": 0.5, "part": "head", "quantity": "position", "value": [0.1, 0, 0]}]``; CSV: a header
+``time,part,quantity,x,y,z`` and a key a row. Both may give a ``weight``.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from egs_warp.errors import UserError
+from egs_warp.io.text import parse_json, read_text
+
+
+class Quantity(Enum):
+    """What a key gives; components are forward, left and up as the body stands at the start."""
+
+    POSITION = "position"
+    """Displacement from the start, body heights."""
+    VELOCITY = "velocity"
+    """Body heights a second."""
+    ORIENTATION = "orientation"
+    """Turn from the start as a rotation vector, degrees; its length says the way round: 270 is not -90."""
+    ANGULAR_MOMENTUM = "angular_momentum"
+    """About the part's centre, body mass x height squared a second."""
+
+
+PARTS = ("body", "base", "head", "foot")
+"""Parts that a key may name: the whole body (of which the position is that of the centre of mass), what stands on the ground, the top,
+the only foot. Feet of a body with several have numbers, as ``foot 2``."""
+_NUMBERED_FOOT = re.compile(r"foot [1-9]\d?")
+LONGEST_TIME = 60.0
+"""Seconds."""
+SHORTEST_GAP = 0.001
+"""Seconds between two keys of a channel, and before the first."""
+LARGEST: Mapping[Quantity, float] = {
+    Quantity.POSITION: 10.0,
+    Quantity.VELOCITY: 20.0,
+    Quantity.ORIENTATION: 360.0,
+    Quantity.ANGULAR_MOMENTUM: 10.0,
+}
+"""Length of a value beyond which it is refused as a slip of the pen."""
+_FIELDS = ("time", "part", "quantity", "value", "weight")
+
+
+@dataclass(frozen=True)
+class Key:
+    """One key frame."""
+
+    time: float
+    """Seconds from the start of the motion."""
+    part: str
+    quantity: Quantity
+    value: tuple[float, float, float]
+    weight: float = 1.0
+    """Relative to the motion's own, on the way from the key before to this one."""
+    where: str = ""
+    """File and place in it, for messages."""
+
+
+@dataclass(frozen=True)
+class Channel:
+    """All keys of one part and quantity, joined by a monotone cubic from zero at time 0; after the last key its value stays."""
+
+    part: str
+    quantity: Quantity
+    times: np.ndarray
+    """(k+1,) seconds, from 0."""
+    values: np.ndarray
+    """(k+1, 3)."""
+    weights: np.ndarray
+    """(k,) of the keys."""
+
+    def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Value (3,) and its rate (3,) per second."""
+        inside = min(time, float(self.times[-1]))
+        curve = PchipInterpolator(self.times, self.values, axis=0)
+        return curve(inside), curve(inside, 1) * (time < self.times[-1])
+
+    def weight_at(self, time: float) -> float:
+        """That of the next key; after the last one, its own."""
+        return float(self.weights[min(np.searchsorted(self.times[1:], time), len(self.weights) - 1)])
+
+
+def read_keyframes(path: Path) -> tuple[Key, ...]:
+    """Keys of a ``.json`` or ``.csv`` file; raises ``UserError`` for the first malformed one, with its place."""
+    path = Path(path)
+    if path.suffix.lower() not in (".json", ".csv"):
+        raise UserError(f"{path}: key frames are read from .json or .csv")
+    text = read_text(path)
+    keys = _from_json(text, path) if path.suffix.lower() == ".json" else _from_csv(text, path)
+    if not keys:
+        raise UserError(f"{path}: no key frames; give at least one")
+    channels(keys)
+    return tuple(keys)
+
+
+def channels(keys: Sequence[Key]) -> tuple[Channel, ...]:
+    """Keys by part and quantity; raises ``UserError`` if two of a channel are nearly at the same time, or times go back."""
+    found: dict[tuple[str, Quantity], list[Key]] = {}
+    for key in keys:
+        group = found.setdefault((key.part, key.quantity), [])
+        before, what = (group[-1].time, "the key before") if group else (0.0, "the start")
+        if round(key.time - before, 9) < SHORTEST_GAP:
+            raise UserError(
+                f"{key.where}: time {key.time:g} is not {SHORTEST_GAP:g} s after {before:g}, {what} of "
+                f"{key.part} {key.quantity.value}; give keys in the order of their times, so far apart"
+            )
+        group.append(key)
+    return tuple(
+        Channel(
+            part,
+            quantity,
+            np.array([0.0, *(key.time for key in group)]),
+            np.array([(0.0, 0.0, 0.0), *(key.value for key in group)]),
+            np.array([key.weight for key in group]),
+        )
+        for (part, quantity), group in found.items()
+    )
+
+
+def _from_json(text: str, path: Path) -> list[Key]:
+    entries = parse_json(text, path)
+    if not isinstance(entries, list):
+        raise UserError(f"{path}: give a list of keys, each an object with {', '.join(_FIELDS[:4])}")
+    keys = []
+    for number, entry in enumerate(entries, start=1):
+        where = f"{path}, key {number}"
+        if not isinstance(entry, dict):
+            raise UserError(f"{where}: {entry!r} is not an object with {', '.join(_FIELDS[:4])}")
+        keys.append(_key(entry, where))
+    return keys
+
+
+def _from_csv(text: str, path: Path) -> list[Key]:
+    try:
+        rows = list(csv.reader(text.splitlines()))
+    except csv.Error as error:
+        raise UserError(f"{path}: not CSV ({error}); correct the file") from None
+    if not rows:
+        return []
+    header = [name.strip().lower() for name in rows[0]]
+    needed = ["time", "part", "quantity", "x", "y", "z"]
+    if sorted(set(header) - {"weight"}) != sorted(needed) or len(set(header)) != len(header):
+        raise UserError(f"{path}, line 1: the columns are {','.join(header)}; give {','.join(needed)} and maybe weight")
+    keys = []
+    for line, row in enumerate(rows[1:], start=2):
+        where = f"{path}, line {line}"
+        if not any(cell.strip() for cell in row):
+            continue
+        if len(row) != len(header):
+            raise UserError(f"{where}: {len(row)} values for {len(header)} columns")
+        cells = dict(zip(header, (cell.strip() for cell in row), strict=True))
+        entry: dict[str, Any] = {"part": cells["part"], "quantity": cells["quantity"]}
+        entry["time"] = _parsed(cells["time"])
+        entry["value"] = [_parsed(cells[axis]) for axis in "xyz"]
+        if cells.get("weight"):
+            entry["weight"] = _parsed(cells["weight"])
+        keys.append(_key(entry, where))
+    return keys
+
+
+def _parsed(cell: str) -> float | str:
+    try:
+        return float(cell)
+    except ValueError:
+        return cell
+
+
+def _key(entry: Mapping[str, Any], where: str) -> Key:
+    for name in _FIELDS[:4]:
+        if name not in entry:
+            raise UserError(f'{where}: "{name}" is missing; a key has {", ".join(_FIELDS[:4])}')
+    for name in entry:
+        if name not in _FIELDS:
+            raise UserError(f'{where}: "{name}" is unknown; a key has {", ".join(_FIELDS)}')
+    part, quantity, value = entry["part"], entry["quantity"], entry["value"]
+    if part not in PARTS and not (isinstance(part, str) and _NUMBERED_FOOT.fullmatch(part)):
+        raise UserError(
+            f"{where}: part {part!r} is unknown; give one of {', '.join(PARTS)}, or of several feet foot 1, foot 2, ..."
+        )
+    names = [member.value for member in Quantity]
+    if quantity not in names:
+        raise UserError(f"{where}: quantity {quantity!r} is unknown; give one of {', '.join(names)}")
+    time = _number(entry["time"])
+    if not 0.0 < time <= LONGEST_TIME:
+        raise UserError(f"{where}: time {entry['time']!r}: give seconds above 0, at most {LONGEST_TIME:g}")
+    if not isinstance(value, list) or len(value) != 3 or not all(math.isfinite(_number(item)) for item in value):
+        raise UserError(f"{where}: value {value!r}: give three numbers: forward, left, up")
+    largest = LARGEST[Quantity(quantity)]
+    length = math.hypot(*value)
+    if length > largest:
+        raise UserError(f"{where}: value {value!r} has the length {length:g}; at most {largest:g} is done")
+    weight = _number(entry.get("weight", 1.0))
+    if not 0.0 < weight <= 1000.0:
+        raise UserError(f"{where}: weight {entry['weight']!r}: give a number above 0, at most 1000")
+    return Key(time, part, Quantity(quantity), (float(value[0]), float(value[1]), float(value[2])), weight, where)
+
+
+def _number(value: Any) -> float:
+    """The number, or nan for anything else."""
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan

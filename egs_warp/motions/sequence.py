@@ -1,0 +1,141 @@
+"""Motions one after the other: each begins where, and as, the body stands when the one before has come to rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Protocol
+
+import numpy as np
+
+from egs_warp.contact.terrain import Solid, surface_above
+from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.stepper import StepReport
+from egs_warp.motions.stance import Ground, heading_between, sole_shares
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a body stands, upright and at rest, and which way is forward."""
+
+    body: SoftBody
+    ground: Ground
+    """Its origin is under the centre of mass; up is against gravity."""
+    standing: np.ndarray
+    """(N, 3) nodes, metres."""
+    touching: np.ndarray
+    """(k, 3) points of the body on the ground, metres."""
+    step: float
+    """Seconds of a solver step."""
+    solids: tuple[Solid, ...] = ()
+    """What there is to stand on, the ground among it."""
+    friction: float = 0.8
+    """Coulomb coefficient."""
+
+    def now(self, positions: np.ndarray) -> Place:
+        """The same stance turned about up and moved to where the feet of ``positions`` (N, 3) are."""
+        share = sole_shares(self.body, self.ground, self.standing)
+        angle = heading_between(self.standing, positions, share, self.ground)
+        feet, moved = share @ self.standing, share @ positions
+        turn = self.ground.turn(angle)
+        return replace(
+            self,
+            ground=Ground(
+                self.ground.axes @ turn.T, moved + (self.ground.origin - feet) @ turn.T, self.ground.surface_normal
+            ),
+            standing=moved + (self.standing - feet) @ turn.T,
+            touching=moved + (self.touching - feet) @ turn.T,
+        )
+
+    def rise_at(self, point: np.ndarray) -> float:
+        """Metres from ``point`` (3,) up to the highest surface over or under it; 0 if there is none."""
+        rise = surface_above(self.solids, point, self.ground.axes[2])
+        return rise if np.isfinite(rise) else 0.0
+
+    def facing(self, direction: np.ndarray) -> Place:
+        """The same stance with another way forward (3,); the body is not turned."""
+        x, y = self.ground.axes[:2] @ direction
+        turn = self.ground.turn(float(np.arctan2(y, x)))
+        return replace(self, ground=replace(self.ground, axes=self.ground.axes @ turn.T))
+
+
+class BodyMotion(Protocol):
+    """A state machine that ends in a phase whose value is "rest"."""
+
+    phase: Enum
+
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[Objective | SpinObjective]:
+        """Objectives of the step of ``dt`` seconds that starts at ``state``; ``report`` is of the step before."""
+        ...
+
+    def planned(self) -> dict[str, float]:
+        """What it aims at."""
+        ...
+
+    def notes(self) -> list[str]:
+        """What kept it from its target, for the user."""
+        ...
+
+
+@dataclass
+class Done:
+    """A motion of a sequence and when it began."""
+
+    name: str
+    asked: dict[str, float]
+    motion: BodyMotion
+    start_time: float
+
+
+@dataclass(frozen=True)
+class Part:
+    """A motion to come."""
+
+    name: str
+    asked: dict[str, float]
+    begin: Callable[[Place], BodyMotion]
+
+
+class MotionSequence:
+    """Runs ``parts`` one after the other from ``place``; itself a motion."""
+
+    def __init__(self, place: Place, parts: Sequence[Part]) -> None:
+        self._place = place
+        self._parts = list(parts)
+        self._count = len(self._parts)
+        self.done: list[Done] = []
+        self._rested_since: float | None = None
+
+    @property
+    def finished(self) -> bool:
+        """Whether the last motion has come to rest."""
+        return not self._parts and self._resting
+
+    @property
+    def _resting(self) -> bool:
+        return bool(self.done) and self.done[-1].motion.phase.value == "rest"
+
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[Objective | SpinObjective]:
+        """Objectives of the step of ``dt`` that starts at ``state``, from the motion whose turn it is."""
+        if self._parts and (not self.done or self._resting):
+            place = self._place.now(state.positions) if self.done else self._place
+            part = self._parts.pop(0)
+            self.done.append(Done(part.name, part.asked, part.begin(place), state.time))
+        return self.done[-1].motion.objectives(state, report, dt)
+
+    def cut_short(self) -> list[str]:
+        """What the last frame kept from its end, for the user."""
+        notes = []
+        if self.done and not self._resting:
+            notes.append(f"{self.done[-1].name} was cut off before it came to rest; give more --frames")
+        if self._parts:
+            names = ", ".join(part.name for part in self._parts)
+            notes.append(f"{len(self._parts)} of {self._count} motions did not begin: {names}")
+        return notes
+
+    def spans(self, time: np.ndarray) -> list[tuple[int, int]]:
+        """First and last index into ``time`` (F+1,) of each motion that was begun."""
+        starts = [int(np.searchsorted(time, entry.start_time - 1e-9)) for entry in self.done]
+        return list(zip(starts, [*starts[1:], len(time) - 1], strict=True))

@@ -1,0 +1,98 @@
+"""Where a muscle's end point is attached: non-negative weights over the nodes around it."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import dijkstra
+
+from egs_warp.geometry.tetmesh import TetMesh
+
+MIN_ATTACHMENT_NODES = 8
+"""Fewer nodes than this would concentrate the force on one or two elements, which then crumple."""
+
+_NEWTON_ITERATIONS = 30
+_MULTIPLIER_PENALTY = 0.05
+
+
+def edge_graph(mesh: TetMesh) -> sp.csr_matrix:
+    """(N, N) symmetric; entry (a, b) is the length in metres of the edge from node a to node b."""
+    pairs = mesh.tets[:, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]].reshape(-1, 2)
+    pairs = np.unique(np.sort(pairs, axis=1), axis=0)
+    lengths = np.linalg.norm(mesh.nodes[pairs[:, 0]] - mesh.nodes[pairs[:, 1]], axis=1)
+    graph = sp.coo_matrix((lengths, (pairs[:, 0], pairs[:, 1])), shape=(len(mesh.nodes),) * 2)
+    return (graph + graph.T).tocsr()
+
+
+def mean_edge_length(mesh: TetMesh) -> float:
+    """Mean length in metres of the edges of ``mesh``."""
+    return float(edge_graph(mesh).data.mean())
+
+
+def attachment_rows(mesh: TetMesh, points: np.ndarray, *, radius: float | None = None) -> sp.csr_matrix:
+    """Attach each of ``points`` (P, 3) to the nodes within about ``radius`` metres (default: the mean edge length).
+
+    Returns rows B (P, N) with B >= 0 and row sums 1. Weights are a Gaussian of width ``radius`` times each node's share
+    of the volume (so that the force density, not the force, is smooth), tilted exponentially so that the weighted
+    centroid B p lies at the point wherever the nodes around it allow (local maximum-entropy weights, Arroyo and Ortiz
+    2006). Nodes are reached along the mesh's edges, never across the gap between two limbs.
+    """
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    graph = edge_graph(mesh)
+    radius = float(graph.data.mean()) if radius is None else radius
+    volumes = mesh.lumped_masses(1.0)
+    distances = np.linalg.norm(points[:, None] - mesh.nodes[None], axis=2)
+    nearest = np.argmin(distances, axis=1)
+    sources, row_from_point = np.unique(nearest, return_inverse=True)
+    along_edges = dijkstra(graph, directed=False, indices=sources)
+    columns, weights, counts = [], [], []
+    for point, to_nodes, row in zip(points, distances, row_from_point, strict=True):
+        order = np.argsort(along_edges[row], kind="stable")
+        reached = (to_nodes <= 2.0 * radius) & (along_edges[row] <= 3.0 * radius)
+        reached[order[:MIN_ATTACHMENT_NODES]] = True
+        nodes = np.flatnonzero(reached)
+        scale = max(radius, float(np.sort(to_nodes[nodes])[MIN_ATTACHMENT_NODES - 1]))
+        columns.append(nodes)
+        weights.append(_maximum_entropy_weights((mesh.nodes[nodes] - point) / scale, volumes[nodes]))
+        counts.append(len(nodes))
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    return sp.csr_matrix(
+        (np.concatenate(weights), np.concatenate(columns), starts), shape=(len(points), len(mesh.nodes))
+    )
+
+
+def _maximum_entropy_weights(offsets: np.ndarray, shares: np.ndarray) -> np.ndarray:
+    """Weights (n,) >= 0, sum 1, closest in entropy to shares exp(-|offset|^2), with mean offset near zero.
+
+    Newton's method on the smooth, strictly convex dual log sum(prior exp(offset.t)) + penalty |t|^2 / 2; the penalty
+    keeps t finite where the origin lies outside the nodes' convex hull.
+    """
+    log_prior = np.log(shares) - np.einsum("ni,ni->n", offsets, offsets)
+
+    def evaluate(tilt: np.ndarray) -> tuple[float, np.ndarray]:
+        exponents = log_prior + offsets @ tilt
+        top = exponents.max()
+        terms = np.exp(exponents - top)
+        total = terms.sum()
+        return top + np.log(total) + 0.5 * _MULTIPLIER_PENALTY * tilt @ tilt, terms / total
+
+    tilt = np.zeros(3)
+    value, weights = evaluate(tilt)
+    for _ in range(_NEWTON_ITERATIONS):
+        mean = weights @ offsets
+        gradient = mean + _MULTIPLIER_PENALTY * tilt
+        if np.linalg.norm(gradient) < 1e-12:
+            break
+        centred = offsets - mean
+        hessian = (centred * weights[:, None]).T @ centred + _MULTIPLIER_PENALTY * np.eye(3)
+        step = -np.linalg.solve(hessian, gradient)
+        length = 1.0
+        while length > 1e-6:
+            trial_value, trial_weights = evaluate(tilt + length * step)
+            if trial_value <= value + 1e-4 * length * (gradient @ step):
+                break
+            length *= 0.5
+        else:
+            break
+        tilt, value, weights = tilt + length * step, trial_value, trial_weights
+    return weights / weights.sum()

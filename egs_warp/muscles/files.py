@@ -1,0 +1,239 @@
+"""Muscles that a user writes down as JSON.
+
+A file is an object with ``fibres``, a list of entries. Lengths are in units of the capture. Every entry has ``name`` and
+``kind`` and, by kind,
+
+* ``longitudinal``: ``from``, ``to`` (points [x, y, z]) and ``segments`` (default 4): a straight fibre;
+* ``polyline``: ``points``, two or more: one segment between each two;
+* ``circular``: ``centre``, ``axis``, ``radius`` and ``segments`` (default 8, at least 3): a closed hoop about the axis;
+* ``radial``: ``centre``, ``axis``, ``radius`` and ``count`` (default 2): diameters across the axis, one fibre each.
+
+Optional in every entry: ``strength`` in body weights (default 2) or ``stiffness`` in N/m, ``group`` (a name), and
+``mirror`` (true or false): true adds the mirror image, its symmetric partner, in the file's ``mirror_plane``
+``{"point": [x, y, z], "normal": [x, y, z]}``. The file may give ``max_strain`` (default 0.3).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.plane import square_to
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.io.text import parse_json, read_text
+from egs_warp.muscles.attachments import mean_edge_length
+from egs_warp.muscles.fibres import Fibre, FibreKind
+from egs_warp.muscles.muscle_set import MuscleSet, attach_fibres
+
+MAX_SEGMENTS = 400
+"""The quadratic program of a step has one unknown for each segment: more would take seconds a frame."""
+
+_COMMON_KEYS = {"name", "kind", "strength", "stiffness", "group", "mirror"}
+_FILE_KEYS = {"fibres", "max_strain", "mirror_plane"}
+_DEFAULT_STRENGTH = 2.0
+_MAX_OUTSIDE_EDGES = 1.5
+
+
+def read_muscles(path: Path | str, mesh: TetMesh, *, body_weight: float, metres_per_unit: float = 1.0) -> MuscleSet:
+    """Muscles of the JSON file ``path`` (module docstring), attached to ``mesh`` (metres).
+
+    ``body_weight`` in newtons; ``metres_per_unit`` turns the file's lengths into metres. Raises ``UserError`` with the
+    file, the entry, what is wrong with it and what to do.
+    """
+    path = Path(path)
+    content = _load(path)
+    _refuse_unknown_keys(f"{path}", content, _FILE_KEYS)
+    entries = content.get("fibres")
+    if not isinstance(entries, list) or not entries:
+        raise UserError(f'{path}: no fibres; give a list "fibres" with at least one entry')
+    max_strain = _positive(f"{path}", content, "max_strain", 0.3)
+    if max_strain >= 1.0:
+        raise UserError(f'{path}: "max_strain" is {max_strain:g}; give a number below 1')
+    mirror = _mirror(f"{path}", content, metres_per_unit)
+    fibres: list[Fibre] = []
+    stiffness: list[float] = []
+    groups: dict[str, int] = {}
+    for index, entry in enumerate(entries):
+        made, its_stiffness = _fibres(path, index, entry, mirror, groups, metres_per_unit, body_weight)
+        fibres += made
+        stiffness += [its_stiffness] * len(made)
+    _check(path, fibres, mesh, metres_per_unit)
+    muscles = attach_fibres(mesh, fibres, max_strain=max_strain)
+    asked = np.array(stiffness)[muscles.fibre_from_segment]
+    return replace(muscles, stiffness=np.where(np.isnan(asked), muscles.stiffness, asked))
+
+
+def _load(path: Path) -> dict[str, Any]:
+    content = parse_json(read_text(path), path)
+    if not isinstance(content, dict):
+        raise UserError(f'{path}: the file holds no object; write {{"fibres": [...]}}')
+    return content
+
+
+def _fibres(
+    path: Path,
+    index: int,
+    entry: Any,
+    mirror: Callable[[np.ndarray], np.ndarray] | None,
+    groups: dict[str, int],
+    unit: float,
+    body_weight: float,
+) -> tuple[list[Fibre], float]:
+    """The fibres of one entry with their mirror images, and their stiffness in N/m, NaN if none was asked."""
+    where = f"{path}: fibre {index + 1}"
+    if not isinstance(entry, dict):
+        raise UserError(f"{where} is no object; write {{...}} with a name and a kind")
+    name = entry.get("name")
+    if not isinstance(name, str) or not name:
+        raise UserError(f'{where} has no name; give it a "name"')
+    where = f'{path}: fibre "{name}"'
+    kind = entry.get("kind")
+    if not isinstance(kind, str) or kind not in _SHAPES:
+        raise UserError(f'{where} has the kind {json.dumps(kind)}; give "kind" as one of {", ".join(_SHAPES)}')
+    shape, shape_keys, fibre_kind = _SHAPES[kind]
+    _refuse_unknown_keys(where, entry, _COMMON_KEYS | shape_keys)
+    if "strength" in entry and "stiffness" in entry:
+        raise UserError(f'{where} gives both "strength" and "stiffness"; give one of them')
+    force = body_weight * _positive(where, entry, "strength", _DEFAULT_STRENGTH)
+    stiffness = _positive(where, entry, "stiffness", 1.0) if "stiffness" in entry else float("nan")
+    group = entry.get("group", "")
+    if not isinstance(group, str):
+        raise UserError(f'{where}: "group" is {json.dumps(group)}; give a name in quotes')
+    mirrored = entry.get("mirror", False)
+    if not isinstance(mirrored, bool):
+        raise UserError(f'{where}: "mirror" is {json.dumps(mirrored)}; give true or false')
+    if mirrored and mirror is None:
+        raise UserError(
+            f'{where} is to be mirrored but the file has no plane; give "mirror_plane" with point and normal'
+        )
+    group_index = groups.setdefault(group, len(groups))
+    polylines = [unit * points for points in shape(where, entry)]
+    made = []
+    for number, points in enumerate(polylines):
+        own = name if len(polylines) == 1 else f"{name} {number + 1}"
+        image = f"{own} mirrored" if mirrored else None
+        made.append(Fibre(own, fibre_kind, points, force, group_index, image))
+        if mirrored and mirror is not None:
+            made.append(Fibre(f"{own} mirrored", fibre_kind, mirror(points), force, group_index, own))
+    return made, stiffness
+
+
+def _longitudinal(where: str, entry: dict[str, Any]) -> list[np.ndarray]:
+    start, end = _point(where, entry, "from"), _point(where, entry, "to")
+    along = np.linspace(0.0, 1.0, _count(where, entry, "segments", 4, least=1) + 1)[:, None]
+    return [(1.0 - along) * start + along * end]
+
+
+def _polyline(where: str, entry: dict[str, Any]) -> list[np.ndarray]:
+    points = entry.get("points")
+    if not isinstance(points, list) or len(points) < 2:
+        raise UserError(f'{where}: "points" must be a list of at least two points [x, y, z]')
+    return [np.array([_point(f"{where}, point {number + 1}", {"": point}, "") for number, point in enumerate(points)])]
+
+
+def _circular(where: str, entry: dict[str, Any]) -> list[np.ndarray]:
+    count = _count(where, entry, "segments", 8, least=3)
+    ring = _around(where, entry, 2.0 * np.pi * np.arange(count) / count)
+    return [np.concatenate([ring, ring[:1]])]
+
+
+def _radial(where: str, entry: dict[str, Any]) -> list[np.ndarray]:
+    count = _count(where, entry, "count", 2, least=1)
+    ring = _around(where, entry, np.pi * np.arange(2 * count) / count)
+    return [ring[[diameter, diameter + count]] for diameter in range(count)]
+
+
+_SHAPES: dict[str, tuple[Callable[[str, dict[str, Any]], list[np.ndarray]], set[str], FibreKind]] = {
+    "longitudinal": (_longitudinal, {"from", "to", "segments"}, FibreKind.LONGITUDINAL),
+    "circular": (_circular, {"centre", "axis", "radius", "segments"}, FibreKind.CIRCULAR),
+    "radial": (_radial, {"centre", "axis", "radius", "count"}, FibreKind.RADIAL),
+    "polyline": (_polyline, {"points"}, FibreKind.USER),
+}
+
+
+def _around(where: str, entry: dict[str, Any], angles: np.ndarray) -> np.ndarray:
+    """Points at ``angles`` on the entry's circle."""
+    first, second = square_to(_direction(where, entry, "axis"))
+    spokes = -np.cos(angles)[:, None] * first - np.sin(angles)[:, None] * second
+    return _point(where, entry, "centre") + _positive(where, entry, "radius", None) * spokes
+
+
+def _mirror(where: str, content: dict[str, Any], unit: float) -> Callable[[np.ndarray], np.ndarray] | None:
+    if "mirror_plane" not in content:
+        return None
+    plane = content["mirror_plane"]
+    if not isinstance(plane, dict):
+        raise UserError(f'{where}: "mirror_plane" must be an object with "point" and "normal"')
+    where = f"{where}: mirror_plane"
+    _refuse_unknown_keys(where, plane, {"point", "normal"})
+    point, normal = unit * _point(where, plane, "point"), _direction(where, plane, "normal")
+    return lambda points: points - 2.0 * ((points - point) @ normal)[:, None] * normal
+
+
+def _check(path: Path, fibres: list[Fibre], mesh: TetMesh, unit: float) -> None:
+    names: set[str] = set()
+    reach = _MAX_OUTSIDE_EDGES * mean_edge_length(mesh)
+    for fibre in fibres:
+        where = f'{path}: fibre "{fibre.name}"'
+        if fibre.name in names:
+            raise UserError(f"{where} is there twice; give each fibre its own name")
+        names.add(fibre.name)
+        distances = np.linalg.norm(fibre.points[:, None] - mesh.nodes[None], axis=2).min(axis=1)
+        worst = int(np.argmax(distances))
+        if distances[worst] > reach:
+            x, y, z = fibre.points[worst] / unit
+            raise UserError(
+                f"{where}: the point [{x:g}, {y:g}, {z:g}] is {distances[worst] / unit:.3g} units away from the body; "
+                "give points inside it, in the capture's own coordinates"
+            )
+        if np.linalg.norm(np.diff(fibre.points, axis=0), axis=1).min() == 0.0:
+            raise UserError(f"{where} has two equal points in a row; remove one")
+    count = sum(len(fibre.points) - 1 for fibre in fibres)
+    if count > MAX_SEGMENTS:
+        raise UserError(f"{path}: {count} segments in all; use at most {MAX_SEGMENTS}")
+
+
+def _refuse_unknown_keys(where: str, entry: dict[str, Any], known: set[str]) -> None:
+    for key in entry:
+        if key not in known:
+            raise UserError(f'{where}: "{key}" is not known here; use {", ".join(sorted(known))}')
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+
+
+def _point(where: str, entry: dict[str, Any], key: str) -> np.ndarray:
+    value = entry.get(key)
+    if not isinstance(value, list) or len(value) != 3 or not all(_is_number(number) for number in value):
+        what = f': "{key}"' if key else ""
+        raise UserError(f"{where}{what} is {json.dumps(value)}; give three finite numbers [x, y, z]")
+    return np.array(value, dtype=np.float64)
+
+
+def _direction(where: str, entry: dict[str, Any], key: str) -> np.ndarray:
+    value = _point(where, entry, key)
+    length = float(np.linalg.norm(value))
+    if length == 0.0:
+        raise UserError(f'{where}: "{key}" is zero; give a direction [x, y, z]')
+    return value / length
+
+
+def _positive(where: str, entry: dict[str, Any], key: str, default: float | None) -> float:
+    value = entry.get(key, default)
+    if not _is_number(value) or value <= 0:
+        raise UserError(f'{where}: "{key}" is {json.dumps(value)}; give a number above 0')
+    return float(value)
+
+
+def _count(where: str, entry: dict[str, Any], key: str, default: int, *, least: int) -> int:
+    value = entry.get(key, default)
+    if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= MAX_SEGMENTS:
+        raise UserError(f'{where}: "{key}" is {json.dumps(value)}; give a whole number from {least} to {MAX_SEGMENTS}')
+    return value

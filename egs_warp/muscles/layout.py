@@ -1,0 +1,152 @@
+"""Automatic fibres along the branches of a body's curve skeleton."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from egs_warp.geometry.plane import square_to
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.muscles.attachments import mean_edge_length
+from egs_warp.muscles.fibres import Fibre, FibreKind
+from egs_warp.muscles.skeleton import Branch, Skeleton
+from egs_warp.muscles.tube import Detail, Surface, Tube
+
+_DETAILS = (
+    Detail(8, 5, 4, 4, 2, 2),
+    Detail(8, 4, 3, 2, 1, 2),
+    Detail(4, 3, 2, 2, 1, 2),
+    Detail(4, 2, 1, 2, 1, 2),
+    Detail(4, 2, 1, 2, 1, 1),
+    Detail(4, 1, 1, 2, 1, 1),
+)
+"""From the richest to the poorest."""
+_LEG_DETAILS = (Detail(4, 4, 1, 2, 1, 1), Detail(4, 3, 1, 1, 1, 1), *_DETAILS[-2:])
+"""The same of each leg of a body on ``_LEGS`` or more. A foot is carried ahead and set down flat by a leg that bends one way
+above and the other way below, which takes three segments on each side of it."""
+_LEGS = 3
+_SEGMENTS, _LEGGED_SEGMENTS = 112, 120
+
+
+def is_legged(skeleton: Skeleton) -> bool:
+    """Whether the body stands on three legs or more."""
+    return sum(branch.starts_on_ground for branch in skeleton.branches) >= _LEGS
+
+
+def lay_fibres(
+    mesh: TetMesh, skeleton: Skeleton, *, max_force: float, max_stress: float, max_segments: int | None = None
+) -> list[Fibre]:
+    """Longitudinal, radial, circular and oblique fibres on every branch, at most ``max_segments`` segments in all (112; for a
+    body on three legs or more 120).
+
+    ``max_force`` in newtons bounds each segment; ``max_stress`` in pascals bounds all longitudinal fibres of one section
+    together. Branches too many for the budget go without, the least voluminous first.
+    """
+    edge = mean_edge_length(mesh)
+    surface = Surface(mesh)
+    forward = _principal_horizontal(mesh, skeleton.up)
+    fibres: list[Fibre] = []
+    for group, (branch, detail) in enumerate(_share_segments(skeleton, edge, max_segments)):
+        tube = Tube(branch, skeleton.up, forward, surface, edge, detail)
+        name = "trunk" if group == 0 else f"limb {group}"
+        fibres += [
+            replace(fibre, group=group, max_force=np.minimum(max_force, max_stress * fibre.max_force))
+            for fibre in tube.fibres(name)
+        ]
+    return _with_partners(fibres, _centre(mesh), skeleton.up, forward, tolerance=0.75 * edge)
+
+
+def _share_segments(skeleton: Skeleton, edge: float, budget: int | None) -> list[tuple[Branch, Detail]]:
+    """The detail of each branch; like branches (the four legs of a stool) get the same."""
+    legged = is_legged(skeleton)
+    budget = budget or (_LEGGED_SEGMENTS if legged else _SEGMENTS)
+    families: list[list[Branch]] = []
+    for branch in skeleton.branches:
+        like = families[-1][0] if families else None
+        if legged and like and like.starts_on_ground != branch.starts_on_ground:
+            like = None
+        if like and branch.volume > 0.7 * like.volume and 0.75 < branch.length / like.length < 1.33:
+            families[-1].append(branch)
+        else:
+            families.append([branch])
+    levels = [0] * len(families)
+    ladders = [_LEG_DETAILS if legged and family[0].starts_on_ground else _DETAILS for family in families]
+
+    def detail(family: int) -> Detail:
+        chosen = ladders[family][levels[family]]
+        shortest = min(branch.length for branch in families[family])
+        return replace(chosen, intervals=int(np.clip(round(shortest / (1.2 * edge)), 1, chosen.intervals)))
+
+    def count(family: int) -> int:
+        return len(families[family]) * detail(family).segment_count()
+
+    def greed(family: int) -> tuple[bool, float]:
+        """Segments against the volume they move; legs count double, since they alone push the ground, and those of a body on
+        many legs come last."""
+        volume = sum(branch.volume * (2.0 if branch.starts_on_ground else 1.0) for branch in families[family])
+        return ladders[family] is _DETAILS, count(family) / volume**0.5
+
+    while sum(count(family) for family in range(len(families))) > budget:
+        reducible = [family for family in range(len(families)) if levels[family] < len(ladders[family]) - 1]
+        if reducible:
+            levels[max(reducible, key=greed)] += 1
+        elif len(families) > 1:
+            families.pop()
+            levels.pop()
+        else:
+            break
+    return [(branch, detail(index)) for index, family in enumerate(families) for branch in family]
+
+
+def _centre(mesh: TetMesh) -> np.ndarray:
+    return np.average(mesh.nodes, axis=0, weights=mesh.lumped_masses(1.0))
+
+
+def _principal_horizontal(mesh: TetMesh, up: np.ndarray) -> np.ndarray:
+    """Unit horizontal vector (3,) along which the body is widest; a round body gets a fixed one.
+
+    Its sign is fixed too: rounding must not choose between a direction and its opposite.
+    """
+    plane = np.stack(square_to(up))
+    flat = (mesh.nodes - _centre(mesh)) @ plane.T
+    second_moments = (flat * mesh.lumped_masses(1.0)[:, None]).T @ flat
+    values, vectors = np.linalg.eigh(second_moments)
+    if values[1] < 1.1 * values[0]:
+        return plane[0]
+    widest = vectors[:, 1] @ plane
+    return widest * (1.0 if widest[int(np.argmax(np.abs(widest)))] > 0 else -1.0)
+
+
+_MIRRORED = {FibreKind.OBLIQUE_LEFT: FibreKind.OBLIQUE_RIGHT, FibreKind.OBLIQUE_RIGHT: FibreKind.OBLIQUE_LEFT}
+
+
+def _with_partners(
+    fibres: list[Fibre], centre: np.ndarray, up: np.ndarray, forward: np.ndarray, *, tolerance: float
+) -> list[Fibre]:
+    """Fibres with their mirror images named, in whichever of the two upright principal planes mirrors more of them."""
+    best: dict[str, str] = {}
+    for normal in (forward, np.cross(up, forward)):
+        found: dict[str, str] = {}
+        for fibre in fibres:
+            image = fibre.points - 2.0 * ((fibre.points - centre) @ normal)[:, None] * normal
+            candidates = [
+                (distance, other.name)
+                for other in fibres
+                if other.kind is _MIRRORED.get(fibre.kind, fibre.kind)
+                and (distance := _polyline_distance(image, other.points)) < tolerance
+            ]
+            if candidates:
+                found[fibre.name] = min(candidates)[1]
+        mutual = {name: other for name, other in found.items() if found.get(other) == name}
+        if len(mutual) > len(best):
+            best = mutual
+    return [replace(fibre, partner=best.get(fibre.name)) for fibre in fibres]
+
+
+def _polyline_distance(first: np.ndarray, second: np.ndarray) -> float:
+    """Largest distance from a vertex of one polyline to the nearest of the other, both ways."""
+    if len(first) != len(second):
+        return float("inf")
+    apart = np.linalg.norm(first[:, None] - second[None], axis=2)
+    return float(max(apart.min(axis=0).max(), apart.min(axis=1).max()))

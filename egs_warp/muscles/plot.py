@@ -1,0 +1,107 @@
+"""A picture of a body and its muscles, from three sides."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.plane import square_to
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.muscles.fibres import FibreKind
+from egs_warp.muscles.muscle_set import MuscleSet
+
+_BGR = {
+    FibreKind.LONGITUDINAL: (60, 60, 210),
+    FibreKind.RADIAL: (60, 160, 60),
+    FibreKind.CIRCULAR: (200, 120, 40),
+    FibreKind.OBLIQUE_LEFT: (190, 60, 170),
+    FibreKind.OBLIQUE_RIGHT: (30, 150, 240),
+    FibreKind.USER: (90, 90, 90),
+}
+_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+_PANEL = 640
+_MARGIN = 40
+_SHARPNESS = 2
+"""Drawn this much larger, then averaged down."""
+_SUBPIXEL_BITS = 4
+
+
+def check_picture_name(path: Path) -> None:
+    """Raises ``UserError`` where the ending is not that of a picture."""
+    if path.suffix.lower() not in _ENDINGS:
+        raise UserError(f"{path}: not the name of a picture; let it end in one of {', '.join(_ENDINGS)}")
+
+
+def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarray) -> None:
+    """Write a picture with the body from the front, from the side and from above, its fibres coloured by kind.
+
+    ``up`` (3,) points up in the first two views. Raises ``UserError`` if ``path`` cannot be written.
+    """
+    check_picture_name(path)
+    up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+    left, near = square_to(up)
+    right, away = -left, -near
+    views = {"front": (right, up, away), "side": (away, up, -right), "above": (right, away, -up)}
+    panels = [_panel(title, np.stack(axes), mesh, muscles) for title, axes in views.items()]
+    image = np.concatenate([np.concatenate(panels, axis=1), _legend(muscles, 3 * _PANEL)])
+    written, data = cv2.imencode(path.suffix, image)
+    try:
+        if not written:
+            raise OSError("encoding failed")
+        path.write_bytes(data.tobytes())
+    except OSError as error:
+        raise UserError(f"{path}: cannot write the picture ({error.strerror or error}); choose another place") from None
+
+
+def _panel(title: str, axes: np.ndarray, mesh: TetMesh, muscles: MuscleSet) -> np.ndarray:
+    size = _PANEL * _SHARPNESS
+    image = np.full((size, size, 3), 255, np.uint8)
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    scale = (_PANEL - 2 * _MARGIN) * _SHARPNESS / float((high - low).max())
+    middle = 0.5 * (low + high)
+
+    def pixels(points: np.ndarray) -> np.ndarray:
+        flat = (points - middle) @ axes[:2].T * [scale, -scale] + 0.5 * size
+        return np.round(flat * 2**_SUBPIXEL_BITS).astype(np.int32)
+
+    faces = mesh.boundary_faces()
+    corners = mesh.nodes[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    depth = corners.mean(axis=1) @ axes[2]
+    brightness = 225 - 40 * np.clip(normals @ axes[2] + 1.0, 0.0, 1.0)
+    drawn = pixels(corners)
+    for face in np.argsort(-depth, kind="stable"):
+        if normals[face] @ axes[2] < 0:
+            shade = (int(brightness[face]),) * 3
+            cv2.fillConvexPoly(image, drawn[face], shade, cv2.LINE_AA, _SUBPIXEL_BITS)
+            cv2.polylines(image, [drawn[face]], True, (200, 200, 200), 1, cv2.LINE_AA, _SUBPIXEL_BITS)
+    ends = muscles.end_points(mesh.nodes)
+    drawn_ends = pixels(ends)
+    middles = ends[muscles.segments].mean(axis=1) @ axes[2]
+    for segment in np.argsort(-middles, kind="stable"):
+        i, k = muscles.segments[segment]
+        colour = _BGR[muscles.fibre_kinds[muscles.fibre_from_segment[segment]]]
+        first, last = (drawn_ends[i].tolist(), drawn_ends[k].tolist())
+        cv2.line(image, first, last, colour, 2 * _SHARPNESS, cv2.LINE_AA, _SUBPIXEL_BITS)
+        for end in (first, last):
+            cv2.circle(image, end, 3 * _SHARPNESS * 2**_SUBPIXEL_BITS, colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
+    image = cv2.resize(image, (_PANEL, _PANEL), interpolation=cv2.INTER_AREA)
+    cv2.putText(image, title, (12, 26), cv2.FONT_HERSHEY_SIMPLEX, 0.7, (0, 0, 0), 1, cv2.LINE_AA)
+    return image
+
+
+def _legend(muscles: MuscleSet, width: int) -> np.ndarray:
+    strip = np.full((48, width, 3), 255, np.uint8)
+    x = 16
+    for kind in FibreKind:
+        count = len(muscles.segments_of_kind(kind))
+        if count:
+            text = f"{kind.value} ({count})"
+            cv2.line(strip, (x, 24), (x + 32, 24), _BGR[kind], 3, cv2.LINE_AA)
+            cv2.putText(strip, text, (x + 40, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 1, cv2.LINE_AA)
+            x += 70 + cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.6, 1)[0][0]
+    return strip

@@ -1,0 +1,277 @@
+"""Curve skeleton of a body: branches (legs, trunk, arms) from the ground up, each a polyline with sections.
+
+Connected slabs of a height-like function (``egs_warp.muscles.ascent``) are the body's sections; how they join is its Reeb graph, whose
+short and thin chains are merged into their neighbours. Slabs cut through tetrahedra (the function is linear inside each), so
+that a coarse mesh has as fine a skeleton as a dense one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
+
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.muscles.ascent import ascent_field
+from egs_warp.muscles.level_cells import LevelCells
+
+_SECTION_COUNT = 24
+"""Sections from the base to the farthest tip."""
+_SAMPLES_PER_EDGE = 4
+"""A tetrahedron is sampled at the points of a lattice with this many along its edge (20 points in all)."""
+_SMOOTHING_PASSES = 3
+_CAP_SECTIONS = 3
+_MIN_BRANCH_VOLUME = 0.01
+"""A branch holds at least this part of the body's volume."""
+_MIN_BRANCH_SLENDERNESS = 1.5
+"""A branch that ends freely is at least this many of its own radii long; shorter ones are bumps."""
+
+
+@dataclass(frozen=True)
+class Branch:
+    """One limb or the trunk: a polyline through the middles of its sections, running away from the ground. K points."""
+
+    points: np.ndarray
+    """(K, 3) float64, metres, K >= 2."""
+    radii: np.ndarray
+    """(K,) float64, metres: radius of the disc with the section's area."""
+    own: np.ndarray
+    """(K,) bool: the section belongs to this branch alone; elsewhere the branch runs inside a junction."""
+    starts_on_ground: bool
+    """Its first point lies on the body's base."""
+    ends_freely: bool
+    """Its last point is a tip of the body."""
+    volume: float
+    """Cubic metres of the body that its own sections hold."""
+
+    @property
+    def length(self) -> float:
+        """Metres along the polyline."""
+        return float(np.linalg.norm(np.diff(self.points, axis=0), axis=1).sum())
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """All branches of a body, the most voluminous first."""
+
+    branches: tuple[Branch, ...]
+    up: np.ndarray
+    """(3,) unit vector away from the ground."""
+
+
+def skeleton(mesh: TetMesh, up: np.ndarray) -> Skeleton:
+    """Curve skeleton of ``mesh`` that stands with its lowest nodes on the ground; ``up`` (3,) points away from it.
+
+    The same mesh gives the same bits every time.
+    """
+    up = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
+    graph = _SectionGraph(mesh, ascent_field(mesh, up), up)
+    graph.merge_insignificant_chains()
+    branches = [graph.branch(chain) for chain in graph.joined_chains()]
+    branches.sort(key=lambda branch: -branch.volume)
+    return Skeleton(tuple(branches), up)
+
+
+class _SectionGraph:
+    """Sections (connected slabs of equal ascent) and which of them touch; merging changes it in place."""
+
+    def __init__(self, mesh: TetMesh, ascent: np.ndarray, up: np.ndarray) -> None:
+        self.thickness = float(ascent.max()) / _SECTION_COUNT
+        self.up = up
+        cells = LevelCells.cut(mesh.tets, ascent / self.thickness, level_count=_SECTION_COUNT)
+        joined = sp.coo_matrix((np.ones(len(cells.touching)), cells.touching.T), shape=(cells.count,) * 2)
+        count, section_from_cell = connected_components(joined, directed=False)
+        self.level = dict.fromkeys(range(count), 0)
+        for section, level in zip(section_from_cell, cells.level_from_cell, strict=True):
+            self.level[int(section)] = int(level)
+        grounded = np.zeros(count, dtype=bool)
+        on_base = (ascent[mesh.tets] == 0.0).any(axis=1)[cells.tet_from_cell] & (cells.level_from_cell == 0)
+        grounded[section_from_cell[on_base]] = True
+        self.grounded = {section: bool(grounded[section]) for section in self.level}
+        lattice = _tetrahedron_lattice(_SAMPLES_PER_EDGE)
+        self.samples = np.einsum("sa,tai->tsi", lattice, mesh.nodes[mesh.tets]).reshape(-1, 3)
+        self.sample_volumes = np.repeat(mesh.volumes() / len(lattice), len(lattice))
+        tet_from_sample = np.repeat(np.arange(len(mesh.tets)), len(lattice))
+        section_from_sample = section_from_cell[
+            cells.holding(tet_from_sample, (ascent[mesh.tets] @ lattice.T).ravel() / self.thickness)
+        ]
+        order = np.argsort(section_from_sample, kind="stable")
+        starts = np.searchsorted(section_from_sample[order], np.arange(count + 1))
+        self.members = {section: order[starts[section] : starts[section + 1]] for section in self.level}
+        self.lowest = float((mesh.nodes @ up).min())
+        self.total_volume = float(self.sample_volumes.sum())
+        self.neighbours: dict[int, set[int]] = {section: set() for section in self.level}
+        for a, b in np.unique(section_from_cell[cells.stacked], axis=0):
+            self.neighbours[int(a)].add(int(b))
+            self.neighbours[int(b)].add(int(a))
+
+    def volume(self, sections: Iterable[int]) -> float:
+        return sum(float(self.sample_volumes[self.members[section]].sum()) for section in sections)
+
+    def merge_insignificant_chains(self) -> None:
+        """Merge the least chain that is no limb, until every chain is one."""
+        while True:
+            chains = [chain for chain in self.chains() if self._is_insignificant(chain)]
+            if not chains:
+                return
+            self._merge(min(chains, key=lambda chain: (self.volume(self._own(chain)), chain)))
+
+    def chains(self) -> list[list[int]]:
+        """Paths between branching or end sections, including these, each once, running upwards."""
+        special = [
+            section for section, others in self.neighbours.items() if len(others) != 2 or self._is_extreme(section)
+        ]
+        found = []
+        for start in special:
+            for following in sorted(self.neighbours[start]):
+                chain = [start, following]
+                while chain[-1] not in special:
+                    (onward,) = self.neighbours[chain[-1]] - {chain[-2]}
+                    chain.append(onward)
+                if (self.level[chain[0]], chain[0], chain[1]) <= (self.level[chain[-1]], chain[-1], chain[-2]):
+                    found.append(chain)
+        return found
+
+    def joined_chains(self) -> list[list[int]]:
+        """Chains, with the one that alone carries a junction continued by the most voluminous one that leaves it.
+
+        One of several carries it alone if it has twice the volume of the next: a trunk beside a hand that rests on the
+        hip, but no leg of a stool.
+        """
+        chains = self.chains() or [[section, section] for section in self.neighbours]
+        for junction in sorted(self.neighbours, key=lambda section: (self.level[section], section)):
+            below = sorted(
+                (chain for chain in chains if chain[-1] == junction),
+                key=lambda chain: (-self._own_volume(chain), chain),
+            )
+            above = [chain for chain in chains if chain[0] == junction]
+            alone = len(below) == 1 or (
+                len(below) > 1 and self._own_volume(below[0]) > 2.0 * self._own_volume(below[1])
+            )
+            if alone and above:
+                onward = max(above, key=lambda chain: (self._own_volume(chain), chain))
+                chains = [chain for chain in chains if chain is not below[0] and chain is not onward]
+                chains.append(below[0] + onward[1:])
+        return chains
+
+    def branch(self, chain: list[int]) -> Branch:
+        """The polyline of a chain of sections; a free end is carried on to its tip, a ground end to the base."""
+        kept = [section for section in chain if len(self.members[section])] or chain
+        grounded, ends_freely = self.grounded[kept[0]], len(self.neighbours[kept[-1]]) <= 1
+        # The last slabs of a blunt end are cut by the mesh's rounding: only together do they have a middle to trust.
+        cap = _CAP_SECTIONS if len(kept) >= 3 * _CAP_SECTIONS else 1
+        groups = [[section] for section in kept]
+        if not grounded and self._is_free(kept[0]):
+            groups[:cap] = [kept[:cap]]
+        if ends_freely:
+            groups[-cap:] = [kept[-cap:]]
+        members = [np.concatenate([self.members[section] for section in group]) for group in groups]
+        points = [self._middle(samples) for samples in members]
+        radii = [float(np.mean([self._radius(section) for section in group])) for group in groups]
+        own = [not any(self._is_junction(section) for section in group) for group in groups]
+        if grounded or self._is_free(kept[0]):
+            points.insert(0, self._ground_point(kept[0]) if grounded else self._tip(members[0], points[1::-1]))
+            radii.insert(0, radii[0])
+            own.insert(0, own[0])
+        if ends_freely:
+            points.append(self._tip(members[-1], points[-2:]))
+            radii.append(radii[-1])
+            own.append(own[-1])
+        polyline = np.array(points)
+        for _ in range(_SMOOTHING_PASSES):
+            polyline[1:-1] = 0.25 * polyline[:-2] + 0.5 * polyline[1:-1] + 0.25 * polyline[2:]
+        return Branch(polyline, np.array(radii), np.array(own), grounded, ends_freely, self._own_volume(chain))
+
+    def _middle(self, members: np.ndarray) -> np.ndarray:
+        return np.average(self.samples[members], axis=0, weights=self.sample_volumes[members])
+
+    def _tip(self, members: np.ndarray, last_points: list[np.ndarray]) -> np.ndarray:
+        """Where a free end of the body is: as far on from the last point as its samples reach in the axis' direction."""
+        middle = last_points[-1]
+        onwards = middle - last_points[0]
+        length = float(np.linalg.norm(onwards))
+        onwards = onwards / length if length > 0.0 else self.up
+        return middle + float(((self.samples[members] - middle) @ onwards).max()) * onwards
+
+    def _ground_point(self, section: int) -> np.ndarray:
+        """The middle of the section's lowest layer, on the ground."""
+        members = self.members[section]
+        heights = self.samples[members] @ self.up
+        base = self._middle(members[heights <= heights.min() + 0.5 * self.thickness])
+        return base - (base @ self.up - self.lowest) * self.up
+
+    def _radius(self, section: int) -> float:
+        return float(np.sqrt(self.volume([section]) / (np.pi * self.thickness)))
+
+    def _is_extreme(self, section: int) -> bool:
+        levels = [self.level[other] for other in self.neighbours[section]]
+        return min(levels) > self.level[section] or max(levels) < self.level[section]
+
+    def _is_free(self, section: int) -> bool:
+        return len(self.neighbours[section]) == 1
+
+    def _own(self, chain: list[int]) -> list[int]:
+        """The sections of a chain that are not shared with another chain."""
+        return [section for section in chain if not self._is_junction(section)]
+
+    def _own_volume(self, chain: list[int]) -> float:
+        return self.volume(set(self._own(chain)))
+
+    def _is_junction(self, section: int) -> bool:
+        return len(self.neighbours[section]) > 2
+
+    def _is_insignificant(self, chain: list[int]) -> bool:
+        own = self._own(chain)
+        if not (self._is_junction(chain[0]) or self._is_junction(chain[-1])):
+            return False
+        length = self.thickness * len(own)
+        mean_radius = np.sqrt(self.volume(own) / (np.pi * max(length, self.thickness)))
+        if self._is_free(chain[0]) or self._is_free(chain[-1]):
+            too_small = self.volume(own) < _MIN_BRANCH_VOLUME * self.total_volume
+            return too_small or len(own) < 2 or length < _MIN_BRANCH_SLENDERNESS * mean_radius
+        # Between two junctions: a short link only separates limbs that leave the body at about the same place.
+        return len(own) < 2 or length < mean_radius
+
+    def _merge(self, chain: list[int]) -> None:
+        """Unite a free chain level by level with the body beside it; a link between junctions, with both of these."""
+        if self._is_free(chain[0]) or self._is_free(chain[-1]):
+            junction, own = (chain[-1], chain[-2::-1]) if self._is_free(chain[0]) else (chain[0], chain[1:])
+            upwards = self.level[own[0]] > self.level[junction]
+            beside, avoid = junction, set(own)
+            for section in own:
+                onward = [
+                    other
+                    for other in self.neighbours[beside]
+                    if other not in avoid and (self.level[other] > self.level[beside]) == upwards
+                ]
+                if onward and (self.level[section] > self.level[beside]) == upwards:
+                    beside = max(onward, key=lambda other: (self.volume([other]), other))
+                self._unite(beside, section)
+        else:
+            for section in chain[1:]:
+                if section != chain[0]:
+                    self._unite(chain[0], section)
+
+    def _unite(self, kept: int, gone: int) -> None:
+        self.members[kept] = np.sort(np.concatenate([self.members[kept], self.members.pop(gone)]))
+        self.grounded[kept] |= self.grounded.pop(gone)
+        for other in self.neighbours.pop(gone):
+            self.neighbours[other].discard(gone)
+            if other != kept:
+                self.neighbours[other].add(kept)
+                self.neighbours[kept].add(other)
+        del self.level[gone]
+
+
+def _tetrahedron_lattice(per_edge: int) -> np.ndarray:
+    """(S, 4) barycentric coordinates of a lattice of inner points."""
+    indices = [
+        (a, b, c, per_edge - 1 - a - b - c)
+        for a in range(per_edge)
+        for b in range(per_edge - a)
+        for c in range(per_edge - a - b)
+    ]
+    return (np.array(indices) + 0.25) / per_edge

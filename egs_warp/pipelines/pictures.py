@@ -1,0 +1,71 @@
+"""Pictures that show whether a step from a scene to its parts has worked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from colorsys import hsv_to_rgb
+
+import numpy as np
+
+from egs_warp.commands.object_flag import shrunk
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera_ring import ring_cameras
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.io.video import contact_sheet
+from egs_warp.render.backdrop import ContactShadow
+from egs_warp.render.rasteriser import render
+
+_BACKDROP = (0.55, 0.75, 0.55)
+_SIDE = 480
+
+
+def picture_cameras(plane: Plane, centre: np.ndarray, size: float, cameras: Sequence[Camera] = ()) -> list[Camera]:
+    """Four views: of the capture's own cameras above the plane, evenly picked, else of a ring."""
+    above = [camera for camera in cameras if plane.heights(camera.centre) > 0.0]
+    if len(above) >= 4:
+        return [shrunk(above[len(above) * k // 4], _SIDE) for k in range(4)]
+    return ring_cameras(plane, centre, 0.7 * size, count=4, elevations=(12.0, 35.0), size=_SIDE)
+
+
+def plane_picture(
+    cloud: GaussianCloud, planes: Sequence[Plane], cameras: Sequence[Camera], *, centre: np.ndarray, size: float
+) -> np.ndarray:
+    """(H, W, 3) uint8: the capture with a grid on each plane, in a colour of its own, faint where something stands before it.
+
+    Ten lines to the ``size`` (scene units) of the object about ``centre`` (3,).
+    """
+    frames = []
+    for camera in cameras:
+        image = render(cloud, camera)
+        picture = np.clip(image.colour.numpy(), 0.0, 1.0)
+        depth = np.where(image.alpha.numpy() > 0.5, image.depth.numpy(), np.inf)
+        for number, plane in enumerate(planes):
+            # Hues a golden section apart differ, however many.
+            colour = np.array(hsv_to_rgb((0.92 + 0.618 * number) % 1.0, 0.85, 0.95))
+            seen = ContactShadow(camera, plane, centre=centre, reach=size)
+            cell = 0.1 * size
+            distance = np.abs((seen.flat / cell + 0.5) % 1.0 - 0.5) * cell
+            line = np.clip(1.6 - distance / (1.0 * seen.pixel[..., None]), 0.0, 1.0).max(axis=-1)
+            line *= np.clip(4.0 - 2.0 * np.linalg.norm(seen.flat, axis=-1) / size, 0.0, 1.0) * seen.hit
+            line *= np.where(seen.depth < 1.01 * depth, 0.9, 0.12)
+            picture = picture + line[..., None] * (colour - picture)
+        frames.append(_bytes(picture))
+    return contact_sheet(frames, 2, ["the grid must lie on what the object stands on", "", "", ""][: len(frames)])
+
+
+def segmentation_picture(
+    cloud: GaussianCloud, thing: GaussianCloud, background: GaussianCloud, cameras: Sequence[Camera]
+) -> np.ndarray:
+    """(H, W, 3) uint8: rows of the capture, the object alone and the background alone."""
+    frames = [_bytes(render(cloud, camera).colour.numpy()) for camera in cameras]
+    for part in (thing, background):
+        frames += [_bytes(render(part, camera, background=_BACKDROP).colour.numpy()) for camera in cameras]
+    labels = [""] * len(frames)
+    for row, text in enumerate(("capture", "object", "background")):
+        labels[row * len(cameras)] = text
+    return contact_sheet(frames, len(cameras), labels)
+
+
+def _bytes(picture: np.ndarray) -> np.ndarray:
+    return np.rint(np.clip(picture, 0.0, 1.0) * 255.0).astype(np.uint8)

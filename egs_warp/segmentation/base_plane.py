@@ -1,0 +1,188 @@
+"""The plane an object stands on, and which way is up, when nobody says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+
+_COLUMNS = 64
+"""Columns across the longer side of the footprint."""
+_SEARCHED_SHARE = 0.15
+"""The support is looked for in this share of the height, from the bottom."""
+_BANDWIDTH = 0.01
+"""Of the height: undersides this close are one support."""
+_MAX_MASS_BELOW = 0.015
+"""Share of the opacity mass that may lie below the plane: half of what contact can leave out."""
+
+
+_AXIS_NAMES = "xyz"
+_HABIT = {1: 0.10, 2: 0.05, 0: 0.0}
+"""Trainers and generators put up along y most often (COLMAP: -y, glTF: +y), then along z, hardly ever along x."""
+_CLEAR_MARGIN = 0.3
+
+
+@dataclass(frozen=True)
+class _Underside:
+    """What the object looks like from below."""
+
+    heights: np.ndarray
+    """(n,) of all means along up, scene units."""
+    opacities: np.ndarray
+    """(n,)"""
+    low: float
+    high: float
+    """Robust lowest and highest height."""
+    bottoms: np.ndarray
+    """(c,) lowest visible height of each column."""
+    columns: np.ndarray
+    """(c, 2) integer position of each column."""
+    column_width: float
+    """Scene units."""
+    centre: np.ndarray
+    """(2,) centre of opacity, in columns."""
+
+    @property
+    def size(self) -> float:
+        """Robust height, scene units."""
+        return self.high - self.low
+
+
+def find_base_plane(cloud: GaussianCloud, up: np.ndarray) -> Plane:
+    """Plane square to ``up`` (3,) on which the object stands.
+
+    The object is cut into columns; their lowest visible Gaussians are its underside. The support is the densest level
+    of the underside in the lowest 15 % of the height (strays are too few to make one), the plane the lower edge of that
+    level. It is lowered, if need be, until at most 1.5 % of the opacity mass lies below it.
+
+    Raises ``UserError`` if the object has no height.
+    """
+    normal = np.asarray(up, dtype=np.float64)
+    normal = normal / np.linalg.norm(normal)
+    underside = _underside(cloud, normal)
+    level = min(_support_level(underside), _mass_quantile(underside.heights, underside.opacities, _MAX_MASS_BELOW))
+    return Plane(normal, -level)
+
+
+def _underside(cloud: GaussianCloud, normal: np.ndarray) -> _Underside:
+    means, opacities = cloud.means.numpy().astype(np.float64), cloud.opacities()
+    heights = means @ normal
+    low, high = (_mass_quantile(heights, opacities, share) for share in (0.002, 0.998))
+    if not high > low:
+        raise UserError(
+            f"object: its {cloud.count} Gaussians have no height along up, so no plane can be found; check --up"
+        )
+    first, second = Plane(normal, 0.0).tangents()
+    across = np.stack([means @ first, means @ second], axis=1)
+    box = np.array([[_mass_quantile(across[:, k], opacities, share) for share in (0.002, 0.998)] for k in range(2)])
+    width = max(float(np.ptp(box, axis=1).max()) / _COLUMNS, 1e-12 * (high - low))
+    # Faint captures have hardly any opaque Gaussian: what counts as visible follows the capture.
+    visible = opacities >= min(0.3, 0.5 * _mass_quantile(opacities, opacities, 0.5))
+    column = np.floor((across[visible] - box[:, 0]) / width).astype(np.int64)
+    near = np.all((column >= -2) & (column <= _COLUMNS + 2), axis=1)
+    columns, of = np.unique(column[near], axis=0, return_inverse=True)
+    bottoms = np.full(len(columns), np.inf)
+    np.minimum.at(bottoms, of.ravel(), heights[visible][near])
+    held = np.all((across >= box[:, 0]) & (across <= box[:, 1]), axis=1)
+    weights = np.where(held, opacities, 0.0)
+    centre = (weights @ across / max(float(weights.sum()), 1e-30) - box[:, 0]) / width - 0.5
+    return _Underside(heights, opacities, low, high, bottoms, columns, width, centre)
+
+
+def _support_level(underside: _Underside) -> float:
+    """Height of the lower edge of the densest low level of the underside."""
+    size = underside.size
+    bottom = underside.low - 0.1 * size
+    # Strays may have pulled the robust lowest height down: search at least up to where 3 % of the mass lies below.
+    top = max(
+        underside.low + _SEARCHED_SHARE * size,
+        _mass_quantile(underside.heights, underside.opacities, 0.03) + 2.0 * _BANDWIDTH * size,
+    )
+    bottoms = underside.bottoms[(underside.bottoms > bottom) & (underside.bottoms < top)]
+    if len(bottoms) == 0:
+        return underside.low
+    levels = np.linspace(bottom, top, 501)
+    density = np.exp(-0.5 * ((levels[:, None] - bottoms[None, :]) / (_BANDWIDTH * size)) ** 2).sum(axis=1)
+    # The lowest peak that holds its own against the highest: a bevel above the sole may be the larger of the two.
+    inner = density[1:-1]
+    peaks = 1 + np.flatnonzero((inner >= density[:-2]) & (inner > density[2:]) & (inner > 0.5 * density.max()))
+    mode = levels[peaks[0]] if len(peaks) else levels[int(np.argmax(density))]
+    members = bottoms[np.abs(bottoms - mode) <= 1.5 * _BANDWIDTH * size]
+    return float(np.quantile(members, 0.15)) if len(members) else float(mode)
+
+
+def _mass_quantile(values: np.ndarray, masses: np.ndarray, share: float) -> float:
+    """The value below which at most ``share`` of the mass lies."""
+    order = np.argsort(values, kind="stable")
+    mass = np.cumsum(masses[order])
+    return float(values[order][min(int(np.searchsorted(mass, share * mass[-1])), len(values) - 1)])
+
+
+def guess_up(cloud: GaussianCloud, capture_format_up: np.ndarray | None = None) -> tuple[np.ndarray, str]:
+    """Up (3,), unit, and the reason, for the user: the format's own up if it has one, else the best of the six axes.
+
+    An object rests on the side where it is supported widely, at one level, and with its weight well inside. Each axis
+    scores the area of its support polygon, as a share of the silhouette seen along the axis, plus the share of its low
+    columns that end at one level, plus how deep the centre of opacity lies inside the polygon.
+    """
+    if capture_format_up is not None:
+        return np.asarray(capture_format_up, dtype=np.float64), "the file format defines it"
+    scores = []
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            up = np.zeros(3)
+            up[axis] = sign
+            shape = _support_shape(cloud, up)
+            scores.append((shape.polygon + shape.level + shape.depth + _HABIT[axis], shape, up))
+    # Python's sort is stable, so a tie goes to the earlier axis.
+    scores.sort(key=lambda entry: -entry[0])
+    (best, shape, up), (second, _, other) = scores[0], scores[1]
+    sure = "clearly" if best - second > _CLEAR_MARGIN else "narrowly"
+    reason = (
+        f"guessed: its support polygon there is {100 * shape.polygon:.0f} % of the silhouette and "
+        f"{100 * shape.level:.0f} % of the low parts end at one level; {sure} ahead of {_name(other)}, "
+        f"score {best:.2f} to {second:.2f}"
+    )
+    return up, reason
+
+
+def _name(up: np.ndarray) -> str:
+    axis = int(np.argmax(np.abs(up)))
+    return f"{'-' if up[axis] < 0 else '+'}{_AXIS_NAMES[axis]}"
+
+
+@dataclass(frozen=True)
+class _Support:
+    """How an object would stand on one side; each 0 to 1."""
+
+    polygon: float
+    """Area of the support polygon over that of the silhouette."""
+    level: float
+    """Share of the low columns that end at the support's level."""
+    depth: float
+    """Distance of the centre of opacity from the polygon's edge over the radius of the disc of its area; 0 outside."""
+
+
+def _support_shape(cloud: GaussianCloud, up: np.ndarray) -> _Support:
+    try:
+        underside = _underside(cloud, up)
+    except UserError:  # flat along this axis
+        return _Support(0.0, 0.0, 0.0)
+    extent = max(underside.size, _COLUMNS * underside.column_width)
+    above = underside.bottoms - _support_level(underside)
+    support, low = np.abs(above) < 0.02 * extent, above < 0.12 * extent
+    if not low.any():
+        return _Support(0.0, 0.0, 0.0)
+    level = float(np.sum(support) / np.sum(low))
+    try:
+        hull = ConvexHull(underside.columns[support])
+    except (QhullError, ValueError):  # fewer than three columns, or all in one line
+        return _Support(0.0, level, 0.0)
+    inside = -(hull.equations[:, :2] @ underside.centre + hull.equations[:, 2]).max()
+    depth = float(np.clip(inside / np.sqrt(hull.volume / np.pi), 0.0, 1.0))
+    return _Support(min(float(hull.volume) / len(above), 1.0), level, depth)

@@ -1,0 +1,267 @@
+"""An object freed of what reaches across its plane: by fine-tuning with L_seg, by splitting, or by leaving it out."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from egs_warp.assets.rooms import joined
+from egs_warp.deformation.splitting import SplitRule, child_layout, child_opacities
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera_ring import ring_cameras
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.kernels.deformation.splitting import split_kernel
+from egs_warp.kernels.segmentation.clearance import half_space_kernel, reach_kernel
+from egs_warp.launching import launch_rows
+from egs_warp.render.rasteriser import render
+from egs_warp.segmentation.plane_fit import plane_depth
+
+if TYPE_CHECKING:
+    from egs_warp.training.finetune import GaussianTensors, TrainingView
+
+GAMMA = 3.0
+"""Standard deviations that a Gaussian counts for, as in Eq. (3)."""
+
+
+class Reach(enum.Enum):
+    """How far a Gaussian is said to reach towards the plane."""
+
+    AXIS_TIPS = "axis-tips"
+    """The farthest of its six axis tips, as Eq. (20) has it."""
+    ELLIPSOID = "ellipsoid"
+    """Its whole ellipsoid, gamma sqrt(N^T Sigma N): up to sqrt 3 times as far."""
+
+
+class Clearing(enum.Enum):
+    """What happens to Gaussians of the object that straddle its plane."""
+
+    NONE = "mask only"
+    """Nothing."""
+    REMOVE = "remove"
+    """They are left out."""
+    FINETUNE = "L_seg"
+    """They shrink and move until they are clear of it, while the object keeps its looks (Eq. 21)."""
+    SPLIT = "static split"
+    """Each is replaced by the part of it above the plane."""
+
+
+@dataclass(frozen=True)
+class ClearingOptions:
+    """What may be chosen about the fine-tune."""
+
+    iterations: int = 200
+    reach: Reach = Reach.ELLIPSOID
+    weight: float = 0.3
+    """Of L_seg beside the photometric loss; 0.3 and 3 give the same to 0.4 dB."""
+    subdivisions: int = 2
+    """How often straddling Gaussians are first split in three across the plane: smaller ones come closer to it without
+    crossing. 0 is the paper's way."""
+    seed: int = 0
+
+
+def reach_across(cloud: GaussianCloud, plane: Plane, reach: Reach = Reach.ELLIPSOID) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) height d0 of each mean over the plane and (n,) reach eta_seg along its normal, Eq. (20); scene units.
+
+    A Gaussian straddles the plane where |d0| < eta_seg.
+    """
+    count, device = cloud.count, cloud.device
+    outputs = [wp.empty(count, dtype=wp.float32, device=device) for _ in range(3)]
+    launch_rows(
+        reach_kernel,
+        count,
+        inputs=[wp.vec3(*plane.normal.tolist()), plane.offset, cloud.means, cloud.rotations, cloud.log_scales],
+        outputs=outputs,
+        device=device,
+    )
+    heights, tips, deviation = (output.numpy().astype(np.float64) for output in outputs)
+    return heights, GAMMA * (tips if reach is Reach.AXIS_TIPS else deviation)
+
+
+def clear_plane(
+    cloud: GaussianCloud,
+    plane: Plane,
+    method: Clearing,
+    *,
+    cameras: Sequence[Camera] = (),
+    views: Sequence[TrainingView] | None = None,
+    surroundings: GaussianCloud | None = None,
+    options: ClearingOptions | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> GaussianCloud:
+    """``cloud``, an object above ``plane``, with its straddling Gaussians treated by ``method``.
+
+    ``FINETUNE`` compares with renders of the untouched object through ``cameras`` (default: a ring about its foot),
+    above the plane only; or with photographs ``views`` of the whole scene, for which it draws the ``surroundings`` as
+    well but does not change them. Gaussians whose means end up below the plane are left out.
+    """
+    options = options or ClearingOptions()
+    heights, reach = reach_across(cloud, plane, options.reach)
+    straddling = np.abs(heights) < reach
+    if method is Clearing.NONE or not straddling.any():
+        return cloud
+    if method is Clearing.REMOVE:
+        return cloud.subset(~straddling)
+    if method is Clearing.SPLIT:
+        return half_space(cloud, plane, straddling)
+    if views is None:
+        views = views_above(cloud, plane, cameras or foot_ring(cloud, plane))
+    fine = cloud
+    for _ in range(options.subdivisions):
+        fine = _subdivided(fine, plane, options.reach)
+    tuned = _finetuned(fine, plane, views, surroundings, options, progress)
+    return tuned.subset(plane.heights(tuned.means.numpy()) > 0.0)
+
+
+def half_space(cloud: GaussianCloud, plane: Plane, chosen: np.ndarray) -> GaussianCloud:
+    """``cloud`` with each of the ``chosen`` (n,) bool Gaussians replaced by its part above the plane.
+
+    Mass, mean and covariance are those of a normal distribution cut off at the plane: with t = -d0 / sigma and
+    l = pdf(t) / (1 - cdf(t)), mean m + l Sigma N / sigma, covariance Sigma - l (l - t) Sigma N N^T Sigma / sigma^2.
+    """
+    source = np.flatnonzero(chosen).astype(np.int32)
+    device = cloud.device
+    shapes: list[tuple[str, Any]] = [
+        ("means", wp.vec3),
+        ("rotations", wp.vec4),
+        ("log_scales", wp.vec3),
+        ("opacity_logits", wp.float32),
+    ]
+    parts = [wp.empty(len(source), dtype=dtype, device=device) for _, dtype in shapes]
+    launch_rows(
+        half_space_kernel,
+        len(source),
+        inputs=[
+            wp.vec3(*plane.normal.tolist()),
+            plane.offset,
+            wp.array(source, dtype=wp.int32, device=device),
+            *(getattr(cloud, name) for name, _ in shapes),
+        ],
+        outputs=parts,
+        device=device,
+    )
+    values = {name: getattr(cloud, name).numpy().copy() for name, _ in shapes}
+    for (name, _), part in zip(shapes, parts, strict=True):
+        values[name][source] = part.numpy()
+    return GaussianCloud.from_numpy(**values, sh=cloud.sh.numpy(), device=str(device))
+
+
+def views_above(cloud: GaussianCloud, plane: Plane, cameras: Sequence[Camera]) -> list[TrainingView]:
+    """Renders of ``cloud`` alone in which only pixels count that show what is above the plane, or nothing at all."""
+    from egs_warp.training.finetune import TrainingView
+
+    views = []
+    for camera in cameras:
+        image = render(cloud, camera, background=(0.0, 0.0, 0.0))
+        alpha, depth = image.alpha.numpy(), image.depth.numpy()
+        colour = np.clip(image.colour.numpy() / np.maximum(alpha, 1e-6)[..., None], 0.0, 1.0)
+        behind = plane_depth(plane, camera)
+        hidden = (behind > 0.0) & (depth > behind) & (alpha > 0.0)
+        if plane.heights(camera.centre) <= 0.0:
+            hidden |= (behind > 0.0) & (alpha > 0.0)
+        views.append(TrainingView(camera, colour, alpha=alpha, weight=(~hidden).astype(np.float32)))
+    return views
+
+
+def foot_ring(cloud: GaussianCloud, plane: Plane, *, size: int = 256) -> list[Camera]:
+    """Cameras low around the part of ``cloud`` that is near the plane."""
+    means = cloud.means.numpy().astype(np.float64)
+    heights = plane.heights(means)
+    low = means[heights < np.quantile(heights, 0.002) + 0.08 * np.ptp(np.quantile(heights, [0.002, 0.998]))]
+    centre = np.median(low, axis=0)
+    radius = float(np.quantile(np.linalg.norm(low - centre, axis=1), 0.98))
+    return ring_cameras(plane, centre, 1.1 * radius, elevations=(1.0, 10.0, 25.0), size=size)
+
+
+def _subdivided(cloud: GaussianCloud, plane: Plane, reach: Reach) -> GaussianCloud:
+    """``cloud`` with straddling Gaussians split in three along the axis that reaches farthest across the plane."""
+    heights, extent = reach_across(cloud, plane, reach)
+    parents = np.flatnonzero(np.abs(heights) < extent)
+    kept = np.flatnonzero(np.abs(heights) >= extent)
+    turns = Rotation.from_quat(cloud.rotations.numpy()[parents][:, [1, 2, 3, 0]]).as_matrix()
+    along = np.abs(np.einsum("nij,i->nj", turns, plane.normal)) * np.exp(cloud.log_scales.numpy()[parents])
+    offsets, shrink = child_layout(SplitRule.MEASURED)
+    source = np.concatenate([kept, np.repeat(parents, len(offsets))]).astype(np.int32)
+    axis, step = np.full(len(source), -1, np.int32), np.zeros(len(source), np.float32)
+    axis[len(kept) :] = np.repeat(along.argmax(axis=1), len(offsets))
+    step[len(kept) :] = np.tile(offsets, len(parents))
+    peaks = np.clip(child_opacities(cloud.opacities()[parents], SplitRule.MEASURED), 1e-6, 1.0 - 1e-6).ravel()
+    logits = cloud.opacity_logits.numpy()[source]
+    logits[len(kept) :] = np.log(peaks / (1.0 - peaks))
+    fields = [cloud.means, cloud.rotations, cloud.log_scales, cloud.sh]
+    shapes = [len(source), len(source), len(source), (len(source), cloud.sh.shape[1])]
+    with wp.ScopedDevice(cloud.device):
+        plan = [wp.array(values) for values in (source, axis, step)]
+        out = [wp.empty(shape, dtype=field.dtype) for shape, field in zip(shapes, fields, strict=True)]
+        means, rotations, log_scales, sh = out
+        split = GaussianCloud(means, rotations, log_scales, wp.array(logits), sh)
+    launch_rows(split_kernel, len(source), inputs=[*plan, shrink, *fields], outputs=out, device=cloud.device)
+    return split.subset(plane.heights(split.means.numpy()) > 0.0)
+
+
+def _finetuned(
+    cloud: GaussianCloud,
+    plane: Plane,
+    views: Sequence[TrainingView],
+    surroundings: GaussianCloud | None,
+    options: ClearingOptions,
+    progress: Callable[[int, float], None] | None,
+) -> GaussianCloud:
+    # torch is slow to import, and wanted only here.
+    import torch
+
+    from egs_warp.training.finetune import FinetuneOptions, finetune
+
+    heights, reach = reach_across(cloud, plane, options.reach)
+    straddling = np.abs(heights) < reach
+    if not straddling.any():
+        return cloud
+    whole = cloud if surroundings is None else joined(cloud, surroundings)
+    scale = float(np.median(reach[straddling]))
+    # Those just above take over what the straddling ones give up.
+    free = np.zeros(whole.count, bool)
+    free[: cloud.count] = heights < 3.0 * scale
+    near = torch.as_tensor(np.flatnonzero(free), device=wp.device_to_torch(cloud.device))
+    normal = torch.tensor(plane.normal, dtype=torch.float32, device=near.device)
+
+    def extra(tensors: GaussianTensors) -> torch.Tensor:
+        loss = straddling_loss(tensors, near, normal, plane.offset, options.reach)
+        return options.weight / (scale * int(straddling.sum())) * loss
+
+    # Pictures with transparency are laid over random colours, so that nothing hides behind a background of its own.
+    cut_out = all(view.alpha is not None for view in views)
+    result = finetune(
+        whole,
+        views,
+        options=FinetuneOptions(
+            iterations=options.iterations, background=None if cut_out else (0.0, 0.0, 0.0), seed=options.seed
+        ),
+        extra_loss=extra,
+        trainable=free,
+        progress=progress,
+    )
+    return result.cloud.subset(np.arange(whole.count) < cloud.count)
+
+
+def straddling_loss(tensors: GaussianTensors, near: Any, normal: Any, offset: float, reach: Reach) -> Any:
+    """L_seg of Eq. (21): the sum of eta_seg - |d0| over those of the Gaussians ``near`` (m,) that straddle the plane.
+
+    A scalar tensor, scene units; ``normal`` (3,) and ``offset`` are the plane's.
+    """
+    import torch
+
+    q = torch.nn.functional.normalize(tensors.rotations[near], dim=1)
+    w, v = q[:, :1], q[:, 1:]
+    # N in each Gaussian's own axes: the conjugate quaternion turns it there.
+    n = normal.expand_as(v)
+    turned = n + 2.0 * torch.cross(-v, torch.cross(-v, n, dim=1) + w * n, dim=1)
+    along = turned * torch.exp(tensors.log_scales[near])
+    eta = GAMMA * (along.abs().amax(dim=1) if reach is Reach.AXIS_TIPS else (along.square().sum(dim=1) + 1e-20).sqrt())
+    height = tensors.means[near] @ normal + offset
+    return torch.relu(eta - height.abs()).sum()

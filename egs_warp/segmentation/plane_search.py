@@ -1,0 +1,187 @@
+"""Planes of a capture that nobody has marked: what an object rests on, from a click or a box alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.render.rasteriser import render
+from egs_warp.segmentation.plane_fit import PlaneFit, PlaneView, camera_rays, fit_plane
+
+_TRIALS = 1500
+_SAMPLE = 4000
+_MIN_OPACITY = 0.3
+_BAND = 0.03
+"""Of the radius looked at: what lies nearer to the plane is taken for part of it. With 0.06 the single views of a real
+table disagreed by 0.8 degree, with 0.03 by 0.3."""
+
+
+@dataclass(frozen=True)
+class FoundPlane:
+    """A flat place, and how much of the surface lies in it."""
+
+    plane: Plane
+    support: float
+    """0 to 1, share of the visible surface."""
+
+
+def find_planes(
+    cloud: GaussianCloud,
+    up: np.ndarray,
+    *,
+    count: int = 4,
+    tilt_degrees: float = 25.0,
+    thickness: float | None = None,
+    seed: int = 0,
+) -> list[FoundPlane]:
+    """Up to ``count`` planes within ``tilt_degrees`` of level, widest first, by random sampling over opaque Gaussians.
+
+    A Gaussian counts with its opacity and the area of its broad side. ``thickness`` (scene units; default 1 % of the
+    extent) is how far from a plane its Gaussians may lie; each plane takes its Gaussians away before the next is
+    sought. The list is empty where nothing is flat.
+    """
+    random = np.random.default_rng(seed)
+    means, opacity = cloud.means.numpy().astype(np.float64), cloud.opacities()
+    scales = np.sort(np.exp(cloud.log_scales.numpy().astype(np.float64)), axis=1)
+    area = opacity * scales[:, 1] * scales[:, 2]
+    # A few blurs behind everything would outweigh the rest.
+    area = np.minimum(area, np.quantile(area, 0.95))
+    left = np.flatnonzero((opacity >= _MIN_OPACITY) & (area > 0.0))
+    if len(left) < 10:
+        return []
+    low, high = np.quantile(means[left], [0.02, 0.98], axis=0)
+    band = thickness or 0.01 * float(np.linalg.norm(high - low))
+    up = np.asarray(up, float) / np.linalg.norm(up)
+    total = float(area[left].sum())
+    found: list[FoundPlane] = []
+    for _ in range(count):
+        if len(left) < 10:
+            break
+        few = random.choice(left, min(_SAMPLE, len(left)), replace=False, p=area[left] / area[left].sum())
+        plane = _best_plane(means[few], up, np.cos(np.radians(tilt_degrees)), band, random)
+        if plane is None:
+            break
+        near = np.abs(plane.heights(means[left])) < band
+        plane = _levelled(means[left[near]], area[left[near]], up, plane)
+        near = np.abs(plane.heights(means[left])) < 2.0 * band
+        support = float(area[left[np.abs(plane.heights(means[left])) < band]].sum()) / total
+        found.append(FoundPlane(plane, support))
+        left = left[~near]
+    return sorted(found, key=lambda one: -one.support)
+
+
+def _best_plane(
+    points: np.ndarray, up: np.ndarray, least_cosine: float, band: float, random: np.random.Generator
+) -> Plane | None:
+    triples = random.integers(len(points), size=(_TRIALS, 3))
+    a, b, c = (points[triples[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1)
+    normals = normals / np.maximum(lengths, 1e-300)[:, None]
+    normals *= np.where(normals @ up < 0.0, -1.0, 1.0)[:, None]
+    level = (normals @ up > least_cosine) & (lengths > 0.0)
+    if not level.any():
+        return None
+    normals, through = normals[level], a[level]
+    offsets = -np.einsum("ij,ij->i", normals, through)
+    # The share of points nearby, counted softly: a plane half inside the band is half as good.
+    scores = np.array(
+        [
+            np.clip(1.0 - ((points @ normal + offset) / band) ** 2, 0.0, None).sum()
+            for normal, offset in zip(normals, offsets, strict=True)
+        ]
+    )
+    best = int(np.argmax(scores))
+    return Plane(normals[best], float(offsets[best]))
+
+
+def _levelled(points: np.ndarray, weights: np.ndarray, up: np.ndarray, start: Plane) -> Plane:
+    """Weighted least squares through ``points``."""
+    if len(points) < 3:
+        return start
+    centre = weights @ points / weights.sum()
+    values, vectors = np.linalg.eigh(np.einsum("n,ni,nj->ij", weights, points - centre, points - centre))
+    if values[1] <= 1e-12 * values[2]:
+        return start
+    normal = vectors[:, 0] * (1.0 if vectors[:, 0] @ up > 0 else -1.0)
+    return Plane(normal, float(-normal @ centre))
+
+
+def plane_under(
+    planes: Sequence[FoundPlane], lowest: np.ndarray, *, tolerance: float, least_share: float = 0.1
+) -> Plane | None:
+    """The highest of ``planes`` that lies below the point ``lowest`` (3,), or no more than ``tolerance`` above it.
+
+    Planes with less than ``least_share`` of the widest one's support do not count. None where there is no such plane.
+    """
+    if not planes:
+        return None
+    most = max(one.support for one in planes)
+    below = [
+        (float(one.plane.heights(lowest)), one.plane)
+        for one in planes
+        if one.support >= least_share * most and one.plane.heights(lowest) > -tolerance
+    ]
+    return min(below, key=lambda entry: entry[0])[1] if below else None
+
+
+def refine_plane(
+    cloud: GaussianCloud,
+    plane: Plane,
+    cameras: Sequence[Camera],
+    *,
+    centre: np.ndarray,
+    radius: float,
+    object_mask: np.ndarray | None = None,
+) -> PlaneFit:
+    """``plane`` fitted anew to the depth of ``cloud`` rendered by ``cameras``, Eq. (18), (19).
+
+    The masks are those of ``plane_views``. Raises ``UserError`` where no camera sees the plane.
+    """
+    views = plane_views(cloud, plane, cameras, centre=centre, radius=radius, object_mask=object_mask)
+    if not views:
+        raise UserError(
+            "plane: none in sight: no camera sees it around the object; give other cameras, or leave them out"
+        )
+    return fit_plane(views)
+
+
+def plane_views(
+    cloud: GaussianCloud,
+    plane: Plane,
+    cameras: Sequence[Camera],
+    *,
+    centre: np.ndarray,
+    radius: float,
+    object_mask: np.ndarray | None = None,
+    band: float | None = None,
+    max_views: int = 8,
+) -> list[PlaneView]:
+    """Pictures of the surroundings of ``centre`` (3,) in which the plane is masked.
+
+    The masks are the pixels whose rendered point lies within ``band`` (default 3 % of ``radius``) of the plane and
+    within ``radius`` of ``centre`` along it, less those of ``object_mask`` (n,) bool Gaussians. Cameras below the plane,
+    and those that see nothing of it, do not count; of more than ``max_views``, some are picked evenly.
+    """
+    band = band or _BAND * radius
+    above = [camera for camera in cameras if plane.heights(camera.centre) > 0.1 * radius]
+    chosen = above[:: max(1, -(-len(above) // max_views))]
+    # The object is left out of the picture only where it is known: its foot would bend the plane up.
+    bare = cloud if object_mask is None else cloud.subset(~object_mask)
+    views = []
+    for camera in chosen:
+        image = render(bare, camera)
+        depth = image.depth.numpy().astype(np.float64)
+        points = camera.centre + depth[..., None] * camera_rays(camera)
+        across = points - centre
+        across = np.linalg.norm(across - (across @ plane.normal)[..., None] * plane.normal, axis=-1)
+        mask = (image.alpha.numpy() > 0.9) & (np.abs(plane.heights(points)) < band) & (across < radius)
+        if mask.sum() >= 50:
+            views.append(PlaneView(camera, depth, mask))
+    return views

@@ -1,0 +1,113 @@
+"""How much each Gaussian shows inside and outside a mask: its blending weight, summed over pixels (DESIGN 10)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.launching import available_threads
+from egs_warp.render.backward import backward
+from egs_warp.render.compositing import composite
+from egs_warp.render.projection import project, view_from_camera
+from egs_warp.render.rasteriser import background_of, refusing_what_does_not_fit
+from egs_warp.render.tiles import build_tile_lists
+
+_SH_0 = 0.28209479177387814
+
+
+@dataclass(frozen=True)
+class MaskedView:
+    """One picture in which somebody, or a segmenter, has marked the object."""
+
+    camera: Camera
+    mask: np.ndarray
+    """(H, W) bool, True on the object."""
+    name: str = "mask"
+    """For messages."""
+
+
+@dataclass(frozen=True)
+class Votes:
+    """Sums over the pixels of all views, in pixels."""
+
+    inside: np.ndarray
+    """(n,) float64 blending weight inside the masks."""
+    outside: np.ndarray
+    """(n,) float64 blending weight outside the masks."""
+    unhidden: np.ndarray
+    """(n,) float64 blending weight if nothing else stood in the way."""
+
+    def share_inside(self) -> np.ndarray:
+        """(n,) 0 to 1; 0.5 for Gaussians that no view shows."""
+        total = self.inside + self.outside
+        return np.where(total > 0.0, self.inside / np.maximum(total, 1e-30), 0.5)
+
+    def share_seen(self) -> np.ndarray:
+        """(n,) 0 to 1: how much of the Gaussian is not hidden."""
+        return np.minimum((self.inside + self.outside) / np.maximum(self.unhidden, 1e-30), 1.0)
+
+
+def blending_votes(cloud: GaussianCloud, views: Sequence[MaskedView]) -> Votes:
+    """Blending weight of each Gaussian summed over the pixels inside and outside the masks.
+
+    A Gaussian's blending weight in a pixel is the derivative of the pixel's colour by the Gaussian's own. So the votes
+    are the colour gradient of a picture that counts masked pixels in red and the others in green, as the renderer's
+    backward kernels find it. Raises ``UserError`` for masks of another size than their cameras.
+    """
+    sums = np.zeros((cloud.count, 3))
+    # One grey for all: colours are not clipped, and bands above 0 cost nothing.
+    grey = GaussianCloud(
+        cloud.means,
+        cloud.rotations,
+        cloud.log_scales,
+        cloud.opacity_logits,
+        wp.zeros((cloud.count, 1), dtype=wp.vec3, device=cloud.device),
+    )
+    for view in views:
+        check_size(view)
+        sums += _votes_of_view(grey, view)
+    return Votes(*sums.T)
+
+
+def check_size(view: MaskedView) -> None:
+    """Raises ``UserError`` for a mask of another size than its camera's picture."""
+    height, width = view.camera.height, view.camera.width
+    if view.mask.shape != (height, width):
+        raise UserError(
+            f"{view.name}: the mask is {view.mask.shape[1]} x {view.mask.shape[0]} pixels, its camera {width} x {height}; "
+            "make it at the photo's size"
+        )
+
+
+def _votes_of_view(grey: GaussianCloud, masked: MaskedView) -> np.ndarray:
+    threads = available_threads()
+    view = view_from_camera(masked.camera)
+    inside = masked.mask.astype(np.float32)
+    colour = np.stack([inside, 1.0 - inside, np.zeros_like(inside)], axis=2)
+    with refusing_what_does_not_fit(grey, masked.camera):
+        projected = project(grey, view, antialiased=False, threads=threads)
+        lists = build_tile_lists(projected, view, threads=threads)
+        behind = background_of((0.0, 0.0, 0.0), masked.camera, grey.device)
+        image = composite(projected, lists, view, background=behind, threads=threads)
+        gradients = backward(
+            *(grey, view, projected, lists, image),
+            colour_gradient=wp.array(colour, dtype=wp.vec3, device=grey.device),
+            alpha_gradient=None,
+            depth_gradient=None,
+            antialiased=False,
+            want_pose=False,
+            threads=threads,
+        )
+    by_colour = gradients.sh.numpy()[:, 0, :2].astype(np.float64) / _SH_0
+    visible = np.diff(projected.slot_end.numpy(), prepend=0) > 0
+    # -ln(alpha / opacity) = a u^2 + v w^2 integrates to pi / sqrt(a v).
+    a, (v, log_opacity) = projected.ellipse.numpy()[visible, 2], projected.falloff.numpy()[visible].T
+    unhidden = np.zeros(grey.count)
+    unhidden[visible] = np.exp(log_opacity) * np.pi / np.sqrt(a.astype(np.float64) * v)
+    return np.column_stack([by_colour, unhidden])

@@ -1,0 +1,304 @@
+"""The one training loop: Gaussians fitted to pictures (Kerbl et al. 2023; relocation after Kheradmand et al. 2024).
+
+Imports torch, so import it only where something is trained.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+import torch
+import warp as wp
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.render import render
+from egs_warp.render.autograd import render_torch
+from egs_warp.training.relocation import Population
+
+MIN_LOG_SCALE = -10.0
+"""Scales are kept at e^-10 or above, as in the paper."""
+
+
+class Densification(enum.Enum):
+    """How the number and places of Gaussians may change."""
+
+    NONE = "none"
+    """The same Gaussians throughout."""
+    RELOCATION = "relocation"
+    """Faint Gaussians move to where opaque ones are, the number grows to a cap, and means are jittered (MCMC)."""
+
+
+@dataclass(frozen=True)
+class TrainingView:
+    """One picture to be matched."""
+
+    camera: Camera
+    image: np.ndarray
+    """(H, W, 3) float32, 0 to 1, display-referred."""
+    alpha: np.ndarray | None = None
+    """(H, W) float32; where given, ``image`` holds colours not yet laid over a background."""
+    weight: np.ndarray | None = None
+    """(H, W) float32 at least 0, how much each pixel counts in the L1 loss; without it all count alike."""
+    name: str = ""
+    """Of the photo, for messages."""
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Step sizes of Adam by attribute; that of the means is times the scene's extent and decays to a hundredth."""
+
+    means: float = 1.6e-4
+    rotations: float = 1e-3
+    log_scales: float = 5e-3
+    opacity_logits: float = 5e-2
+    sh_band_0: float = 2.5e-3
+    sh_rest: float = 1.25e-4
+
+
+@dataclass(frozen=True)
+class FinetuneOptions:
+    """Everything that may be chosen about a training run."""
+
+    iterations: int = 1000
+    rates: Rates = field(default_factory=Rates)
+    ssim_weight: float = 0.2
+    """Loss = (1 - w) L1 + w (1 - SSIM)."""
+    background: tuple[float, float, float] | None = (1.0, 1.0, 1.0)
+    """One colour; None draws a random one each step, which needs views with alpha to make sense."""
+    densification: Densification = Densification.NONE
+    max_gaussians: int = 100_000
+    """The cap that relocation grows to."""
+    antialiased: bool = False
+    seed: int = 0
+    threads: int | None = None
+
+
+@dataclass(frozen=True)
+class GaussianTensors:
+    """The parameters under training, as leaf tensors in the terms of ``GaussianCloud``."""
+
+    means: torch.Tensor
+    """(n, 3)."""
+    rotations: torch.Tensor
+    """(n, 4)."""
+    log_scales: torch.Tensor
+    """(n, 3)."""
+    opacity_logits: torch.Tensor
+    """(n,)."""
+    sh_band_0: torch.Tensor
+    """(n, 1, 3)."""
+    sh_rest: torch.Tensor
+    """(n, K - 1, 3)."""
+
+
+@dataclass(frozen=True)
+class FinetuneResult:
+    """What training gave."""
+
+    cloud: GaussianCloud
+    losses: np.ndarray
+    """(iterations,) float64."""
+
+
+ExtraLoss = Callable[[GaussianTensors], torch.Tensor]
+
+
+def finetune(
+    cloud: GaussianCloud,
+    views: Sequence[TrainingView],
+    *,
+    options: FinetuneOptions | None = None,
+    extra_loss: ExtraLoss | None = None,
+    trainable: np.ndarray | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> FinetuneResult:
+    """Fit ``cloud`` to ``views`` by Adam, one view a step in shuffled rounds; a new cloud on the same device.
+
+    ``extra_loss`` adds to the loss from the parameters themselves (``L_seg`` of Eq. 21, for one). ``trainable`` (n,)
+    bool picks the Gaussians that may change; it cannot be combined with relocation. ``progress`` is called with the
+    step's number and loss. Raises ``UserError`` for views that do not fit their cameras and for a loss that is not
+    finite.
+    """
+    options = options or FinetuneOptions()
+    _check(cloud, views, options, trainable)
+    device = wp.device_to_torch(cloud.device)
+    generator = torch.Generator(device=device).manual_seed(options.seed)
+    order = np.random.default_rng(options.seed)
+    extent = scene_extent([view.camera for view in views], cloud)
+    population = Population(_tensors(cloud, device), vars(options.rates), extent=extent, generator=generator)
+    frozen = None if trainable is None else torch.as_tensor(~np.asarray(trainable, bool), device=device)
+    targets = [_Target.of(view, device) for view in views]
+    losses = np.zeros(options.iterations)
+    queue: list[int] = []
+    for step in range(options.iterations):
+        queue = queue or order.permutation(len(views)).tolist()
+        target = targets[queue.pop()]
+        background = options.background
+        if background is None:
+            background = tuple(torch.rand(3, generator=generator, device=device).tolist())
+        tensors = GaussianTensors(**population.tensors)
+        picture = render_torch(
+            *(tensors.means, tensors.rotations, tensors.log_scales, tensors.opacity_logits),
+            torch.cat([tensors.sh_band_0, tensors.sh_rest], dim=1),
+            target.camera,
+            background=background,
+            antialiased=options.antialiased,
+            threads=options.threads,
+        ).colour
+        loss = target.loss(picture, background, options.ssim_weight)
+        if extra_loss is not None:
+            loss = loss + extra_loss(tensors)
+        if options.densification is Densification.RELOCATION:
+            loss = loss + population.regularisation()
+        losses[step] = float(loss.detach())
+        if not np.isfinite(losses[step]):
+            raise UserError(f"finetune: the loss is not finite at step {step}; lower the rates or check the views")
+        loss.backward()
+        if frozen is not None:
+            for tensor in population.tensors.values():
+                if tensor.grad is not None:
+                    tensor.grad[frozen] = 0.0
+        population.step(decay=0.01 ** (step / max(options.iterations, 1)))
+        with torch.no_grad():
+            population.tensors["log_scales"].clamp_(min=MIN_LOG_SCALE)
+        if options.densification is Densification.RELOCATION:
+            population.evolve(step, options.iterations, options.max_gaussians)
+        if progress is not None:
+            progress(step, losses[step])
+    return FinetuneResult(_cloud(population.tensors), losses)
+
+
+def views_of_capture(
+    cloud: GaussianCloud,
+    cameras: Sequence[Camera],
+    *,
+    background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    antialiased: bool = False,
+) -> list[TrainingView]:
+    """Renders of the capture itself, to train against where the photos are not at hand."""
+    return [
+        TrainingView(
+            camera, np.clip(render(cloud, camera, background=background, antialiased=antialiased).colour.numpy(), 0, 1)
+        )
+        for camera in cameras
+    ]
+
+
+def scene_extent(cameras: Sequence[Camera], cloud: GaussianCloud) -> float:
+    """Length that the step size of the means is measured by: 1.1 times the cameras' radius, or the cloud's if smaller."""
+    centres = np.array([camera.centre for camera in cameras])
+    of_cameras = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
+    means = cloud.means.numpy()
+    of_cloud = 2.0 * float(np.linalg.norm(means - np.median(means, axis=0), axis=1).mean())
+    candidates = [value for value in (of_cameras, of_cloud) if value > 0]
+    return min(candidates) if candidates else 1.0
+
+
+def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Mean structural similarity of two pictures (H, W, 3) in 0 to 1: 11 x 11 Gaussian window, sigma 1.5, zero padding."""
+    offsets = torch.arange(-5.0, 6.0, device=a.device)
+    line = torch.exp(-(offsets**2) / (2 * 1.5**2))
+    line = line / line.sum()
+    stack = torch.cat([t.permute(2, 0, 1) for t in (a, b, a * a, b * b, a * b)])[None]
+    channels = stack.shape[1]
+    blurred = torch.nn.functional.conv2d(stack, line.expand(channels, 1, 1, 11), padding=(0, 5), groups=channels)
+    blurred = torch.nn.functional.conv2d(
+        blurred, line[:, None].expand(channels, 1, 11, 1), padding=(5, 0), groups=channels
+    )
+    mean_a, mean_b, aa, bb, ab = blurred[0].reshape(5, 3, *a.shape[:2])
+    c1, c2 = 0.01**2, 0.03**2
+    covariance = ab - mean_a * mean_b
+    variances = aa - mean_a**2 + bb - mean_b**2
+    return (
+        (2 * mean_a * mean_b + c1) * (2 * covariance + c2) / ((mean_a**2 + mean_b**2 + c1) * (variances + c2))
+    ).mean()
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    """Peak signal to noise ratio in dB of two pictures in 0 to 1; at most 100."""
+    return float(-10.0 * np.log10(max(float(np.mean((a.astype(np.float64) - b) ** 2)), 1e-10)))
+
+
+@dataclass(frozen=True)
+class _Target:
+    camera: Camera
+    image: torch.Tensor
+    alpha: torch.Tensor | None
+    weight: torch.Tensor | None
+
+    @classmethod
+    def of(cls, view: TrainingView, device: str) -> _Target:
+        def upload(values: np.ndarray | None) -> torch.Tensor | None:
+            return None if values is None else torch.as_tensor(values, dtype=torch.float32, device=device)
+
+        image = upload(view.image)
+        assert image is not None
+        return cls(view.camera, image, upload(view.alpha), upload(view.weight))
+
+    def loss(self, picture: torch.Tensor, background: Sequence[float], ssim_weight: float) -> torch.Tensor:
+        image = self.image
+        if self.alpha is not None:
+            alpha = self.alpha[:, :, None]
+            image = image * alpha + (1 - alpha) * torch.tensor(background, device=image.device)
+        off = (picture - image).abs()
+        if self.weight is not None:
+            off = off * self.weight[:, :, None]
+            # What does not count must not reach the windows of the similarity either.
+            picture = torch.where(self.weight[:, :, None] > 0, picture, image)
+        loss = (1 - ssim_weight) * off.mean()
+        if ssim_weight > 0:
+            loss = loss + ssim_weight * (1 - ssim(picture, image))
+        return loss
+
+
+def _check(
+    cloud: GaussianCloud, views: Sequence[TrainingView], options: FinetuneOptions, trainable: np.ndarray | None
+) -> None:
+    if not views:
+        raise UserError("finetune: there are no views; give at least one picture with its camera")
+    for number, view in enumerate(views):
+        shape = (view.camera.height, view.camera.width)
+        for name, values, expected in (
+            ("image", view.image, (*shape, 3)),
+            ("alpha", view.alpha, shape),
+            ("weight", view.weight, shape),
+        ):
+            if values is not None and (values.shape != expected or not np.isfinite(values).all()):
+                raise UserError(
+                    f"finetune: {name} of view {number} has shape {values.shape}, expected {expected} and finite"
+                )
+    if trainable is not None and np.shape(trainable) != (cloud.count,):
+        raise UserError(f"finetune: trainable has shape {np.shape(trainable)}, expected ({cloud.count},)")
+    if trainable is not None and options.densification is not Densification.NONE:
+        raise UserError("finetune: relocation moves every Gaussian; leave trainable or the densification out")
+
+
+def _tensors(cloud: GaussianCloud, device: str) -> dict[str, torch.Tensor]:
+    values = {
+        "means": cloud.means.numpy(),
+        "rotations": cloud.rotations.numpy(),
+        "log_scales": np.maximum(cloud.log_scales.numpy(), MIN_LOG_SCALE),
+        "opacity_logits": cloud.opacity_logits.numpy(),
+        "sh_band_0": cloud.sh.numpy()[:, :1],
+        "sh_rest": cloud.sh.numpy()[:, 1:],
+    }
+    assert set(values) == {f.name for f in fields(GaussianTensors)}
+    return {name: torch.tensor(array, device=device, requires_grad=True) for name, array in values.items()}
+
+
+def _cloud(tensors: dict[str, torch.Tensor]) -> GaussianCloud:
+    detached = {name: tensor.detach() for name, tensor in tensors.items()}
+    rotations = torch.nn.functional.normalize(detached["rotations"], dim=1)
+    sh = torch.cat([detached["sh_band_0"], detached["sh_rest"]], dim=1)
+    return GaussianCloud(
+        means=wp.from_torch(detached["means"].clone(), dtype=wp.vec3),
+        rotations=wp.from_torch(rotations, dtype=wp.vec4),
+        log_scales=wp.from_torch(detached["log_scales"].clone(), dtype=wp.vec3),
+        opacity_logits=wp.from_torch(detached["opacity_logits"].clone(), dtype=wp.float32),
+        sh=wp.from_torch(sh.contiguous(), dtype=wp.vec3),
+    )

@@ -1,0 +1,125 @@
+"""The command: bad input is one line and exit status 2, and loses nothing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from egs_warp.assets import pawn
+from egs_warp.cli import main
+from egs_warp.commands.flags import parse_plane, parse_up
+from egs_warp.errors import UserError
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.io import write_ply
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--distance", "nan"], "--distance nan: give a number of body heights from 0 to 10"),
+        (["--distance", "-1"], "--distance -1.0: give a number of body heights from 0 to 10"),
+        (["--height", "11"], "--height 11.0: give a number of body heights from 0 to 10"),
+        (["--height", "0"], "--height 0: a jump needs a height above 0 body heights"),
+        (["--frames", "0"], "--frames 0: give a whole number of at least 1"),
+        (["--size", "99999"], "--size 99999: give a number of pixels from 16 to 4096"),
+        (["--friction", "nan"], "--friction nan: give a Coulomb coefficient from 0 to 10"),
+        (["--friction", "-1"], "--friction -1.0: give a Coulomb coefficient from 0 to 10"),
+        (["--metres-per-unit", "-2"], "--metres-per-unit -2.0: give a positive number"),
+        (["--up", "w"], "--up w: give one of x, y, z, -x, -y, -z"),
+        (["--metres-per-unit", "1e-300"], "--metres-per-unit 1e-300: give a positive number, from 1e-9 to 1e9"),
+        (["--metres-per-unit", "1e300"], "--metres-per-unit 1e+300: give a positive number, from 1e-9 to 1e9"),
+        (["--plane", "0,0,0,1"], "give four finite numbers nx,ny,nz,d with a normal that is not zero"),
+        (["--plane", "1,2"], "--plane 1,2: give four numbers nx,ny,nz,d"),
+        (["--device", "tpu"], "--device tpu: this machine has cpu"),
+        (
+            ["--gravity-up", "1,2"],
+            "--gravity-up 1,2: give three numbers x,y,z or an axis as -y",
+        ),
+        ([], "nothing.ply"),
+    ],
+)
+def test_bad_input_is_one_line(
+    flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status = main(["animate", str(tmp_path / "nothing.ply"), "--out", str(tmp_path / "out"), *flags])
+    error = capsys.readouterr().err
+    assert status == 2
+    assert message in error
+    assert error.startswith("egs-warp: ") and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--object", "-1,-2.5,.5"], "nothing.ply: no such file"),
+        (["--object", "-.1,0,0,-.05,1,2"], "nothing.ply: no such file"),
+        (["--up", "-y", "--view-from", "-1,0,.5", "--plane", "-8e-05,0,1,-0.2"], "nothing.ply: no such file"),
+        (["--up", "-w"], "argument --up: expected one argument"),
+        (["--frames", "many"], "argument --frames: invalid int value: 'many'; see egs-warp animate --help"),
+        (["--nonsense"], "unrecognized arguments: --nonsense"),
+    ],
+)
+def test_values_may_begin_with_a_minus_and_wrong_flags_take_one_line(
+    flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        status = main(["animate", str(tmp_path / "nothing.ply"), "--out", str(tmp_path / "out"), *flags])
+    except SystemExit as stop:
+        status = stop.code
+    error = capsys.readouterr().err
+    assert status == 2
+    assert message in error
+    assert error.startswith("egs-warp") and error.count("\n") == 1
+
+
+def test_flat_object_leaves_an_earlier_result_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(0)
+    flat = np.column_stack([rng.uniform(-1, 1, (500, 2)), np.zeros(500)])
+    cloud = GaussianCloud.from_numpy(
+        flat, np.tile([1.0, 0, 0, 0], (500, 1)), np.full((500, 3), -6.0), np.full(500, 3.0), np.zeros((500, 1, 3))
+    )
+    write_ply(tmp_path / "flat.ply", cloud)
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "jump.mp4").write_bytes(b"precious")
+    status = main(["animate", str(tmp_path / "flat.ply"), "--up", "z", "--out", str(out)])
+    assert status == 2
+    assert "Traceback" not in capsys.readouterr().err
+    assert (out / "jump.mp4").read_bytes() == b"precious"
+    assert [path.name for path in out.iterdir()] == ["jump.mp4"]
+
+
+def test_own_muscles_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The picture shows what the file says; a fibre outside of the body is refused by name."""
+    thing = pawn()
+    write_ply(tmp_path / "pawn.ply", thing.cloud)
+    flags = ["muscles", str(tmp_path / "pawn.ply"), "--plot", str(tmp_path / "muscles.png")]
+    flags += ["--plane", ",".join(str(x) for x in (*thing.plane.normal, thing.plane.offset))]
+    foot = -thing.plane.offset * thing.plane.normal
+    for far, status in ((0.3, 0), (9.0, 2)):
+        ends = {"from": (foot + 0.1 * thing.plane.normal).tolist(), "to": (foot + far * thing.plane.normal).tolist()}
+        (tmp_path / "own.json").write_text(json.dumps({"fibres": [{"name": "spine", "kind": "longitudinal", **ends}]}))
+        assert main([*flags, "--muscles", str(tmp_path / "own.json")]) == status
+    said = capsys.readouterr()
+    assert "1 fibres, 4 segments" in said.out and 'fibre "spine"' in said.err
+    assert cv2.imread(str(tmp_path / "muscles.png")) is not None
+
+
+@pytest.mark.parametrize("name", ["a.xyz", "a", ".png"])
+def test_a_plot_needs_the_name_of_a_picture(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["muscles", str(tmp_path / "nothing.ply"), "--plot", str(tmp_path / name)]) == 2
+    error = capsys.readouterr().err
+    assert f"{name}: not the name of a picture; let it end in one of .png, .jpg" in error and error.count("\n") == 1
+
+
+def test_axes_and_planes_are_read() -> None:
+    assert np.array_equal(parse_up("-y"), [0.0, -1.0, 0.0])
+    assert np.array_equal(parse_up("+Z"), [0.0, 0.0, 1.0])
+    plane = parse_plane("0,2,0,-4")
+    assert np.array_equal(plane.normal, [0.0, 1.0, 0.0]) and plane.offset == -2.0
+    with pytest.raises(UserError, match="give one of x, y, z"):
+        parse_up("up")

@@ -1,0 +1,305 @@
+"""Contact (Eq. 3, 8, 9): which points may touch, their frames, and the exact Coulomb forces of a set of contacts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from egs_warp.contact.coulomb import coulomb_forces
+from egs_warp.contact.detection import (
+    ContactDetector,
+    ContactGeometry,
+    contact_geometry,
+    independent_contacts,
+    push_out_speeds,
+    tangent_directions,
+)
+from egs_warp.contact.terrain import Solid, step
+from egs_warp.deformation.embedding import embed_points
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.tetmesh import TetMesh
+from tests.support.meshes import block_mesh
+
+FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+GRAVITY = 9.81
+
+
+def surface_cloud(mesh: TetMesh, count: int, *, lowest: float = 0.0, scale: float = 0.01) -> GaussianCloud:
+    """Gaussians of random rotation scattered over the mesh's surface, means kept above ``lowest``."""
+    rng = np.random.default_rng(0)
+    faces = mesh.boundary_faces()
+    shares = rng.dirichlet([1.0, 1.0, 1.0], count)
+    means = np.einsum("ni,nij->nj", shares, mesh.nodes[faces[rng.integers(len(faces), size=count)]])
+    means[:, 2] = np.maximum(means[:, 2], lowest)
+    return GaussianCloud.from_numpy(
+        means,
+        rng.standard_normal((count, 4)),
+        np.log(scale * rng.uniform(0.3, 1.0, (count, 3))),
+        rng.uniform(-2, 3, count),
+        np.zeros((count, 1, 3)),
+        device="cpu",
+    )
+
+
+def seven_points(cloud: GaussianCloud, gamma: float = 3.0) -> np.ndarray:
+    """(n, 7, 3) mean and the six ends of T+ and T-, one Gaussian at a time (slow twin)."""
+    rows = []
+    for mean, (w, x, y, z), log_scale in zip(
+        cloud.means.numpy(), cloud.rotations.numpy(), cloud.log_scales.numpy(), strict=True
+    ):
+        axes = Rotation.from_quat([x, y, z, w]).as_matrix()
+        arms = [gamma * np.exp(float(s)) * axes[:, i] for i, s in enumerate(log_scale)]
+        rows.append([mean, *(mean + arm for arm in arms), *(mean - arm for arm in arms)])
+    return np.array(rows, dtype=np.float64)
+
+
+def test_hull_points_hold_the_lowest_of_all_points(device: str) -> None:
+    """Eq. (3), Eq. (8): over 50 deformations of the cage the least gap of the points kept is that of all 7 n points."""
+    mesh = block_mesh()
+    cloud = surface_cloud(mesh, 3000, lowest=0.05)
+    tilted = (FLOOR, Plane.from_coefficients(0.3, 0.1, 1.0, 0.4))
+    geometry = contact_geometry(cloud, mesh, tilted, device=device)
+    assert geometry.left_out == 0
+    all_points = embed_points(mesh, seven_points(cloud).reshape(-1, 3), device="cpu")
+    assert len(geometry.weights) < 0.25 * all_points.count
+    detector = ContactDetector(geometry, device=device)
+    weights, corners = all_points.weights.numpy(), all_points.nodes.numpy()
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        x = mesh.nodes @ rng.standard_normal((3, 3)) + 0.1 * rng.standard_normal(mesh.nodes.shape)
+        points = np.einsum("pw,pwi->pi", weights, x[corners])
+        lowest = min(plane.heights(points).min() for plane in tilted)
+        # Means are float32 on both sides, their sums are not in the same order.
+        assert detector.gaps(x)[0].min() == pytest.approx(lowest, abs=1e-6)
+
+
+def test_gaps_kernel_equals_its_twin(device: str) -> None:
+    """Eq. (8): gaps and nearest plane of every point against plain numpy."""
+    mesh = block_mesh()
+    planes = (FLOOR, Plane.from_coefficients(1.0, 0.2, 0.3, 0.5), Plane.from_coefficients(-1.0, 0.0, 0.5, 0.7))
+    geometry = contact_geometry(surface_cloud(mesh, 200, lowest=0.05), mesh, planes, device=device)
+    x = mesh.nodes + 0.2 * np.random.default_rng(2).standard_normal(mesh.nodes.shape)
+    points = np.einsum("pw,pwi->pi", geometry.weights, x[mesh.tets[geometry.tet_from_point]])
+    heights = np.stack([plane.heights(points) for plane in planes])
+    gaps, nearest = ContactDetector(geometry, device=device).gaps(x)
+    assert np.abs(gaps - heights.min(axis=0)).max() < 1e-13
+    assert np.array_equal(nearest, heights.argmin(axis=0)) and set(nearest) == {0, 1, 2}
+
+
+def test_gaps_to_a_step_and_a_wall_equal_their_twin(device: str) -> None:
+    """Eq. (8): a step (two faces) and a wall beside the floor; on the step its top counts, before it its riser."""
+    mesh = block_mesh()
+    low = mesh.nodes.min(axis=0)
+    size = np.ptp(mesh.nodes, axis=0)
+    stair = step(FLOOR, low + 0.5 * size, np.array([1.0, 0.0, 0.3]), 0.3 * size[2])
+    wall = Solid((Plane.from_coefficients(0.0, -1.0, 0.0, low[1] + 0.9 * size[1]),))
+    geometry = contact_geometry(surface_cloud(mesh, 300), mesh, (FLOOR,), solids=(stair, wall), device=device)
+    assert geometry.solid_from_plane == (0, 1, 1, 2) and len(geometry.planes) == 4
+    x = mesh.nodes + 0.2 * size * np.random.default_rng(2).standard_normal(mesh.nodes.shape)
+    points = np.einsum("pw,pwi->pi", geometry.weights, x[mesh.tets[geometry.tet_from_point]])
+    floor, top, riser, side = (plane.heights(points) for plane in geometry.planes)
+    expected = np.minimum(np.minimum(floor, np.maximum(top, riser)), side)
+    gaps, facing = ContactDetector(geometry, device=device).gaps(x)
+    assert np.abs(gaps - expected).max() < 1e-13
+    assert set(facing) == {0, 1, 2, 3}
+    on_top, before = facing == 1, facing == 2
+    assert (top[on_top] >= riser[on_top]).all() and (riser[before] > top[before]).all()
+    axes = ContactDetector(geometry, device=device).contact_set(np.flatnonzero(before), x).axes
+    assert np.allclose(axes[:, 0], [-1.0, 0.0, 0.0])
+
+
+def test_endpoints_are_shortened_to_the_plane_at_rest() -> None:
+    """Eq. (3): arms through the plane end on it, in their own direction; the others keep gamma sigma."""
+    mesh = block_mesh()
+    mean = np.array([[0.05, 0.02, 0.03]])
+    cloud = GaussianCloud.from_numpy(
+        mean, np.array([[1.0, 0, 0, 0]]), np.log([[0.01, 0.02, 0.05]]), np.zeros(1), np.zeros((1, 1, 3)), device="cpu"
+    )
+    geometry = contact_geometry(cloud, mesh, (FLOOR,), device="cpu")
+    points = np.einsum("pw,pwi->pi", geometry.weights, mesh.nodes[mesh.tets[geometry.tet_from_point]])
+    expected = mean + np.array(
+        [[0, 0, 0], [0.03, 0, 0], [-0.03, 0, 0], [0, 0.06, 0], [0, -0.06, 0], [0, 0, 0.15], [0, 0, -0.03]]
+    )
+    assert len(points) == 7
+    assert max(np.abs(points - e).max(axis=1).min() for e in expected) < 1e-7
+    crowd = contact_geometry(surface_cloud(mesh, 2000), mesh, (FLOOR,), device="cpu")
+    assert ContactDetector(crowd, device="cpu").gaps(mesh.nodes)[0].min() > -1e-8
+
+
+def test_gaussians_below_the_plane_are_left_out_and_counted() -> None:
+    """DESIGN 7: a Gaussian whose mean lies below the plane takes no part; its share of the opacity mass is reported."""
+    mesh = block_mesh()
+    means = np.array([[0.0, 0.0, 0.1], [0.1, 0.0, 0.5], [0.0, 0.1, -0.01]])
+    logits = np.log([1.0, 3.0, 0.25])
+    cloud = GaussianCloud.from_numpy(
+        means, np.tile([1.0, 0, 0, 0], (3, 1)), np.full((3, 3), -6.0), logits, np.zeros((3, 1, 3)), device="cpu"
+    )
+    geometry = contact_geometry(cloud, mesh, (FLOOR,), device="cpu")
+    assert geometry.left_out == 1
+    assert geometry.left_out_opacity == pytest.approx(0.2 / (0.5 + 0.75 + 0.2))
+    points = np.einsum("pw,pwi->pi", geometry.weights, mesh.nodes[mesh.tets[geometry.tet_from_point]])
+    assert len(points) == 14 and points[:, 2].min() > 0.05
+
+
+def test_contact_frame_maps_nodes_to_points(device: str) -> None:
+    """Eq. (8): frame rows give normal and tangential velocity of each point; axes are orthonormal; end gaps are linear."""
+    mesh = block_mesh()
+    slope = Plane.from_coefficients(0.4, -0.2, 1.0, 0.3)
+    geometry = contact_geometry(surface_cloud(mesh, 200, lowest=0.1), mesh, (slope,), device=device)
+    detector = ContactDetector(geometry, device=device)
+    chosen = np.array([3, 17, 5, 40])
+    contacts = detector.contact_set(chosen, mesh.nodes)
+    v = np.random.default_rng(3).standard_normal(mesh.nodes.shape)
+    local = (contacts.frame @ v.ravel()).reshape(-1, 3)
+    for i, point in enumerate(chosen):
+        velocity = geometry.weights[point] @ v[mesh.tets[geometry.tet_from_point[point]]]
+        assert np.allclose(contacts.axes[i] @ contacts.axes[i].T, np.eye(3), atol=1e-14)
+        assert np.allclose(local[i], contacts.axes[i] @ velocity, atol=1e-13)
+    moved, _ = detector.gaps(mesh.nodes + 0.01 * v)
+    assert np.allclose(contacts.end_gaps(0.01, v), moved[chosen], atol=1e-13)
+    head = contacts.head(2)
+    assert head.count == 2 and np.allclose((head.frame @ v.ravel()).reshape(-1, 3), local[:2])
+
+
+def test_candidates_keep_last_steps_points_and_the_lowest_of_each_tetrahedron() -> None:
+    mesh = block_mesh()
+    geometry = ContactGeometry(mesh, (FLOOR,), 0.8, np.array([0, 0, 1, 1, 2, 3]), np.full((6, 4), 0.25), 0, 0.0)
+    detector = ContactDetector(geometry, device="cpu")
+    gaps = np.array([0.004, 0.002, 0.001, 0.003, 0.5, 0.008])
+    assert detector.candidates(np.zeros(0, int), gaps, 0.01).tolist() == [2, 1, 5]
+    assert detector.candidates(np.array([3, 4]), gaps, 0.01).tolist() == [3, 1, 5]
+    assert detector.candidates(np.array([0]), np.array([0.015] + [1.0] * 5), 0.01).tolist() == [0]
+    assert detector.candidates(np.array([0]), np.array([0.021] + [1.0] * 5), 0.01).tolist() == []
+
+
+def test_independent_contacts_are_well_conditioned() -> None:
+    """Pivoted Cholesky: duplicates and dependent rows fall out, last step's points go first, the rest is spanned."""
+    rng = np.random.default_rng(4)
+    rows = rng.standard_normal((8, 12))
+    rows = np.vstack([rows, rows[2], rows[0] + rows[5], 2.0 * rows[7]])
+    compliance = rows @ rows.T
+    chosen = independent_contacts(compliance, 3, 32, 1e-6)
+    assert set(chosen[:3]) == {0, 1, 2} and len(chosen) == 8 == np.linalg.matrix_rank(rows)
+    assert np.linalg.matrix_rank(rows[chosen]) == 8
+    assert len(independent_contacts(compliance, 0, 5, 1e-6)) == 5
+    # Every point left out moves as a combination of the chosen ones.
+    part = np.linalg.lstsq(rows[chosen].T, rows.T, rcond=None)[0]
+    assert np.abs(rows[chosen].T @ part - rows.T).max() < 1e-9
+
+
+def test_push_out_speed_and_tangent_directions() -> None:
+    """Eq. (8): c = u_n + min(phi, 0) b / dt + max(phi, 0) / dt with b = 1/2, the push-out capped; D is a regular star."""
+    shift = push_out_speeds(np.array([0.02, 0.0, -0.004, -1.0]), 0.1, 0.3)
+    assert shift.tolist() == pytest.approx([0.2, 0.0, -0.02, -0.3])
+    for count in (4, 6, 8):
+        star = tangent_directions(count)
+        assert np.allclose(np.linalg.norm(star, axis=1), 1.0) and np.allclose(star.sum(axis=0), 0.0)
+        assert np.allclose(star.T @ star, count / 2 * np.eye(2))
+
+
+def assert_coulomb(
+    delassus: np.ndarray, free: np.ndarray, shift: np.ndarray, friction: float, force: np.ndarray, tolerance: float
+) -> None:
+    """Eq. (9) with the exact cone; ``tolerance`` in m/s."""
+    velocity = (free + delassus @ force.ravel()).reshape(-1, 3)
+    measure = velocity[:, 0] + shift
+    rate = 1.0 / np.diag(delassus).mean()
+    assert force[:, 0].min() >= 0.0
+    assert measure.min() >= -tolerance
+    assert (force[:, 0] * measure).max() <= tolerance * max(force[:, 0].max(), rate)
+    tangent = np.linalg.norm(force[:, 1:], axis=1)
+    assert (tangent - friction * force[:, 0]).max() <= 1e-12 * max(force[:, 0].max(), 1.0)
+    for f, t, u in zip(force, tangent, velocity[:, 1:], strict=True):
+        slip = np.linalg.norm(u)
+        # Maximal dissipation: slip only on the cone, straight against the force.
+        if slip > 10 * tolerance and f[0] > 10 * tolerance * rate:
+            assert t == pytest.approx(friction * f[0], rel=1e-4, abs=tolerance * rate)
+            assert f[1:] @ u == pytest.approx(-t * slip, rel=1e-4, abs=tolerance**2 * rate)
+
+
+@pytest.mark.parametrize(("count", "unknowns"), [(1, 6), (4, 20), (12, 60), (12, 24), (40, 150), (40, 60)])
+@pytest.mark.parametrize("friction", [0.0, 0.3, 0.8])
+def test_coulomb_forces_on_random_problems(count: int, unknowns: int, friction: float) -> None:
+    """Eq. (8), Eq. (9): complementarity and exact cone; with fewer unknowns than rows G is singular, and one contact is doubled."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        rows = rng.standard_normal((3 * count, unknowns)) * rng.uniform(0.3, 2.0, unknowns)
+        if count > 1:
+            rows[-3:] = rows[:3]
+        # All normals share a component, as on a floor, so that some motion separates every contact.
+        rows[0::3, 0] = 4.0 + np.abs(rows[0::3, 0])
+        falling = rng.standard_normal(unknowns) - 2.0 * np.eye(unknowns)[0]
+        shift = rng.uniform(-0.1, 0.3, count)
+        if count > 1:
+            shift[-1] = shift[0]
+        delassus = rows @ rows.T / unknowns
+        delassus[np.diag_indices_from(delassus)] += 1e-7 * delassus.diagonal().mean()
+        free = rows @ falling
+        force, residual = coulomb_forces(delassus, free, shift, friction, np.zeros((count, 3)))
+        assert residual < 1e-7
+        assert_coulomb(delassus, free, shift, friction, force, 1e-6)
+        assert force[:, 0].max() > 0.0
+
+
+def block_on_incline(angle: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(delassus, speed per second of gravity, arms) of a rigid unit block of 2 kg on its four corners on an incline."""
+    mass, inertia = 2.0, 2.0 / 6.0 * np.eye(3)
+    arms = np.array([[x, y, -0.5] for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
+    axes = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    jacobian = np.vstack([np.hstack([axes, np.cross(arm, axes)]) for arm in arms])
+    mobility = np.zeros((6, 6))
+    mobility[:3, :3], mobility[3:, 3:] = np.eye(3) / mass, np.linalg.inv(inertia)
+    pull = GRAVITY * np.array([np.sin(angle), 0.0, -np.cos(angle), 0.0, 0.0, 0.0])
+    return jacobian @ mobility @ jacobian.T, jacobian @ pull, np.hstack([arms, np.zeros((4, 3))])
+
+
+def test_block_on_an_incline() -> None:
+    """Eq. (9), closed form: sticks while tan < mu, else slides with a = g (sin - mu cos) and friction mu m g cos uphill."""
+    friction, dt = 0.5, 0.01
+    for angle in np.radians([5.0, 20.0, 26.0, 27.2, 35.0, 42.0]):
+        delassus, acceleration, _ = block_on_incline(angle)
+        force, residual = coulomb_forces(delassus, dt * acceleration, np.zeros(4), friction, np.zeros((4, 3)))
+        assert residual < 1e-10
+        velocity = (dt * acceleration + delassus @ force.ravel()).reshape(-1, 3)
+        slide = max(GRAVITY * (np.sin(angle) - friction * np.cos(angle)), 0.0)
+        assert velocity[:, 1] == pytest.approx(dt * slide, abs=1e-9)
+        assert velocity[:, [0, 2]] == pytest.approx(0.0, abs=1e-9)
+        assert force[:, 0].sum() == pytest.approx(2.0 * GRAVITY * np.cos(angle) * dt)
+        hold = min(np.sin(angle), friction * np.cos(angle))
+        assert force[:, 1].sum() == pytest.approx(-2.0 * GRAVITY * hold * dt)
+
+
+def test_separating_and_absent_contacts_need_no_force() -> None:
+    """Eq. (9): a body that leaves the ground, or has no contact, gets none."""
+    delassus, acceleration, _ = block_on_incline(0.0)
+    force, _ = coulomb_forces(delassus, -acceleration, np.zeros(4), 0.5, np.ones((4, 3)))
+    assert np.abs(force).max() < 1e-12
+    none, residual = coulomb_forces(np.zeros((0, 0)), np.zeros(0), np.zeros(0), 0.5, np.zeros((0, 3)))
+    assert none.shape == (0, 3) and residual == 0.0
+
+
+@pytest.mark.parametrize("regularisation", [0.0, 1e-7])
+def test_coulomb_forces_of_forty_points_under_a_rigid_base(regularisation: float) -> None:
+    """Eq. (9): 120 rows of rank 6, sticking, sliding and spinning; all forty touch and the net wrench obeys Coulomb."""
+    rng = np.random.default_rng(5)
+    mass, inertia = 2.0, np.diag([0.3, 0.4, 0.2])
+    arms = np.column_stack([rng.uniform(-0.5, 0.5, (40, 2)), np.full(40, -0.5)])
+    axes = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    jacobian = np.vstack([np.hstack([axes, np.cross(arm, axes)]) for arm in arms])
+    mobility = np.zeros((6, 6))
+    mobility[:3, :3], mobility[3:, 3:] = np.eye(3) / mass, np.linalg.inv(inertia)
+    delassus = jacobian @ mobility @ jacobian.T
+    delassus[np.diag_indices_from(delassus)] += regularisation * delassus.diagonal().mean()
+    for twist in (
+        [0, 0, -0.16, 0, 0, 0],
+        [0.05, 0.02, -0.16, 0, 0, 0],
+        [0.5, 0, -0.16, 0, 0, 3.0],
+        [0, 0, -1, 1, 2, 0],
+    ):
+        free = jacobian @ np.array(twist, dtype=float)
+        force, residual = coulomb_forces(delassus, free, np.zeros(40), 0.5, np.zeros((40, 3)))
+        assert residual < 1e-7
+        assert_coulomb(delassus, free, np.zeros(40), 0.5, force, 1e-6)
+        assert force[:, 0].sum() > 0.5 * mass * -twist[2]

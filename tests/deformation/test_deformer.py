@@ -1,0 +1,314 @@
+"""Eq. (14) to (16): Gaussians carried by the cage."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from egs_warp.deformation.deformer import Deformer, deform
+from egs_warp.deformation.embedding import CageLocator, embed_gaussians
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.kernels.deformation.spherical_harmonics import rotate_sh_kernel
+from egs_warp.launching import launch_rows
+from egs_warp.render import render
+from tests.support.carrying_scenes import bent, box, covariances, matrices, random_cloud
+
+
+def colours(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """(n, 3) linear colour seen along unit ``direction`` (n, 3), as the INRIA renderer evaluates it."""
+    x, y, z = direction.T
+    basis = [
+        0.28209479177387814 + 0 * x,
+        -0.4886025119029199 * y,
+        0.4886025119029199 * z,
+        -0.4886025119029199 * x,
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2 * z * z - x * x - y * y),
+        -1.0925484305920792 * x * z,
+        0.5462742152960396 * (x * x - y * y),
+        -0.5900435899266435 * y * (3 * x * x - y * y),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
+        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+        -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
+        1.445305721320277 * z * (x * x - y * y),
+        -0.5900435899266435 * x * (x * x - 3 * y * y),
+    ]
+    return np.einsum("kn,nkc->nc", np.array(basis[: sh.shape[1]]), sh)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_turned_cage_turns_shape_and_colour_exactly(device: str, degree: int) -> None:
+    """Eq. (14), (15): under a rotation the covariance turns, and every band of colour seen from a turned eye stays."""
+    mesh, cloud = box(), random_cloud(300, degree=degree, device=device)
+    turn = Rotation.from_rotvec([0.7, -2.1, 0.4]).as_matrix()
+    result = deform(cloud, embed_gaussians(cloud, mesh), mesh.nodes @ turn.T + [3.0, 1.0, -2.0])
+    np.testing.assert_allclose(result.cloud.means.numpy(), cloud.means.numpy() @ turn.T + [3, 1, -2], atol=1e-5)
+    np.testing.assert_allclose(np.exp(result.cloud.log_scales.numpy() - cloud.log_scales.numpy()), 1.0, atol=2e-5)
+    np.testing.assert_allclose(matrices(result.cloud), turn @ matrices(cloud), atol=1e-5)
+    views = np.random.default_rng(5).normal(size=(300, 3))
+    views /= np.linalg.norm(views, axis=1, keepdims=True)
+    seen = colours(cloud.sh.numpy().astype(np.float64), views)
+    turned = colours(result.cloud.sh.numpy().astype(np.float64), views @ turn.T)
+    np.testing.assert_allclose(turned, seen, atol=2e-5)
+
+
+def test_colour_turns_exactly_where_euler_angles_are_arbitrary(device: str) -> None:
+    """Eq. (15): turns about z alone, by half a turn about axes across it, by nothing, and by nearly each of them."""
+    half = [np.pi * np.array([np.cos(a), np.sin(a), 0.0]) for a in (0.0, 0.5 * np.pi, 1.1)]
+    near = np.array([1e-9, -3e-5, 2e-4])
+    vectors = np.array(
+        [v + e for v in (np.zeros(3), np.array([0.0, 0.0, 2.3]), *half) for e in (0.0 * near, near, near[::-1])]
+    )
+    turns = Rotation.from_rotvec(vectors)
+    sh = np.random.default_rng(3).normal(size=(len(vectors), 16, 3))
+    result = wp.zeros((len(vectors), 16), dtype=wp.vec3, device=device)
+    launch_rows(
+        rotate_sh_kernel,
+        len(vectors),
+        inputs=[
+            wp.array(turns.as_quat(scalar_first=True), dtype=wp.vec4, device=device),
+            wp.array(sh, dtype=wp.vec3, device=device),
+            3,
+        ],
+        outputs=[result],
+        device=result.device,
+    )
+    turned = result.numpy().astype(np.float64)
+    turned[:, 0] = sh[:, 0]
+    for view in np.eye(3):
+        views = np.tile(view, (len(vectors), 1))
+        np.testing.assert_allclose(colours(turned, turns.apply(views)), colours(sh, views), atol=1e-5)
+
+
+def test_turning_the_object_is_turning_the_camera(device: str) -> None:
+    """Eq. (15): the picture of the turned object is that of the object seen by a camera turned the other way, to 1e-4 in linear
+    colour, with bands 1 to 3 at full strength."""
+    mesh, cloud = box(), random_cloud(300, degree=3, device=device)
+    turn = Rotation.from_rotvec([0.7, -2.1, 0.4]).as_matrix()
+    turned = deform(cloud, embed_gaussians(cloud, mesh), mesh.nodes @ turn.T).cloud
+    middle, eye, up = np.full(3, 0.5), np.array([2.2, 0.9, 1.4]), np.array([0.0, 0.0, 1.0])
+    pictures = [
+        render(each, Camera.look_at(r @ eye, r @ middle, r @ up, width=96, height=96)).colour.numpy()
+        for each, r in ((cloud, np.eye(3)), (turned, turn))
+    ]
+    difference = np.abs(pictures[0] - pictures[1])
+    assert pictures[0].max() - pictures[0].min() > 0.5
+    # A splat that is cut at 1/255 in one picture and just not in the other differs by more; it is one in ten thousand.
+    assert np.percentile(difference, 99.9) < 1e-4
+    assert difference.max() < 4e-3 * np.abs(pictures[0]).max()
+
+
+def test_an_affine_cage_carries_flat_splats_exactly(device: str) -> None:
+    """Eq. (14), (15): Sigma' = F Sigma F^T to float32, for scales from e^-16 to a quarter of the body; det R = +1, and
+    axes matched in order and sign to the carried ones."""
+    mesh, rng = box((5, 5, 5)), np.random.default_rng(3)
+    count = 400
+    cloud = GaussianCloud.from_numpy(
+        rng.uniform(0.0, 1.0, (count, 3)),
+        rng.normal(size=(count, 4)),
+        rng.uniform(-16.0, np.log(0.25), (count, 3)),
+        rng.normal(size=count),
+        rng.normal(size=(count, 1, 3)),
+        device=device,
+    )
+    gradient = np.array([[1.3, 0.4, 0.0], [-0.2, 0.8, 0.3], [0.1, 0.0, 1.1]])
+    embedding = embed_gaussians(cloud, mesh)
+    weights = embedding.points.weights.numpy().reshape(count, 7, 4)
+    shortened = embedding.arms.numpy() < 1.73 * np.tile(np.exp(cloud.log_scales.numpy()), (1, 2))
+    assert 0.001 < shortened.mean() < 0.6
+    assert weights[:, 1:].min() >= -1.0 and weights.max() <= 2.0
+    result = deform(cloud, embedding, mesh.nodes @ gradient.T).cloud
+    expected = np.sort(
+        np.linalg.svd(gradient @ matrices(cloud) * np.exp(cloud.log_scales.numpy().astype(float))[:, None])[1]
+    )
+    scales = np.exp(result.log_scales.numpy().astype(float))
+    np.testing.assert_allclose(np.sort(scales), expected, rtol=3e-4)
+    sigma, exact = covariances(result), gradient @ covariances(cloud) @ gradient.T
+    error = np.abs(sigma - exact).max(axis=(1, 2)) / np.abs(exact).max(axis=(1, 2))
+    assert error.max() < 2e-5
+    np.testing.assert_allclose(np.linalg.det(matrices(result)), 1.0, atol=1e-6)
+    left, _, right = np.linalg.svd(gradient)
+    carried = left @ right @ matrices(cloud)
+    assert np.einsum("nij,nij->nj", matrices(result), carried).sum(axis=1).min() > 2.0
+
+
+def test_arms_go_where_their_ends_go(device: str) -> None:
+    """Eq. (14): (F+ + F-)/2 from the carried ends, in float64, gives the carried covariance: for ends in the same tetrahedron, in the
+    next one and beyond, where the cage is bent and shaken."""
+    mesh, cloud = box((4, 4, 4)), random_cloud(400, degree=0, scale=0.15, device=device)
+    rng = np.random.default_rng(2)
+    positions = bent(mesh.nodes, 1.0) + 0.02 * rng.normal(size=mesh.nodes.shape)
+    embedding = embed_gaussians(cloud, mesh)
+    result = deform(cloud, embedding, positions, max_stretch=1e9).cloud
+    nodes, weights = embedding.points.nodes.numpy(), embedding.points.weights.numpy()
+    ends = np.einsum("pk,pki->pi", weights, positions[nodes]).reshape(-1, 7, 3)
+    arms = embedding.arms.numpy().astype(float)
+    axes = matrices(cloud)
+    plus = (ends[:, 1:4] - ends[:, :1]) / arms[:, :3, None]
+    minus = (ends[:, :1] - ends[:, 4:]) / arms[:, 3:, None]
+    gradient = 0.5 * (plus + minus).transpose(0, 2, 1) @ axes.transpose(0, 2, 1)
+    sigma = gradient @ covariances(cloud) @ gradient.transpose(0, 2, 1)
+    tets = embedding.points.tets.numpy().reshape(-1, 7)
+    shared = (mesh.tets[tets][:, 1:, :, None] == mesh.tets[tets][:, :1, None, :]).any(axis=3).sum(axis=2)
+    assert (shared == 4).any() and (shared == 3).any() and (shared < 3).any()
+    # An arm too short for a difference of float32 positions takes the middle of the two gradients instead.
+    exact = (np.linalg.det(gradient) > 0.05) & ~((shared < 3) & (arms < 2e-3)).any(axis=1)
+    assert exact.mean() > 0.9
+    error = np.abs(covariances(result) - sigma).max(axis=(1, 2)) / np.abs(sigma).max(axis=(1, 2))
+    assert error[exact].max() < 2e-4
+
+
+def test_bend_angle_is_the_angle_between_the_arms(device: str) -> None:
+    """Eq. (16): a needle whose two arms are bent by 40 degrees reads 40, not half; one across it reads nothing."""
+    mesh = box((24, 2, 2), (4.0, 0.4, 0.4))
+    scales = np.log([[0.4, 0.004, 0.004], [0.004, 0.05, 0.004], [0.4, 0.4 / 3, 0.004]])
+    means = np.tile([2.0, 0.2, 0.2], (3, 1))
+    cloud = GaussianCloud.from_numpy(
+        means, np.tile([1, 0, 0, 0], (3, 1)), scales, np.zeros(3), np.zeros((3, 1, 3)), device=device
+    )
+    # A chord over the arc of one arm (1.2 m) turns by half that arc on each side: 1.2 / radius in all.
+    radius = 1.2 / np.radians(40.0)
+    deformer = Deformer(cloud, embed_gaussians(cloud, mesh, gamma=3.0))
+    measure = deformer.measure_bend([mesh.nodes, bent(mesh.nodes, radius)])
+    assert measure.bend_degrees[0] == pytest.approx(40.0, abs=1.0)
+    assert measure.bend_degrees[1] < 4.0
+    assert measure.bend_degrees[2] == pytest.approx(40.0, rel=0.15)
+    assert np.argmax(measure.fit_error[0]) == 0
+    # The sagitta of the arc at one standard deviation, s^2 / 2 radius, is what an affine map leaves out.
+    assert measure.fit_error[0, 0] == pytest.approx(0.4**2 / (2 * radius), rel=0.1)
+    assert measure.curl_degrees[0, 0] == pytest.approx(40.0, abs=1.0)
+    assert deformer.measure_bend([mesh.nodes]).bend_degrees.max() < 0.05
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    noise=st.sampled_from([0.0, 0.05, 0.3, 2.0]),
+    flatten=st.sampled_from([1.0, 1e-3, 0.0, -1.0]),
+    reach=st.sampled_from([0.0, 0.5, 30.0]),
+)
+def test_no_spike_and_no_nan_whatever_the_cage_does(seed: int, noise: float, flatten: float, reach: float) -> None:
+    """Eq. (14): inverted and flattened tetrahedra, far ends, means far outside, scales from e^-16 to a quarter of the
+    body: all finite, proper rotations, and no Gaussian is stretched more than the matter around it allows."""
+    rng = np.random.default_rng(seed)
+    mesh, count = box((2, 2, 2)), 60
+    cloud = GaussianCloud.from_numpy(
+        rng.uniform(-reach, 1.0 + reach, (count, 3)),
+        rng.normal(size=(count, 4)),
+        rng.uniform(-16.0, np.log(0.25), (count, 3)),
+        np.zeros(count),
+        rng.normal(size=(count, 16, 3)),
+        device="cpu",
+    )
+    cage = CageLocator(mesh, device="cpu")
+    positions = mesh.nodes * [1.0, 1.0, flatten] + noise * rng.normal(size=mesh.nodes.shape)
+    embedding = embed_gaussians(cloud, cage)
+    result = deform(cloud, embedding, positions)
+    for values in (result.cloud.means, result.cloud.rotations, result.cloud.log_scales, result.cloud.sh, result.turns):
+        assert np.isfinite(values.numpy()).all()
+    np.testing.assert_allclose(np.linalg.norm(result.cloud.rotations.numpy(), axis=1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(result.turns.numpy(), axis=1), 1.0, atol=1e-5)
+    corners, rest = positions[mesh.tets], mesh.nodes[mesh.tets]
+    edges, rest_edges = ((x[:, 1:] - x[:, :1]).transpose(0, 2, 1) for x in (corners, rest))
+    stretch = np.linalg.svd(edges @ np.linalg.inv(rest_edges))[1][:, 0]
+    around = stretch[embedding.points.tets.numpy().reshape(count, 7)].max(axis=1)
+    grown = np.exp(result.cloud.log_scales.numpy().max(axis=1) - cloud.log_scales.numpy().max(axis=1))
+    # Columns are held to 1.5 times the stretch; three of them can conspire to sqrt(3) times that.
+    assert (grown <= 1.5 * np.sqrt(3.0) * around + 1e-3).all()
+    weights = embedding.points.weights.numpy().reshape(count, 7, 4)[:, 0]
+    far = (weights.min(axis=1) < -1.0) | (weights.max(axis=1) > 2.0)
+    if reach == 30.0:
+        assert far.mean() > 0.9
+    np.testing.assert_allclose(result.cloud.log_scales.numpy()[far], cloud.log_scales.numpy()[far], atol=1e-3)
+
+
+def test_the_mean_goes_where_the_mass_goes(device: str) -> None:
+    """Eq. (14) and beyond: the carried mean of a long Gaussian is the mean of its carried mass, sampled here."""
+    mesh = box((24, 2, 2), (4.0, 0.4, 0.4))
+    scales = np.array([0.3, 0.02, 0.03])
+    cloud = GaussianCloud.from_numpy(
+        np.array([[2.0, 0.2, 0.2]]),
+        np.array([[1.0, 0, 0, 0]]),
+        np.log(scales)[None],
+        np.zeros(1),
+        np.zeros((1, 1, 3)),
+        device=device,
+    )
+    result = deform(cloud, embed_gaussians(cloud, mesh), bent(mesh.nodes, 2.0))
+    samples = bent(np.random.default_rng(0).normal(size=(200_000, 3)) * scales + [2.0, 0.2, 0.2], 2.0)
+    point = bent(np.array([[2.0, 0.2, 0.2]]), 2.0)[0]
+    shift = samples.mean(axis=0) - point
+    assert np.linalg.norm(shift) > 0.02
+    assert np.linalg.norm(result.cloud.means.numpy()[0] - point - shift) < 0.15 * np.linalg.norm(shift)
+
+
+def test_scale_and_rotation_do_not_flicker() -> None:
+    """Eq. (15): under a slow twist by 360 degrees with stretch, axes keep their order and move a little every frame."""
+    mesh, cloud = box(), random_cloud(200, degree=0)
+    # Twice the stretch apart: nearer ones may rightly swap as fast as they please.
+    scales = np.random.default_rng(1).permuted(np.tile(np.log([0.06, 0.03, 0.01]), (200, 1)), axis=1)
+    cloud = GaussianCloud.from_numpy(
+        cloud.means.numpy(),
+        cloud.rotations.numpy(),
+        scales,
+        cloud.opacity_logits.numpy(),
+        cloud.sh.numpy(),
+        device="cpu",
+    )
+    deformer = Deformer(cloud, embed_gaussians(cloud, mesh))
+    previous = None
+    for angle in np.linspace(0.0, 2 * np.pi, 121):
+        turn = Rotation.from_rotvec([0, 0, angle]).as_matrix()
+        stretch = np.diag([1.0 + 0.2 * np.sin(angle), 1.0, 1.0 - 0.1 * np.sin(angle)])
+        frame = matrices(deformer.deform(mesh.nodes @ (turn @ stretch).T).cloud)
+        if previous is not None:
+            assert np.einsum("nij,nij->nj", frame, previous).min() > np.cos(np.radians(10.0))
+        previous = frame
+
+
+def test_a_wrong_number_of_nodes_is_refused() -> None:
+    mesh, cloud = box(), random_cloud(5)
+    with pytest.raises(UserError, match=r"^deformation: 7 node positions for a cage of 64 nodes$"):
+        deform(cloud, embed_gaussians(cloud, mesh), np.zeros((7, 3)))
+
+
+def test_far_outside_nothing_bends_or_stretches(device: str) -> None:
+    """Eq. (14), (16): a Gaussian that floats far from the cage goes with the nearest tetrahedron as a rigid body."""
+    mesh = box()
+    cloud = random_cloud(50, degree=0, device=device)
+    far = GaussianCloud.from_numpy(
+        cloud.means.numpy() + [8.0, 0.0, 0.0],
+        cloud.rotations.numpy(),
+        cloud.log_scales.numpy(),
+        cloud.opacity_logits.numpy(),
+        cloud.sh.numpy(),
+        device=device,
+    )
+    positions = mesh.nodes * [1.0, 3.0, 0.2] + 0.05 * np.random.default_rng(0).normal(size=mesh.nodes.shape)
+    deformer = Deformer(far, embed_gaussians(far, mesh))
+    result = deformer.deform(positions).cloud
+    np.testing.assert_allclose(np.exp(result.log_scales.numpy() - far.log_scales.numpy()), 1.0, atol=1e-4)
+    assert np.linalg.norm(result.means.numpy() - far.means.numpy(), axis=1).max() < 12.0
+    assert deformer.measure_bend([positions]).fit_error.max() == 0.0
+
+
+@pytest.mark.cuda
+@pytest.mark.parametrize("count", [1, 31, 1000])
+def test_one_pass_on_cuda_equals_two_on_the_cpu(count: int) -> None:
+    """Eq. (14), (15): shape and degree 3 colour in one kernel, for counts that leave the last warp part empty."""
+    mesh, cloud = box((6, 6, 6)), random_cloud(count)
+    positions = bent(mesh.nodes, 1.0)
+    expected = deform(cloud, embed_gaussians(cloud, mesh), positions)
+    there = random_cloud(count, device="cuda:0")
+    result = deform(there, embed_gaussians(there, mesh), positions)
+    np.testing.assert_allclose(result.cloud.means.numpy(), expected.cloud.means.numpy(), atol=2e-6)
+    np.testing.assert_allclose(covariances(result.cloud), covariances(expected.cloud), atol=1e-6)
+    np.testing.assert_allclose(result.cloud.sh.numpy(), expected.cloud.sh.numpy(), atol=1e-4)

@@ -1,0 +1,83 @@
+"""The soft body: mass, momenta, energy, best-fit rotation, and the elasticity and damping that follow from its height."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.linalg as dense
+import scipy.sparse as sparse
+from scipy.spatial.transform import Rotation
+
+from egs_warp.errors import UserError
+from egs_warp.fem.body import GRAVITY, SoftBody, make_body
+from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.tetmesh import TetMesh
+from tests.support.meshes import block_mesh
+
+FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+
+
+@pytest.fixture(scope="module")
+def body() -> SoftBody:
+    return make_body(block_mesh(), FLOOR, sag=0.03, device="cpu")
+
+
+def test_material_follows_from_height() -> None:
+    """DESIGN 4: E = rho g H / sag, for any size and any up."""
+    for size, normal in ((0.3, [0.0, 0.0, 1.0]), (2.0, [0.0, 1.0, 0.0])):
+        mesh = block_mesh(size=(0.4 * size, 0.4 * size, size))
+        made = make_body(mesh, Plane(np.array(normal), 0.1), sag=0.03, density=800.0, device="cpu")
+        height = np.ptp(mesh.nodes @ normal)
+        assert made.height == pytest.approx(height)
+        assert made.assembly.material.young_modulus == pytest.approx(800.0 * GRAVITY * height / 0.03)
+        assert np.allclose(made.gravity, -GRAVITY * np.array(normal))
+        assert made.mass == pytest.approx(800.0 * mesh.volumes().sum())
+        assert made.weight == pytest.approx(made.mass * GRAVITY)
+
+
+def test_damping_ratio_of_the_first_mode(body: SoftBody) -> None:
+    """Eq. (6): beta = 2 zeta / omega_1, omega_1 from a dense eigenvalue problem of the body held at its base."""
+    upper = body.assembly.matrix(body.assembly.matrix_entries(body.mesh.nodes))
+    free = np.repeat(body.mesh.nodes[:, 2] > 0.05 * body.height, 3)
+    stiffness = (upper + sparse.triu(upper, 1).T).toarray()[free][:, free]
+    omega = np.sqrt(dense.eigh(stiffness, np.diag(np.repeat(body.node_mass, 3)[free]), eigvals_only=True)[0])
+    assert body.assembly.material.damping_time == pytest.approx(2 * 0.05 / omega, rel=1e-8)
+
+
+def test_momenta_of_a_rigid_motion(body: SoftBody) -> None:
+    """For v = u + omega x (x - c): the centre moves with u, L = I omega, kinetic energy = m u^2/2 + omega . I omega / 2."""
+    x = body.mesh.nodes @ Rotation.from_rotvec([0.1, 0.7, -0.4]).as_matrix().T + [0.3, 0.2, 1.0]
+    centre = body.centre_of_mass(x)
+    u, omega = np.array([1.0, -0.5, 2.0]), np.array([0.3, 1.1, -0.7])
+    v = u + np.cross(omega, x - centre)
+    assert np.allclose(body.centre_of_mass(v), u, atol=1e-13)
+    inertia = np.zeros((3, 3))
+    for m, arm in zip(body.node_mass, x - centre, strict=True):
+        inertia += m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    assert np.allclose(body.inertia(x), inertia)
+    assert np.allclose(body.angular_momentum(x, v), inertia @ omega)
+    kinetic = 0.5 * body.mass * u @ u + 0.5 * omega @ inertia @ omega
+    potential = body.mass * GRAVITY * centre[2]
+    assert body.mechanical_energy(x, v) == pytest.approx(kinetic + potential, rel=1e-9)
+
+
+def test_best_fit_rotation_recovers_a_turn(body: SoftBody) -> None:
+    """Exact for a turned stretch along the body's own axis; proper even for a mirrored body."""
+    turn = Rotation.from_rotvec([0.4, -1.9, 0.8]).as_matrix()
+    centred = body.mesh.nodes - body.centre_of_mass(body.mesh.nodes)
+    assert np.allclose(body.best_fit_rotation(centred @ turn.T + [1.0, 2.0, 3.0]), turn, atol=1e-12)
+    spread = np.einsum("n,ni,nj->ij", body.node_mass, centred, centred)
+    _, axes = np.linalg.eigh(spread)
+    stretch = axes @ np.diag([0.8, 1.1, 1.5]) @ axes.T
+    assert np.allclose(body.best_fit_rotation(centred @ (turn @ stretch).T), turn, atol=1e-10)
+    mirrored = body.best_fit_rotation(centred * [-1.0, 1.0, 1.0])
+    assert np.linalg.det(mirrored) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-4, 1e5])
+def test_a_height_that_no_body_has_is_refused(scale: float) -> None:
+    mesh = block_mesh()
+    with pytest.raises(
+        UserError, match=r"--metres-per-unit: the body is .* m high; choose it so that this is from 0.001"
+    ):
+        make_body(TetMesh(mesh.nodes * scale, mesh.tets), FLOOR, device="cpu")

@@ -1,0 +1,134 @@
+"""Eq. (5): Neo-Hookean elasticity against finite differences, closed forms and symmetries."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sparse
+from scipy.spatial.transform import Rotation
+
+from egs_warp.fem.elasticity import ElasticAssembly, Material
+from egs_warp.geometry.tetmesh import TetMesh
+from tests.support.meshes import block_mesh
+
+MATERIAL = Material(young_modulus=3.0e4, poisson_ratio=0.4, density=1000.0, damping_time=0.01)
+
+
+def full(assembly: ElasticAssembly, entries: np.ndarray) -> np.ndarray:
+    upper = assembly.matrix(entries).toarray()
+    return upper + np.triu(upper, 1).T
+
+
+DT = 1 / 60
+
+
+@pytest.fixture
+def bent(device: str) -> tuple[ElasticAssembly, np.ndarray]:
+    mesh = block_mesh()
+    rng = np.random.default_rng(1)
+    x = mesh.nodes @ Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix().T
+    x = x * [1.0, 0.9, 1.1] + 0.008 * rng.standard_normal(x.shape)
+    assembly = ElasticAssembly(mesh, MATERIAL, device=device)
+    assembly.begin_step(x @ Rotation.from_rotvec([0.1, 0.0, 0.3]).as_matrix() + 0.006 * rng.standard_normal(x.shape))
+    assert assembly.determinants(x).min() > 0.1
+    return assembly, x
+
+
+@pytest.mark.parametrize("dt", [0.0, DT])
+def test_gradient_is_derivative_of_energy(bent, dt: float) -> None:
+    """Eq. (5), and with damping over a step of dt Eq. (6): central differences in x."""
+    assembly, x = bent
+    assert assembly.energy(x, DT) > 1.05 * assembly.energy(x)
+    rng = np.random.default_rng(2)
+    for _ in range(4):
+        direction = rng.standard_normal(x.shape)
+        h = 1e-6
+        slope = (assembly.energy(x + h * direction, dt) - assembly.energy(x - h * direction, dt)) / (2 * h)
+        assert slope == pytest.approx(np.sum(assembly.gradient(x, dt) * direction), rel=1e-6)
+
+
+@pytest.mark.parametrize("dt", [0.0, DT])
+def test_hessian_is_derivative_of_gradient(bent, dt: float) -> None:
+    """Eq. (5), Eq. (6): central differences of the gradient; the projected matrix lies above the true one where damping turns it."""
+    assembly, x = bent
+    matrix = full(assembly, assembly.matrix_entries(x, dt))
+    direction = np.random.default_rng(3).standard_normal(x.shape)
+    h = 1e-6
+    change = (assembly.gradient(x + h * direction, dt) - assembly.gradient(x - h * direction, dt)) / (2 * h)
+    assert np.abs(matrix @ direction.ravel() - change.ravel()).max() < 1e-6 * np.abs(change).max()
+    projected = np.linalg.eigvalsh(full(assembly, assembly.matrix_entries(x, dt, projected=True)))
+    assert projected.min() > -1e-9 * projected.max()
+    assert np.allclose(assembly.matrix_entries(x, dt, factor=0.3), 0.3 * assembly.matrix_entries(x, dt), rtol=1e-12)
+
+
+def test_projected_hessian_clamps_each_element(device: str) -> None:
+    """The analytic projection equals clamping the eigenvalues of the element's 9x9 (here 12x12) Hessian numerically."""
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    assembly = ElasticAssembly(TetMesh.oriented(corners, np.array([[0, 1, 2, 3]])), MATERIAL, device=device)
+    weights = np.linalg.cholesky(assembly_gram(corners)).T
+    rng = np.random.default_rng(4)
+    indefinite = 0
+    for _ in range(20):
+        x = corners @ (np.diag(rng.uniform(0.3, 1.6, 3)) + 0.3 * rng.standard_normal((3, 3))).T
+        if np.linalg.det((x[1:] - x[0]).T) < 0.05:
+            continue
+        true = full(assembly, assembly.matrix_entries(x))
+        projected = full(assembly, assembly.matrix_entries(x, projected=True))
+        # The projection is taken in deformation-gradient space: pull both back there.
+        pull = np.kron(np.linalg.pinv(weights), np.eye(3))
+        values, vectors = np.linalg.eigh(pull.T @ true @ pull)
+        indefinite += values.min() < -1e-6 * values.max()
+        clamped = vectors @ np.diag(np.maximum(values, 0)) @ vectors.T
+        assert np.abs(pull.T @ projected @ pull - clamped).max() < 1e-8 * values.max()
+    assert indefinite >= 5
+
+
+def assembly_gram(corners: np.ndarray) -> np.ndarray:
+    """4x4 matrix whose Cholesky factor maps corner values to gradients (3 rows) and their mean (1 row)."""
+    inverse = np.linalg.inv((corners[1:] - corners[0]).T)
+    gradients = np.vstack([-inverse.sum(0), inverse])
+    return gradients @ gradients.T + np.full((4, 4), 1.0 / 16.0)
+
+
+def test_rigid_motion_costs_nothing(bent) -> None:
+    """No energy, force or damping from rotation; internal forces carry no net force or torque."""
+    assembly, x = bent
+    nodes = assembly.mesh.nodes
+    motion = Rotation.from_rotvec([1.0, 2.0, -0.5]).as_matrix().T
+    turned = nodes @ motion + [1.0, 2.0, 3.0]
+    assert abs(assembly.energy(turned)) < 1e-9 * MATERIAL.mu
+    assert np.abs(assembly.gradient(turned)).max() < 1e-9 * MATERIAL.mu
+    force = assembly.gradient(x, DT)
+    scale = np.abs(force).sum()
+    for part in (force, assembly.gradient(x)):
+        assert np.abs(part.sum(0)).max() < 1e-12 * scale
+        assert np.abs(np.cross(x, part).sum(0)).max() < 1e-12 * scale
+    assembly.begin_step(x)
+    turned = x @ motion + [1.0, 2.0, 3.0]
+    assert np.abs(assembly.gradient(turned, DT) - assembly.gradient(turned)).max() < 1e-9 * MATERIAL.mu
+
+
+def test_uniaxial_stretch_closed_form(device: str) -> None:
+    """Eq. (5) for diag(a, b, c): Psi = mu/2 (a^2+b^2+c^2-3) - mu ln J + lambda/2 ln^2 J, times the volume."""
+    mesh = block_mesh()
+    assembly = ElasticAssembly(mesh, MATERIAL, device=device)
+    stretch = np.array([1.2, 0.9, 0.8])
+    log_j = np.log(stretch.prod())
+    density = MATERIAL.mu / 2 * (np.sum(stretch**2) - 3) - MATERIAL.mu * log_j + MATERIAL.lam / 2 * log_j**2
+    energy = assembly.energy(mesh.nodes * stretch)
+    assert energy == pytest.approx(density * mesh.volumes().sum(), rel=1e-12)
+
+
+def test_inverted_element_has_infinite_energy(device: str) -> None:
+    mesh = block_mesh()
+    assembly = ElasticAssembly(mesh, MATERIAL, device=device)
+    assert assembly.energy(mesh.nodes * [1, 1, -1]) == np.inf
+
+
+def test_pattern_is_the_meshs(device: str) -> None:
+    mesh = block_mesh()
+    assembly = ElasticAssembly(mesh, MATERIAL, device=device)
+    pairs = sparse.coo_matrix(
+        (np.ones(16 * len(mesh.tets)), (np.repeat(mesh.tets, 4, 1).ravel(), np.tile(mesh.tets, (1, 4)).ravel()))
+    ).tocsr()
+    assert full(assembly, np.ones(assembly.upper_pattern.nnz)).astype(bool).sum() == 9 * pairs.nnz

@@ -1,0 +1,92 @@
+"""OpenCV and TorchScript behind the same protocol, and their errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from egs_warp.errors import UserError
+from egs_warp.inpainting.inpainters import OpenCvInpainter, OpenCvMethod, TorchScriptInpainter, inpainter_by_name
+from egs_warp.inpainting.patch_synthesis import PatchSynthesis
+
+# LaMa is published as TorchScript, which torch calls deprecated.
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
+
+
+class MeanOfTheKnown(torch.nn.Module):
+    """Paints the hole in the mean colour of the rest: what LaMa's interface asks for, in two lines."""
+
+    def forward(self, image: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        mean = (image * (1 - mask)).sum(dim=(2, 3), keepdim=True) / (1 - mask).sum(dim=(2, 3), keepdim=True)
+        return image * (1 - mask) + mean * mask
+
+
+def holed() -> tuple[np.ndarray, np.ndarray]:
+    """37 x 45 pixels, so that padding is needed, red left and blue right, with a hole on the border."""
+    image = np.zeros((37, 45, 3), np.float32)
+    image[:, :22, 0], image[:, 22:, 2] = 0.8, 0.6
+    hole = np.zeros((37, 45), bool)
+    hole[10:20, 15:30] = True
+    return np.where(hole[..., None], 0.0, image).astype(np.float32), hole
+
+
+def traced(module: torch.nn.Module, path: Path) -> Path:
+    torch.jit.trace(module, (torch.rand(1, 3, 40, 48), torch.ones(1, 1, 40, 48))).save(str(path))
+    return path
+
+
+def test_torchscript_is_given_padded_pictures(tmp_path: Path) -> None:
+    image, hole = holed()
+    inpainter = inpainter_by_name(str(traced(MeanOfTheKnown(), tmp_path / "mean.pt")))
+    filled = inpainter.fill(image, hole, ~hole)
+    assert np.array_equal(filled[~hole], image[~hole])
+    values = np.unique(filled[hole].round(5), axis=0)
+    assert len(values) == 1 and values[0, 1] == 0.0
+    padded = np.pad(image, ((0, 3), (0, 3), (0, 0)), mode="symmetric")
+    outside = ~np.pad(hole, ((0, 3), (0, 3)), mode="symmetric")
+    assert values[0] == pytest.approx(padded[outside].mean(axis=0), abs=1e-5)
+
+
+@pytest.mark.parametrize("method", OpenCvMethod)
+def test_opencv_continues_flat_colour_exactly(method: OpenCvMethod) -> None:
+    image, hole = holed()
+    image[:] = np.where(hole[..., None], 0.0, [0.123, 0.456, 0.789])
+    filled = OpenCvInpainter(method).fill(image, hole, ~hole)
+    # Without rounding to 8 bits.
+    assert filled[hole] == pytest.approx(np.tile([0.123, 0.456, 0.789], (hole.sum(), 1)), abs=1e-4)
+
+
+def test_names(tmp_path: Path) -> None:
+    assert isinstance(inpainter_by_name("patch"), PatchSynthesis)
+    assert inpainter_by_name("ns") == OpenCvInpainter(OpenCvMethod.NAVIER_STOKES)
+    with pytest.raises(UserError, match="--inpainter lama: give patch, telea, ns or a TorchScript file"):
+        inpainter_by_name("lama")
+    with pytest.raises(UserError, match=r"gone\.pt: no such file; give the TorchScript file"):
+        inpainter_by_name(str(tmp_path / "gone.pt"))
+
+
+def test_bad_networks(tmp_path: Path) -> None:
+    image, hole = holed()
+    text = tmp_path / "text.pt"
+    text.write_text("weights")
+    with pytest.raises(UserError, match=r"text\.pt: not a TorchScript file; save the network with torch\.jit\.save"):
+        TorchScriptInpainter(text).fill(image, hole, ~hole)
+
+    class Half(torch.nn.Module):
+        def forward(self, image: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+            return image[:, :, ::2] * mask[:, :, ::2]
+
+    with pytest.raises(UserError, match=r"returned shape \(1, 3, 20, 48\) .* expected \(1, 3, 40, 48\)"):
+        TorchScriptInpainter(traced(Half(), tmp_path / "half.pt")).fill(image, hole, ~hole)
+
+    class One(torch.nn.Module):
+        def forward(self, image: torch.Tensor) -> torch.Tensor:
+            return image
+
+    torch.jit.trace(One(), torch.rand(1, 3, 8, 8)).save(str(tmp_path / "one.pt"))
+    with pytest.raises(UserError, match=r"one\.pt: the network failed on an image") as caught:
+        TorchScriptInpainter(tmp_path / "one.pt").fill(image, hole, ~hole)
+    assert "\n" not in str(caught.value)

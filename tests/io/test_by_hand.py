@@ -1,0 +1,130 @@
+"""Captures from hand-made bytes: what the public descriptions say, value by value."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.io import read_capture, write_ply
+from tests.support.captures import assert_same_bits, make_cloud
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_spz_by_hand(version: int, tmp_path: Path) -> None:
+    """One Gaussian at (1.5, -2, 0.25) with rotation (w, x, y, z) = (0.8, 0, -0.6, 0), SH of degree 1."""
+    position = struct.pack("<3e", 1.5, -2.0, 0.25)
+    if version > 1:
+        position = b"".join(struct.pack("<i", int(v * 4096))[:3] for v in (1.5, -2.0, 0.25))
+    if version < 3:
+        rotation = bytes([128, round((-0.6 + 1) * 127.5), 128])
+    else:
+        # Components x, y, z, w; w is the largest (index 3); a sign bit and nine bits of |c| sqrt(2) for each other one.
+        rotation = struct.pack("<I", 3 << 30 | 0 << 20 | (512 | round(0.6 * 2**0.5 * 511)) << 10 | 0)
+    body = struct.pack("<IIIBBBB", 0x5053474E, version, 1, 1, 12, version == 3, 0) + position
+    body += bytes([51]) + bytes([255, 128, 0]) + bytes([160, 96, 0]) + rotation
+    body += bytes([128 + 64, 128, 128, 128, 128 - 64, 128, 128, 128, 0])
+    (tmp_path / "a.spz").write_bytes(gzip.compress(body))
+    (tmp_path / "plain.spz").write_bytes(body)
+    capture = read_capture(tmp_path / "a.spz", device="cpu")
+    cloud = capture.cloud
+    np.testing.assert_array_equal(cloud.means.numpy(), [[1.5, -2.0, 0.25]])
+    np.testing.assert_allclose(cloud.rotations.numpy(), [[0.8, 0.0, -0.6, 0.0]], atol=6e-3 if version < 3 else 1e-3)
+    np.testing.assert_array_equal(cloud.log_scales.numpy(), [[0.0, -4.0, -10.0]])
+    np.testing.assert_allclose(cloud.opacities(), [0.2], atol=1e-6)
+    np.testing.assert_allclose(cloud.sh.numpy()[0, 0], [0.5 / 0.15, (128 / 255 - 0.5) / 0.15, -0.5 / 0.15], rtol=1e-5)
+    np.testing.assert_array_equal(cloud.sh.numpy()[0, 1:], [[0.5, 0, 0], [0, -0.5, 0], [0, 0, -1.0]])
+    np.testing.assert_array_equal(capture.up, [0.0, 1.0, 0.0])
+    assert capture.antialiased == (version == 3)
+    assert_same_bits(read_capture(tmp_path / "plain.spz", device="cpu").cloud, cloud)
+
+
+def test_splat_by_hand(tmp_path: Path) -> None:
+    row = struct.pack("<6f", 1.0, 2.0, 3.0, 0.5, 1.0, 2.0) + bytes([255, 0, 51, 255]) + bytes([128, 128, 0, 128])
+    zero = struct.pack("<6f", 0.0, 0.0, 0.0, 0.0, 1.0, 1.0) + bytes(8)
+    (tmp_path / "a.splat").write_bytes(row + zero)
+    capture = read_capture(tmp_path / "a.splat", device="cpu")
+    cloud = capture.cloud
+    np.testing.assert_array_equal(cloud.means.numpy()[0], [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(np.exp(cloud.log_scales.numpy()[0]), [0.5, 1.0, 2.0], rtol=1e-6)
+    np.testing.assert_array_equal(cloud.rotations.numpy()[0], [0.0, 0.0, -1.0, 0.0])
+    np.testing.assert_allclose(0.5 + SH_BAND_0 * cloud.sh.numpy()[0, 0], [1.0, 0.0, 0.2], atol=1e-6)
+    np.testing.assert_array_equal(cloud.opacity_logits.numpy(), [16.0, -16.0])
+    assert capture.infinite_opacities == 0
+    assert capture.notes == ("1 Gaussians with a scale of 0 read as 1e-38",)
+
+
+def test_compressed_ply_by_hand(tmp_path: Path) -> None:
+    """The oldest layout, without bounds of colour; extremes and middles of each packed field."""
+    names = ["min_x", "min_y", "min_z", "max_x", "max_y", "max_z"]
+    names += ["min_scale_x", "min_scale_y", "min_scale_z", "max_scale_x", "max_scale_y", "max_scale_z"]
+    header = "ply\r\nformat binary_little_endian 1.0\r\nelement chunk 1\r\n"
+    header += "".join(f"property float {name}\r\n" for name in names) + "element vertex 1\r\n"
+    header += "".join(f"property uint packed_{name}\r\n" for name in ("position", "rotation", "scale", "color"))
+    chunk = struct.pack("<12f", -1.0, -1.0, -1.0, 1.0, 3.0, 5.0, -8.0, -8.0, -8.0, -2.0, -2.0, -2.0)
+    position = 0 << 21 | 1023 << 11 | 2047
+    # x is the largest (index 1); w, y, z follow in order.
+    rotation = 1 << 30 | round((0.6 / 2**0.5 + 0.5) * 1023) << 20 | round(0.5 * 1023) << 10 | round(0.5 * 1023)
+    scale = 2047 << 21 | 0 << 11 | 2047
+    colour = 255 << 24 | 0 << 16 | 102 << 8 | 51
+    vertex = struct.pack("<4I", position, rotation, scale, colour)
+    (tmp_path / "a.ply").write_bytes(header.encode() + b"end_header\r\n" + chunk + vertex)
+    cloud = read_capture(tmp_path / "a.ply", device="cpu").cloud
+    np.testing.assert_array_equal(cloud.means.numpy(), [[-1.0, 3.0, 5.0]])
+    np.testing.assert_allclose(cloud.rotations.numpy(), [[0.6, 0.8, 0.0, 0.0]], atol=1.5e-3)
+    np.testing.assert_array_equal(cloud.log_scales.numpy(), [[-2.0, -8.0, -2.0]])
+    np.testing.assert_allclose(0.5 + SH_BAND_0 * cloud.sh.numpy()[0, 0], [1.0, 0.0, 0.4], atol=1e-6)
+    np.testing.assert_allclose(cloud.opacities(), [0.2], atol=1e-6)
+
+
+def ply_text(cloud: GaussianCloud, *, kind: str, order: str, number: str) -> bytes:
+    """The same Gaussians in an unusual but lawful .ply: shuffled properties, extra elements, other number types."""
+    rest = 3 * ((cloud.sh_degree + 1) ** 2 - 1)
+    columns = {f"f_rest_{i}": cloud.sh.numpy()[:, 1 + i % (rest // 3), i // (rest // 3)] for i in range(rest)}
+    for i in range(3):
+        columns |= {"xyz"[i]: cloud.means.numpy()[:, i], f"scale_{i}": cloud.log_scales.numpy()[:, i]}
+        columns |= {f"f_dc_{i}": cloud.sh.numpy()[:, 0, i]}
+    columns |= {f"rot_{i}": cloud.rotations.numpy()[:, i] for i in range(4)}
+    columns |= {"opacity": cloud.opacity_logits.numpy(), "beauty": np.arange(cloud.count)}
+    names = sorted(columns, key=lambda name: zlib.crc32(name.encode()))
+    header = f"ply\nformat {kind} 1.0\ncomment made by hand\nelement camera 2\nproperty uchar id\nproperty int f\n"
+    header += f"element vertex {cloud.count}\n" + "".join(f"property {number} {name}\n" for name in names)
+    header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    rows = np.stack([columns[name] for name in names], axis=1).astype(np.float64)
+    if kind == "ascii":
+        lines = ["1 5", "2 6", *(" ".join(repr(float(value)) for value in row) for row in rows), "3 0 1 2"]
+        return header.encode() + "\n".join(lines).encode() + b"\n"
+    code = {"float": "f4", "double": "f8"}[number]
+    camera = struct.pack(f"{order}BiBi", 1, 5, 2, 6)
+    return header.encode() + camera + rows.astype(f"{order}{code}").tobytes() + struct.pack(f"{order}B3i", 3, 0, 1, 2)
+
+
+@pytest.mark.parametrize(
+    ("kind", "order", "number"),
+    [
+        ("binary_little_endian", "<", "float"),
+        ("binary_little_endian", "<", "double"),
+        ("binary_big_endian", ">", "float"),
+        ("ascii", "", "float"),
+    ],
+)
+def test_ply_in_any_order_and_type(kind: str, order: str, number: str, tmp_path: Path) -> None:
+    cloud = make_cloud(40, 2)
+    (tmp_path / "a.ply").write_bytes(ply_text(cloud, kind=kind, order=order, number=number))
+    assert_same_bits(read_capture(tmp_path / "a.ply", device="cpu").cloud, cloud)
+
+
+def test_infinite_opacities_are_counted_and_made_finite(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", make_cloud(3))
+    data = bytearray((tmp_path / "a.ply").read_bytes())
+    data[-32:-28] = struct.pack("<f", np.inf)
+    data[-32 - 68 : -28 - 68] = struct.pack("<f", -np.inf)
+    (tmp_path / "a.ply").write_bytes(data)
+    capture = read_capture(tmp_path / "a.ply", device="cpu")
+    assert capture.infinite_opacities == 2
+    np.testing.assert_array_equal(capture.cloud.opacity_logits.numpy()[1:], [-16.0, 16.0])

@@ -1,0 +1,307 @@
+"""Camera poses: real photos, conventions by hand, bad files."""
+
+from __future__ import annotations
+
+import json
+import struct
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.io import read_cameras, read_capture
+
+
+def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixel coordinates (n, 2) and z-depth (n,) of world points (n, 3)."""
+    seen = points @ camera.rotation.T + camera.translation
+    pixels = seen[:, :2] / seen[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    return pixels, seen[:, 2]
+
+
+def inside(mask: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Whether each pixel coordinate falls on a set pixel; centres lie at +0.5."""
+    columns, rows = np.floor(pixels).astype(int).T
+    height, width = mask.shape
+    valid = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    return valid & mask[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
+
+
+def drawn(shape: tuple[int, int], pixels: np.ndarray, radius: int) -> np.ndarray:
+    """Mask with a square dot at each pixel coordinate."""
+    out = np.zeros(shape, bool)
+    columns, rows = np.floor(pixels).astype(int).T
+    for across in range(-radius, radius + 1):
+        for down in range(-radius, radius + 1):
+            out[np.clip(rows + down, 0, shape[0] - 1), np.clip(columns + across, 0, shape[1] - 1)] = True
+    return out
+
+
+# Real photos ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.data
+def test_plush_dog_gaussians_land_on_the_dog(data_dir: Path) -> None:
+    """COLMAP text: the capture's Gaussians cover the brown fur of each photo, and little of what is not the dog."""
+    posed = read_cameras(data_dir / "posed/plush_dog")
+    assert len(posed) == 84
+    cloud = read_capture(data_dir / "objects/plush_dog.ply", device="cpu").cloud
+    points = cloud.means.numpy()[cloud.opacities() > 0.5].astype(float)
+    for view in posed[::7]:
+        assert view.image is not None and view.image.name == view.name
+        photo = np.asarray(Image.open(view.image).convert("RGB")).astype(float)
+        assert photo.shape[:2] == (view.camera.height, view.camera.width)
+        fur = np.ptp(photo, axis=2) > 60
+        pixels, depth = project(view.camera, points)
+        assert depth.min() > 0.5
+        covered = drawn(fur.shape, pixels, 5)
+        assert (covered & fur).sum() > 0.98 * fur.sum()
+        assert covered.mean() < 0.3
+        # The measure sees a wrong pose: the dog moved by a fifth of its height.
+        moved = drawn(fur.shape, project(view.camera, points + np.array([0.0, 0.06, 0.0]))[0], 5)
+        assert (moved & fur).sum() < 0.9 * fur.sum()
+
+
+@pytest.mark.data
+def test_lego_masks_carve_a_bulldozer(data_dir: Path) -> None:
+    """NeRF-synthetic: the points inside all 100 silhouettes fill the silhouettes again, which only true poses do."""
+    posed = read_cameras(data_dir / "posed/lego")
+    assert len(posed) == 100
+    ticks = np.linspace(-1.4, 1.4, 71)
+    points = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+    masks = []
+    for view in posed:
+        assert view.image is not None
+        mask = np.asarray(Image.open(view.image))[:, :, 3] > 127
+        assert mask.shape == (view.camera.height, view.camera.width) == (200, 200)
+        masks.append(mask)
+        pixels, depth = project(view.camera, points)
+        assert depth.min() > 0
+        points = points[inside(mask, pixels)]
+    assert 3000 < len(points) < 60_000
+    low, high = points.min(axis=0), points.max(axis=0)
+    # The toy is about 1.2 x 2.3 x 1.3 and stands on z = -0.35, up along +z.
+    np.testing.assert_allclose(low, [-0.64, -1.16, -0.4], atol=0.12)
+    np.testing.assert_allclose(high, [0.64, 1.2, 1.0], atol=0.15)
+    for view, mask in list(zip(posed, masks, strict=True))[::20]:
+        covered = drawn(mask.shape, project(view.camera, points)[0], 4)
+        assert (covered & mask).sum() > 0.97 * mask.sum()
+
+
+# Conventions by hand -------------------------------------------------------------------------------------------------
+
+# The camera stands at (1, 2, 3), looks along +x, with +z up in the image: right is -y, down is -z.
+ROTATION = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+CENTRE = np.array([1.0, 2.0, 3.0])
+
+
+def check_by_hand(camera: Camera) -> None:
+    np.testing.assert_allclose(camera.rotation, ROTATION, atol=1e-9)
+    np.testing.assert_allclose(camera.centre, CENTRE, atol=1e-9)
+    assert (camera.width, camera.height, camera.fx, camera.fy) == (640, 480, 500.0, 510.0)
+    # One unit ahead, 0.1 to the left (+y) and 0.1 up.
+    pixels, depth = project(camera, CENTRE[None] + [[1.0, 0.1, 0.1]])
+    np.testing.assert_allclose(pixels, [[320.0 - 50.0, 240.0 - 51.0]], atol=1e-9)
+    np.testing.assert_allclose(depth, [1.0])
+
+
+def test_inria_by_hand(tmp_path: Path) -> None:
+    entry = {"id": 0, "img_name": "a", "width": 640, "height": 480, "fx": 500.0, "fy": 510.0}
+    entry |= {"position": CENTRE.tolist(), "rotation": ROTATION.T.tolist()}
+    (tmp_path / "cameras.json").write_text(json.dumps([entry]))
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.jpg").write_bytes(b"")
+    (view,) = read_cameras(tmp_path)
+    check_by_hand(view.camera)
+    assert view.name == "a" and view.image == tmp_path / "images" / "a.jpg"
+
+
+@pytest.mark.parametrize("place", ["shared", "frame"])
+def test_nerfstudio_by_hand(place: str, tmp_path: Path) -> None:
+    pose = np.eye(4)
+    pose[:3, :3] = ROTATION.T @ np.diag([1.0, -1.0, -1.0])
+    pose[:3, 3] = CENTRE
+    intrinsics = {"w": 640, "h": 480, "fl_x": 500.0, "fl_y": 510.0, "cx": 320.0, "cy": 240.0, "k1": 0.0}
+    frame = {"file_path": "images/a.png", "transform_matrix": pose.tolist()}
+    tree = {"camera_model": "OPENCV", "frames": [frame]}
+    (tree if place == "shared" else frame).update(intrinsics)
+    (tmp_path / "transforms.json").write_text(json.dumps(tree))
+    (view,) = read_cameras(tmp_path / "transforms.json")
+    check_by_hand(view.camera)
+    assert view.image is None
+
+
+def colmap_text(folder: Path, *, camera: str = "3 PINHOLE 640 480 500 510 320 240") -> None:
+    w, x, y, z = 0.5, 0.5, -0.5, 0.5
+    tx, ty, tz = -ROTATION @ CENTRE
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "cameras.txt").write_text(f"# comment\n{camera}\n")
+    lines = [f"7 {w} {x} {y} {z} {tx} {ty} {tz} 3 sub/with space.jpg", "1.0 2.0 -1 3.0 4.0 -1", ""]
+    lines += [f"8 {w} {x} {y} {z} {tx} {ty} {tz} 3 b.jpg", ""]
+    (folder / "images.txt").write_text("# comment\n" + "\n".join(lines))
+
+
+def colmap_binary(folder: Path, *, model: int = 1) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    parameters = {
+        0: (500.0, 320.0, 240.0),
+        1: (500.0, 510.0, 320.0, 240.0),
+        4: (500.0, 510.0, 320.0, 240.0, 0, 0, 0, 0),
+    }
+    camera = struct.pack("<QiiQQ", 1, 3, model, 640, 480)
+    (folder / "cameras.bin").write_bytes(camera + struct.pack(f"<{len(parameters[model])}d", *parameters[model]))
+    pose = struct.pack("<i7di", 7, 0.5, 0.5, -0.5, 0.5, *(-ROTATION @ CENTRE), 3)
+    points = struct.pack("<Q2dq2dq", 2, 1.0, 2.0, -1, 3.0, 4.0, 5)
+    images = struct.pack("<Q", 2) + pose + b"sub/with space.jpg\0" + points + pose + b"b.jpg\0" + struct.pack("<Q", 0)
+    (folder / "images.bin").write_bytes(images)
+
+
+@pytest.mark.parametrize("write", [colmap_text, colmap_binary])
+def test_colmap_by_hand(write, tmp_path: Path) -> None:
+    write(tmp_path / "sparse" / "0")
+    (tmp_path / "images" / "sub").mkdir(parents=True)
+    (tmp_path / "images" / "sub" / "with space.jpg").write_bytes(b"")
+    for place in (tmp_path, tmp_path / "sparse" / "0"):
+        first, second = read_cameras(place)
+        check_by_hand(first.camera)
+        check_by_hand(second.camera)
+        assert (first.name, second.name) == ("sub/with space.jpg", "b.jpg")
+        assert first.image == tmp_path / "images" / "sub" / "with space.jpg" and second.image is None
+
+
+def test_colmap_models_without_distortion(tmp_path: Path) -> None:
+    colmap_binary(tmp_path, model=4)
+    check_by_hand(read_cameras(tmp_path)[0].camera)
+    colmap_binary(tmp_path, model=0)
+    assert read_cameras(tmp_path)[0].camera.fy == 500.0
+
+
+# Bad files -----------------------------------------------------------------------------------------------------------
+
+
+def message(path: Path) -> str:
+    with pytest.raises(UserError) as caught:
+        read_cameras(path)
+    text = str(caught.value)
+    assert "\n" not in text and str(path) in text
+    return text.removeprefix(str(path)).removeprefix("/")
+
+
+def test_missing_or_unreadable(tmp_path: Path) -> None:
+    assert message(tmp_path / "a.json") == ": no such file or folder; check the path"
+    assert message(tmp_path) == ": no camera poses; give a COLMAP model, a cameras.json or a transforms.json"
+    for text, expected in (
+        ("[", ": not readable JSON; give a cameras.json or a transforms.json"),
+        ("{}", ": neither a list of cameras nor frames; give a cameras.json or a transforms.json"),
+        ("[]", ": it has no cameras; export the poses again"),
+        ("[1]", ": camera 0 is not a record of fields; export the poses again"),
+    ):
+        (tmp_path / "b.json").write_text(text)
+        assert message(tmp_path / "b.json") == expected
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"fx": -1.0}, "fx is not a positive number"),
+        ({"width": 3.5}, "width is not a number of pixels"),
+        ({"position": [0.0, 1.0]}, "position is not 3 finite numbers"),
+        ({"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "the pose is not a rotation"),
+        ({"rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}, "the pose is not a rotation"),
+        ({"img_name": 5}, "img_name is not a name"),
+    ],
+)
+def test_bad_inria(change: dict, expected: str, tmp_path: Path) -> None:
+    entry = {"img_name": "a", "width": 640, "height": 480, "fx": 500.0, "fy": 510.0}
+    entry |= {"position": [0.0, 0.0, 0.0], "rotation": np.eye(3).tolist()}
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps([entry, entry | change]))
+    assert message(path) == f": camera 1: {expected}; export the poses again"
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"camera_angle_x": 4.0}, ": frame 0: camera_angle_x is not an angle between 0 and pi; export the poses again"),
+        ({"k1": 0.1, "p2": 1e-3}, ": frame 0 has lens distortion (k1, p2); undistort the photos first"),
+        (
+            {"camera_model": "OPENCV_FISHEYE"},
+            ": frame 0 has lens distortion (OPENCV_FISHEYE); undistort the photos first",
+        ),
+        ({"w": None}, ": frame 0: w is not a finite number; export the poses again"),
+        ({"transform_matrix": [[1]]}, ": frame 0: transform_matrix is not 16 finite numbers; export the poses again"),
+    ],
+)
+def test_bad_transforms(change: dict, expected: str, tmp_path: Path) -> None:
+    frame = {"file_path": "a", "transform_matrix": np.eye(4).tolist(), "w": 8, "h": 8, "camera_angle_x": 0.7}
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({"frames": [frame | change]}))
+    assert message(path) == expected
+
+
+def test_transforms_without_a_size(tmp_path: Path) -> None:
+    frame = {"file_path": "a", "transform_matrix": np.eye(4).tolist()}
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({"camera_angle_x": 0.7, "frames": [frame]}))
+    assert message(path) == ": frame 0 has no w and h, and its photo a is missing; add either"
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n no")
+    with pytest.raises(UserError, match=r"a\.png: not a readable image; copy it again"):
+        read_cameras(path)
+
+
+def test_bad_colmap(tmp_path: Path) -> None:
+    colmap_text(tmp_path, camera="3 SIMPLE_RADIAL 640 480 500 320 240 0.01")
+    assert message(tmp_path) == (
+        "cameras.txt: camera 3 has lens distortion (SIMPLE_RADIAL); run colmap image_undistorter first"
+    )
+    colmap_text(tmp_path, camera="4 PINHOLE 640 480 500 510 320 240")
+    assert message(tmp_path) == "images.txt: image sub/with space.jpg has camera 3, missing in cameras.txt"
+    colmap_text(tmp_path, camera="3 PINHOLE 640 480 500 510 320")
+    assert message(tmp_path) == "cameras.txt: camera 3 of model PINHOLE with 3 parameters is not known"
+    colmap_text(tmp_path, camera="3 PINHOLE wide")
+    assert message(tmp_path) == "cameras.txt: malformed camera line '3 PINHOLE wide'; export the model again"
+    (tmp_path / "cameras.txt").unlink()
+    assert message(tmp_path) == "cameras.txt: cannot be read (No such file or directory); a COLMAP model needs it"
+    colmap_binary(tmp_path)
+    data = (tmp_path / "images.bin").read_bytes()
+    (tmp_path / "images.bin").write_bytes(data[:-30])
+    assert message(tmp_path) == f"images.bin: truncated at {len(data) - 30} bytes; copy or export it again"
+    (tmp_path / "images.bin").write_bytes(bytes(8))
+    assert message(tmp_path) == "images.bin: it has no images; reconstruct the scene again"
+
+
+@pytest.mark.filterwarnings("error")
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(st.data())
+@pytest.mark.parametrize("name", ["cameras.txt", "images.txt", "cameras.bin", "images.bin", "transforms.json"])
+def test_any_bytes(name: str, data: st.DataObject) -> None:
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        if name.endswith(".bin"):
+            colmap_binary(folder)
+        elif name.endswith(".txt"):
+            colmap_text(folder)
+        else:
+            frame = {"file_path": "a", "transform_matrix": np.eye(4).tolist(), "w": 8, "h": 8, "fl_x": 1.0, "cx": 4.0}
+            (folder / name).write_text(json.dumps({"frames": [frame]}))
+        content = bytearray((folder / name).read_bytes())
+        for _ in range(data.draw(st.integers(1, 3))):
+            content[data.draw(st.integers(0, len(content) - 1))] = data.draw(
+                st.sampled_from(b"0 9\n-") | st.integers(0, 255)
+            )
+        keep = data.draw(st.just(len(content)) | st.integers(0, len(content)))
+        (folder / name).write_bytes(content[:keep])
+        try:
+            posed = read_cameras(folder)
+        except UserError as error:
+            assert "\n" not in str(error)
+            return
+        for view in posed:
+            np.testing.assert_allclose(view.camera.rotation @ view.camera.rotation.T, np.eye(3), atol=3e-3)
+            assert np.isfinite(view.camera.translation).all() and view.camera.fx > 0

@@ -1,0 +1,78 @@
+"""Pictures and videos on disk: what is read back is what was written, and nothing half-written is left."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from egs_warp.errors import UserError
+from egs_warp.io.video import VideoWriter, contact_sheet, write_png
+
+
+def smooth_frames(count: int, height: int, width: int) -> list[np.ndarray]:
+    y, x = np.mgrid[:height, :width]
+    return [
+        np.stack([x * 255 // width, y * 255 // height, np.full_like(x, 20 + 20 * k)], -1).astype(np.uint8)
+        for k in range(count)
+    ]
+
+
+@pytest.mark.parametrize(("height", "width"), [(48, 64), (47, 63)])
+def test_video_reads_back(tmp_path: Path, height: int, width: int) -> None:
+    frames = smooth_frames(9, height, width)
+    with VideoWriter(tmp_path / "v.mp4", width, height, frames_per_second=30) as video:
+        for frame in frames:
+            video.write(frame)
+    assert os.listdir(tmp_path) == ["v.mp4"]
+    reader = cv2.VideoCapture(str(tmp_path / "v.mp4"))
+    assert reader.get(cv2.CAP_PROP_FPS) == pytest.approx(30)
+    fourcc = int(reader.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little")
+    assert fourcc in (b"avc1", b"h264")
+    for frame in frames:
+        ok, back = reader.read()
+        assert ok
+        assert back.shape[:2] == (height + height % 2, width + width % 2)
+        assert np.abs(back[:height, :width, ::-1].astype(float) - frame).mean() < 4.0
+    assert not reader.read()[0]
+
+
+def test_a_failed_video_leaves_the_old_one(tmp_path: Path) -> None:
+    path = tmp_path / "v.mp4"
+    path.write_bytes(b"good")
+    with pytest.raises(RuntimeError, match="solver"), VideoWriter(path, 16, 16) as video:
+        video.write(np.zeros((16, 16, 3), np.uint8))
+        raise RuntimeError("solver")
+    with pytest.raises(UserError, match=r"a frame has shape \(8, 16, 3\)"), VideoWriter(path, 16, 16) as video:
+        video.write(np.zeros((8, 16, 3), np.uint8))
+    assert path.read_bytes() == b"good"
+    assert os.listdir(tmp_path) == ["v.mp4"]
+
+
+def test_unwritable_places_are_named(tmp_path: Path) -> None:
+    missing = tmp_path / "missing" / "v.mp4"
+    with pytest.raises(UserError, match=r"v\.mp4: cannot write the video .*; choose a writable folder"):
+        VideoWriter(missing, 16, 16).__enter__()
+    with pytest.raises(UserError, match="cannot write the picture"):
+        write_png(missing, np.zeros((4, 4, 3), np.uint8))
+
+
+def test_png_is_lossless_and_in_rgb_order(tmp_path: Path) -> None:
+    image = smooth_frames(1, 13, 17)[0]
+    write_png(tmp_path / "p.png", image)
+    assert np.array_equal(cv2.imread(str(tmp_path / "p.png"))[..., ::-1], image)
+
+
+def test_contact_sheet_places_frames_and_writes_labels() -> None:
+    frames = [np.full((64, 80, 3), 10 * k, np.uint8) for k in range(12)]
+    sheet = contact_sheet(frames, 4, [f"{k / 6:.2f} s" for k in range(12)])
+    assert sheet.shape == (3 * 64, 4 * 80, 3)
+    for k in range(12):
+        cell = sheet[k // 4 * 64 : k // 4 * 64 + 64, k % 4 * 80 : k % 4 * 80 + 80]
+        assert (cell[32:] == 10 * k).all()
+        assert (cell[:24] != 10 * k).any(), "a label"
+    with pytest.raises(UserError, match="12 frames and 1 labels"):
+        contact_sheet(frames, 4, ["x"])

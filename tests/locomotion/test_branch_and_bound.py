@@ -1,0 +1,49 @@
+"""Branch and bound against trying every contact state."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.locomotion.branch_and_bound import exact_states
+from egs_warp.locomotion.complementarity import STATIC
+from tests.support.contact_programs import optimum_of_each, small_problem
+
+
+@pytest.mark.parametrize(("contacts", "directions"), [(1, 8), (2, 4), (2, 8), (3, 4)])
+def test_the_optimum_is_that_of_brute_force(contacts: int, directions: int) -> None:
+    """Eq. (9), Eq. (13): same objective as the best of all states; complementary; and far fewer QPs than states."""
+    for seed in range(3):
+        program = small_problem(seed, contacts=contacts, directions=directions).program
+        best = min(value for value, _ in optimum_of_each(program).values())
+        found = exact_states(program)
+        assert found is not None and found.proved
+        assert found.objective == pytest.approx(best, rel=1e-6, abs=1e-6)
+        assert found.bound <= found.objective
+        x, w = program.pairs(found.y)
+        assert x.min() > -1e-6 and w.min() > -1e-6 and np.abs(x * w).max() < 1e-5
+        assert found.objective == pytest.approx(program.objective(found.y))
+        assert found.qp_count < 0.5 * (2 * directions + 2) ** contacts + 20
+
+
+def test_starts_change_nothing_but_the_effort() -> None:
+    """A good start prunes; a bad one is forgotten."""
+    program = small_problem(5, contacts=3).program
+    plain = exact_states(program)
+    assert plain is not None
+    good = exact_states(program, starts=(plain.states,))
+    bad = exact_states(program, starts=(np.full(3, STATIC),))
+    assert good is not None and bad is not None
+    assert good.objective == pytest.approx(plain.objective) and bad.objective == pytest.approx(plain.objective)
+    assert good.qp_count <= plain.qp_count + 1
+
+
+def test_a_limit_is_not_called_a_proof() -> None:
+    """Cut short, the search says how far the optimum may still be."""
+    program = small_problem(5, contacts=3).program
+    whole = exact_states(program)
+    assert whole is not None
+    cut = exact_states(program, starts=(whole.states,), qp_limit=6)
+    assert cut is not None and not cut.proved
+    assert cut.bound < whole.objective <= cut.objective + 1e-9
+    assert exact_states(program, qp_limit=1) is None

@@ -1,0 +1,157 @@
+"""Objectives: their rows against differences of the quantity they name."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from egs_warp.fem.body import BodyState, make_body
+from egs_warp.geometry.plane import Plane
+from egs_warp.locomotion.objectives import (
+    WORLD,
+    BodyPart,
+    Coordinates,
+    base_area,
+    centre_of_mass_velocity,
+    node_velocities,
+    part_acceleration,
+    part_angular_momentum,
+    part_nodes,
+    part_position,
+    part_turning,
+    part_velocity,
+)
+from tests.support.meshes import block_mesh
+
+BODY = make_body(block_mesh(), Plane(np.array([0.0, 0.0, 1.0]), 0.0), device="cpu")
+HEIGHTS = BODY.mesh.nodes[:, 2]
+PARTS = [BodyPart.whole(BODY), BodyPart.base(BODY, HEIGHTS), BodyPart.head(BODY, HEIGHTS)]
+TURNED = Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix()
+FRAMES = [WORLD, Coordinates(TURNED, False), Coordinates(TURNED, True)]
+NEAR = 1e-6
+by_part = pytest.mark.parametrize("part", PARTS, ids=lambda part: part.name)
+by_frame = pytest.mark.parametrize("frame", FRAMES, ids=["world", "turned", "centre of mass"])
+
+
+def shaken_state(seed: int = 3) -> BodyState:
+    """A bent body in motion."""
+    rng = np.random.default_rng(seed)
+    nodes = BODY.mesh.nodes
+    return BodyState(nodes + 0.02 * rng.standard_normal(nodes.shape), rng.standard_normal(nodes.shape))
+
+
+def rate_of(quantity, state: BodyState, velocities: np.ndarray) -> np.ndarray:
+    """d quantity(positions) / dt by a central difference along ``velocities`` (N, 3)."""
+    return (quantity(state.positions + NEAR * velocities) - quantity(state.positions - NEAR * velocities)) / (2 * NEAR)
+
+
+def test_centre_of_mass_rows_are_the_rate_of_the_centre_of_mass() -> None:
+    """Rows v = d(com)/dt by a difference of positions moved along v."""
+    rng = np.random.default_rng(0)
+    x, v, h = BODY.mesh.nodes, rng.standard_normal(BODY.mesh.nodes.shape), 1e-3
+    objective = centre_of_mass_velocity(BODY, np.array([1.0, 2.0, 3.0]), 0.7)
+    rate = (BODY.centre_of_mass(x + h * v) - BODY.centre_of_mass(x - h * v)) / (2 * h)
+    assert np.allclose(objective.rows @ v.ravel(), rate, atol=1e-10)
+    assert objective.target.tolist() == [1.0, 2.0, 3.0] and objective.weight == 0.7
+
+
+def test_node_rows_measure_the_mass_weighted_distance_from_the_target() -> None:
+    """|rows v - target|^2 = sum m_i |v_i - target_i|^2 / m, its gradient by differences."""
+    rng = np.random.default_rng(1)
+    v, target, along = rng.standard_normal((3, *BODY.mesh.nodes.shape))
+    objective = node_velocities(BODY, target, 1.0)
+
+    def cost(velocities: np.ndarray) -> float:
+        return float(((objective.rows @ velocities.ravel() - objective.target) ** 2).sum())
+
+    assert cost(v) == pytest.approx((BODY.node_mass[:, None] * (v - target) ** 2).sum() / BODY.mass)
+    gradient = 2.0 * objective.rows.T @ (objective.rows @ v.ravel() - objective.target)
+    slope = (cost(v + 1e-4 * along) - cost(v - 1e-4 * along)) / 2e-4
+    assert slope == pytest.approx(gradient @ along.ravel(), rel=1e-8)
+
+
+def place(part: BodyPart, frame: Coordinates, positions: np.ndarray) -> np.ndarray:
+    """Centre of a part as an objective tells it."""
+    origin = BODY.centre_of_mass(positions) if frame.relative else 0.0
+    return frame.axes @ (part.centre(positions) - origin)
+
+
+@by_part
+@by_frame
+def test_part_rows_are_the_rate_of_the_parts_place(part: BodyPart, frame: Coordinates) -> None:
+    """Velocity, position and acceleration of a part: rows by differences; a velocity that meets the target brings what is asked."""
+    state, dt = shaken_state(), 0.01
+    v = np.random.default_rng(4).standard_normal(state.positions.shape)
+    rate = rate_of(lambda x: place(part, frame, x), state, v)
+    asked = np.array([0.1, 0.2, 0.3])
+    velocity = part_velocity(BODY, part, asked, 2.0, frame)
+    assert np.allclose(velocity.rows @ v.ravel(), rate, atol=1e-8)
+    assert velocity.target.tolist() == asked.tolist() and velocity.weight == 2.0
+    position = part_position(BODY, part, state, asked, 1.0, 1.0 / dt, frame)
+    reached = place(part, frame, state.positions) + dt * position.target
+    assert np.allclose(position.rows @ v.ravel(), rate, atol=1e-8) and np.allclose(reached, asked)
+    acceleration = part_acceleration(BODY, part, state, asked, 1.0, dt, frame)
+    before = rate_of(lambda x: place(part, frame, x), state, state.velocities)
+    assert np.allclose((acceleration.target - before) / dt, asked, atol=1e-5)
+
+
+@by_part
+@by_frame
+def test_momentum_rows_measure_the_angular_momentum_in_metres_a_second(part: BodyPart, frame: Coordinates) -> None:
+    """Sum of m (x - c) x (v - v_c) over the part, about its own centre or that of the body; a rigid turn gives inertia x omega."""
+    state = shaken_state()
+    v = np.random.default_rng(5).standard_normal(state.positions.shape)
+    origin = BODY.centre_of_mass if frame.relative else part.centre
+    arms, speeds = ((x - origin(x))[part.nodes] for x in (state.positions, v))
+    momentum = frame.axes @ (part.masses[:, None] * np.cross(arms, speeds)).sum(axis=0)
+    objective = part_angular_momentum(BODY, part, state, momentum, 1.0, frame)
+    assert np.allclose(objective.rows @ v.ravel(), objective.target, atol=1e-10)
+    if not frame.relative:
+        turn = np.array([0.4, -0.2, 0.7])
+        rigid = np.cross(turn, state.positions) + [1.0, 2.0, 3.0]
+        asked = part_angular_momentum(BODY, part, state, frame.axes @ part.spread(state.positions) @ turn, 1.0, frame)
+        assert np.allclose(asked.rows @ rigid.ravel(), asked.target, atol=1e-10)
+
+
+@by_part
+def test_turning_rows_are_the_rate_of_the_best_fit_rotation_of_a_rigid_part(part: BodyPart) -> None:
+    """A rigid velocity field has the angular velocity with which Kabsch's rotation of the part changes."""
+    state = shaken_state()
+    turn = np.array([0.4, -0.2, 0.7])
+    rigid = np.cross(turn, state.positions) + [1.0, 2.0, 3.0]
+
+    def rotation(positions: np.ndarray) -> np.ndarray:
+        arms, rest = (x[part.nodes] - part.centre(x) for x in (positions, state.positions))
+        return Rotation.align_vectors(arms, rest, weights=part.masses)[0].as_rotvec()
+
+    objective = part_turning(BODY, part, state, TURNED @ turn, 1.0, Coordinates(TURNED, False))
+    assert np.allclose(rate_of(rotation, state, rigid), turn, atol=1e-6)
+    assert np.allclose(objective.rows @ rigid.ravel(), objective.target, atol=1e-10)
+
+
+def test_area_rows_are_the_rate_of_the_area_of_the_base() -> None:
+    """dA/dt of the hull of the base seen along a tilted up, by differences; the target closes the gap at the asked rate."""
+    part, state, up = BodyPart.base(BODY, HEIGHTS), shaken_state(), TURNED[2]
+    v = np.random.default_rng(6).standard_normal(state.positions.shape)
+    plane = np.stack([TURNED[0], TURNED[1]])
+
+    def hull(positions: np.ndarray) -> ConvexHull:
+        return ConvexHull(positions[part.nodes] @ plane.T)
+
+    objective = base_area(part, state, up, 0.2, 1.0, 5.0)
+    perimeter = hull(state.positions).area
+    rate = rate_of(lambda x: np.array([hull(x).volume]), state, v)
+    assert np.allclose(perimeter * (objective.rows @ v.ravel()), rate, rtol=1e-6)
+    assert objective.target[0] * perimeter == pytest.approx(5.0 * (0.2 - hull(state.positions).volume))
+
+
+def test_node_rows_of_a_part_are_a_mean_square() -> None:
+    """|rows v - target|^2 is the mean over the part's nodes of |v - target|^2."""
+    part = PARTS[2]
+    v = np.random.default_rng(7).standard_normal(BODY.mesh.nodes.shape)
+    target = np.random.default_rng(8).standard_normal((len(part.nodes), 3))
+    objective = part_nodes(BODY, part, target, 1.0)
+    gap = objective.rows @ v.ravel() - objective.target
+    assert gap @ gap == pytest.approx(((v[part.nodes] - target) ** 2).sum(axis=1).mean())

@@ -1,0 +1,126 @@
+"""The QP adapters: optimality, bounds-only updates against fresh set-ups, and honest status."""
+
+from __future__ import annotations
+
+import builtins
+
+import numpy as np
+import pytest
+
+from egs_warp.errors import UserError
+from egs_warp.locomotion.solvers import QpSolver, QpStatus, quadratic_program
+
+SOLVERS = pytest.mark.parametrize(("solver", "accuracy"), [(QpSolver.OSQP, 1e-4), (QpSolver.DAQP, 1e-6)])
+
+
+def random_program(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((20, 20))
+    return root @ root.T / 20 + 0.1 * np.eye(20), rng.standard_normal(20), rng.standard_normal((30, 20))
+
+
+@SOLVERS
+def test_closed_form(solver: QpSolver, accuracy: float) -> None:
+    """min (x-2)^2 + (y+1)^2 with x <= 1, y free: (1, -1), and the multiplier is positive where the upper bound pushes."""
+    program = quadratic_program(2 * np.eye(2), np.array([-4.0, 2.0]), np.eye(2), solver=solver)
+    solution = program.solve(np.array([-np.inf, -np.inf]), np.array([1.0, np.inf]))
+    assert solution.status is QpStatus.SOLVED
+    assert np.allclose(solution.x, [1.0, -1.0], atol=accuracy)
+    assert np.allclose(solution.multipliers, [2.0, 0.0], atol=accuracy)
+    assert solution.objective == pytest.approx(-4.0, abs=accuracy)
+
+
+@SOLVERS
+def test_bounds_only_updates_give_the_optimum_of_a_fresh_set_up(solver: QpSolver, accuracy: float) -> None:
+    """Eq. (13): rows switch between free, one-sided and held, as contact states do; KKT holds and x is that of a fresh solver."""
+    P, q, A = random_program(0)
+    for rows in (A, np.vstack([np.eye(20), A[:10]])):  # plain bounds first, as the contact program has them
+        rng = np.random.default_rng(1)
+        program = quadratic_program(P, q, rows, solver=solver)
+        for _ in range(12):
+            kind = rng.integers(0, 4, 30) * (rng.random(30) < 0.5)
+            lower = np.where(kind > 0, 0.0, -1.0)
+            upper = np.where(kind == 3, 0.0, np.where(kind > 0, np.inf, 1.0))
+            warm = program.solve(lower, upper)
+            fresh = quadratic_program(P, q, rows, solver=solver).solve(lower, upper)
+            assert warm.status is fresh.status is QpStatus.SOLVED
+            assert np.abs(warm.x - fresh.x).max() < 20 * accuracy
+            assert warm.objective == pytest.approx(fresh.objective, abs=accuracy)
+            assert np.abs(P @ warm.x + q + rows.T @ warm.multipliers).max() < 10 * accuracy
+            assert (rows @ warm.x - upper).max() < accuracy and (lower - rows @ warm.x).max() < accuracy
+
+
+@SOLVERS
+def test_infeasible_bounds_are_reported_and_the_next_solve_recovers(solver: QpSolver, accuracy: float) -> None:
+    """OSQP returns garbage in x when infeasible: it must not come back, nor spoil the next warm start."""
+    P, q, A = random_program(2)
+    A = np.vstack([A, A[0]])
+    program = quadratic_program(P, q, A, solver=solver)
+    lower, upper = np.full(31, -1.0), np.ones(31)
+    first = program.solve(lower, upper)
+    broken = lower.copy(), upper.copy()
+    broken[0][30], broken[1][0] = 0.5, 0.0
+    bad = program.solve(*broken)
+    assert bad.status is QpStatus.INFEASIBLE and not bad.usable
+    assert bad.objective == np.inf and not bad.x.any()
+    again = program.solve(lower, upper)
+    assert again.status is QpStatus.SOLVED and np.abs(again.x - first.x).max() < 20 * accuracy
+
+
+@SOLVERS
+def test_rows_that_repeat_each_other_may_all_be_held(solver: QpSolver, accuracy: float) -> None:
+    """A static contact holds n_d rows of rank two; held rows that agree are no contradiction."""
+    P, q, A = random_program(4)
+    A = np.vstack([A[:4], A[:4], A[0] + A[1]])
+    solution = quadratic_program(P, q, A, solver=solver).solve(np.zeros(9), np.zeros(9))
+    assert solution.status is QpStatus.SOLVED and np.abs(A @ solution.x).max() < accuracy
+    assert np.abs(P @ solution.x + q + A.T @ solution.multipliers).max() < 10 * accuracy
+
+
+def test_an_iteration_limit_is_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the limit the point may be read if it nearly obeys its bounds; one that does not has a false, low objective."""
+    P, q, A = random_program(0)
+    program = quadratic_program(P, q, A, accuracy=1e-30)
+    near = program.solve(np.zeros(30), np.full(30, np.inf))
+    assert near.status is QpStatus.ITERATION_LIMIT and near.usable
+    assert near.status.value == "the iteration limit was reached near the bounds; the last point is used"
+    monkeypatch.setattr("egs_warp.locomotion.solvers.LARGEST_BREACH", 0.0)
+    far = program.solve(np.zeros(30), np.full(30, np.inf))
+    assert far.status is QpStatus.FAILED and not far.usable and far.objective == np.inf
+
+
+def test_a_program_whose_bounds_are_all_slack(capfd: pytest.CaptureFixture[str]) -> None:
+    """As in flight: the free minimum to rounding, and no word from the solver."""
+    P, q, A = random_program(1)
+    solution = quadratic_program(P, q, A).solve(np.full(30, -1e3), np.full(30, 1e3))
+    assert solution.status is QpStatus.SOLVED and np.abs(P @ solution.x + q).max() < 1e-9
+    assert not solution.multipliers.any() and not capfd.readouterr().out
+
+
+def test_same_solves_give_the_same_bits() -> None:
+    """No step of a solver may depend on the clock."""
+    P, q, A = random_program(3)
+    for solver in QpSolver:
+        runs = []
+        for _ in range(2):
+            program = quadratic_program(P, q, A, solver=solver)
+            solutions = [program.solve(np.full(30, -s), np.full(30, s)) for s in (1.0, 0.1, 0.5)]
+            runs.append(np.concatenate([s.x for s in solutions] + [s.multipliers for s in solutions]))
+        assert runs[0].tobytes() == runs[1].tobytes()
+
+
+def test_daqp_is_optional(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The engine does not need DAQP; whoever asks for it without having it is told what to do."""
+    real = builtins.__import__
+
+    def without(name: str, *rest, **options):
+        if name == "daqp":
+            raise ImportError(name)
+        return real(name, *rest, **options)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    P, q, A = random_program(0)
+    with pytest.raises(
+        UserError, match=r"^QP solver daqp: the package is not installed; pip install daqp, or use osqp$"
+    ):
+        quadratic_program(P, q, A, solver=QpSolver.DAQP)

@@ -1,0 +1,194 @@
+"""The two-stage stepper (Eq. 12, 13): every step audited by hand, bit-identical runs, subdivision of a step that fails."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from egs_warp.contact.detection import ContactGeometry
+from egs_warp.deformation.embedding import embed_points
+from egs_warp.fem.body import BodyState, SoftBody, make_body
+from egs_warp.geometry.plane import Plane
+from egs_warp.locomotion.objectives import Objective, SpinObjective, centre_of_mass_velocity, node_velocities
+from egs_warp.locomotion.solvers import QpSolver
+from egs_warp.locomotion.stepper import LocomotionSettings, LocomotionStepper, StepMemory, StepReport
+from egs_warp.locomotion.strategies import PATIENCE, Strategy
+from egs_warp.muscles.fibres import Fibre, FibreKind
+from egs_warp.muscles.muscle_set import attach_fibres
+from tests.support.meshes import block_mesh
+
+DT, FRICTION = 1 / 60, 0.8
+FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+
+
+SIDE = np.linspace(-0.2, 0.2, 5)
+GRID = np.array([[x, y] for x in SIDE for y in SIDE])
+
+
+def muscular_block(
+    device: str = "cpu", *, feet: np.ndarray = GRID, settings: LocomotionSettings | None = None
+) -> LocomotionStepper:
+    """A block with eight longitudinal and six radial fibres and contact points ``feet`` (n, 2) under its base."""
+    mesh = block_mesh()
+    body = make_body(mesh, FLOOR, sag=0.03, device=device)
+    heights = np.array([0.02, 0.26, 0.5, 0.74, 0.98])
+    fibres = []
+    for k in range(8):
+        across = 0.15 * np.array([np.cos(k * np.pi / 4), np.sin(k * np.pi / 4)])
+        points = np.column_stack([np.tile(across, (5, 1)), heights])
+        fibres.append(Fibre(f"long{k}", FibreKind.LONGITUDINAL, points, 2.0 * body.weight))
+    for k, z in enumerate((0.25, 0.5, 0.75)):
+        for axis in np.eye(3)[:2]:
+            ends = np.stack([-0.18 * axis, 0.18 * axis]) + [0, 0, z]
+            fibres.append(Fibre(f"radial{k}{axis}", FibreKind.RADIAL, ends, 2.0 * body.weight))
+    embedding = embed_points(mesh, np.column_stack([feet, np.zeros(len(feet))]), device="cpu")
+    geometry = ContactGeometry(mesh, (FLOOR,), FRICTION, embedding.tets.numpy(), embedding.weights.numpy(), 0, 0.0)
+    return LocomotionStepper(body, attach_fibres(mesh, fibres), geometry, settings=settings, device=device)
+
+
+def hop(body: SoftBody, step: int) -> list[Objective | SpinObjective]:
+    """Down for six steps, then up and forwards, kept upright."""
+    velocity = np.array([0.0, 0.0, -0.4]) if step < 6 else np.array([0.1, 0.0, 0.25 * (step - 5)])
+    pose = np.tile(velocity, (len(body.mesh.nodes), 1))
+    return [
+        centre_of_mass_velocity(body, velocity, 1.0),
+        SpinObjective(np.zeros(3), 1.0),
+        node_velocities(body, pose, 0.02),
+    ]
+
+
+def run_hop(stepper: LocomotionStepper, steps: int) -> tuple[list[BodyState], list[StepReport]]:
+    body = stepper.body
+    states, reports = [BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))], []
+    memory = stepper.initial_memory()
+    for i in range(steps):
+        end, memory, fresh = stepper.advance(states[-1], memory, hop(body, i), DT)
+        reports += fresh
+        states += [report.state for report in fresh]
+        assert end is fresh[-1].state
+    return states, reports
+
+
+def test_audit_of_a_hop(device: str) -> None:
+    """Eq. (4), Eq. (9), Eq. (12), Eq. (13): momentum 1e-5, angular 1e-4, cone 1e-4, complementarity 1e-4, penetration 0.01."""
+    stepper = muscular_block(device)
+    body = stepper.body
+    states, reports = run_hop(stepper, 16)
+    weight, height = body.weight, body.height
+    assert len(states) == len(reports) + 1
+    for before, report in zip(states[:-1], reports, strict=True):
+        after, dt = report.state, report.dt
+        # By hand: world forces at world points.
+        points = np.einsum("nw,nwi->ni", report.contacts.weights, before.positions[report.contacts.nodes])
+        forces = np.einsum("na,nai->ni", report.forces, report.contacts.axes)
+        gain = (body.node_mass[:, None] * (after.velocities - before.velocities)).sum(0) / dt
+        assert np.linalg.norm(gain - body.mass * body.gravity - forces.sum(0)) <= 1e-5 * weight
+        arms = points - body.centre_of_mass(before.positions)
+        spin = (
+            body.angular_momentum(after.positions, after.velocities)
+            - body.angular_momentum(before.positions, before.velocities)
+        ) / dt
+        assert np.linalg.norm(spin - np.cross(arms, forces).sum(0)) <= 1e-4 * weight * height
+        assert report.forces[:, 0].min(initial=0.0) >= -1e-4 * weight
+        slack = np.linalg.norm(report.forces[:, 1:], axis=1) - FRICTION * report.forces[:, 0]
+        assert slack.max(initial=0.0) <= 1e-4 * weight
+        ends = np.einsum("nw,nwi->ni", report.contacts.weights, after.positions[report.contacts.nodes])
+        gaps = FLOOR.heights(ends)
+        assert np.allclose(gaps, report.end_gaps, atol=1e-12)
+        assert (report.forces[:, 0] * np.maximum(gaps, 0.0)).max(initial=0.0) <= 1e-4 * weight * height
+        assert report.min_gap >= -0.01 * height
+        assert report.converged and body.assembly.determinants(after.positions).min() > 0.0
+        assert np.all(np.abs(report.activations) <= stepper.muscles.bounds * (1 + 1e-12))
+        assert 0 < report.qp_count <= PATIENCE * stepper.settings.qp_limit
+        # The end positions are those of the implicit step; the spin correction only turns the velocities.
+        moved = after.positions - before.positions
+        turned = after.velocities - moved / dt
+        assert np.linalg.norm(body.centre_of_mass(turned)) < 1e-9
+    # The muscles did something: the body went down, then up faster than the floor's mere push-out could.
+    speeds = [body.centre_of_mass(s.velocities)[2] for s in states]
+    assert min(speeds) < -0.2 and max(speeds) > 0.8
+    assert max(np.abs(r.activations / stepper.muscles.bounds).max() for r in reports) > 0.05
+
+
+def test_two_runs_are_bit_identical() -> None:
+    """Same device, same input: positions, velocities, forces and activations agree to the last bit."""
+    runs = [run_hop(muscular_block(), 10) for _ in range(2)]
+    for (states, reports), (others, twins) in [runs]:
+        for a, b in zip(states, others, strict=True):
+            assert a.positions.tobytes() == b.positions.tobytes() and a.velocities.tobytes() == b.velocities.tobytes()
+        for r, s in zip(reports, twins, strict=True):
+            assert r.forces.tobytes() == s.forces.tobytes() and r.activations.tobytes() == s.activations.tobytes()
+            assert np.array_equal(r.contacts.points, s.contacts.points) and r.qp_count == s.qp_count
+
+
+@pytest.mark.parametrize("solver", list(QpSolver))
+@pytest.mark.parametrize(
+    "feet",
+    [
+        np.column_stack([np.linspace(-0.2, 0.2, 7), np.zeros(7)]),
+        np.repeat([[-0.2, -0.2], [0.2, -0.2], [0.0, 0.2]], 4, axis=0),
+        np.zeros((1, 2)),
+        np.random.default_rng(0).uniform(-0.2, 0.2, (40, 2)),
+    ],
+    ids=["line", "duplicates", "one point", "forty points"],
+)
+def test_degenerate_contact_sets_never_lose_a_frame(feet: np.ndarray, solver: QpSolver) -> None:
+    """Eq. (9), Eq. (13): every step converges, finds feasible states and keeps its points out of the ground."""
+    stepper = muscular_block(feet=feet, settings=LocomotionSettings(contact_pivot_tolerance=0.0, qp_solver=solver))
+    _, reports = run_hop(stepper, 8)
+    assert len(reports) == 8
+    for report in reports:
+        assert report.converged and report.qp_count >= 1 and report.qp_infeasible == 0
+        assert np.isfinite(report.state.velocities).all() and np.isfinite(report.forces).all()
+        assert report.min_gap > -0.01 * stepper.body.height
+    assert any(report.contacts.count > 0 for report in reports)
+
+
+@pytest.mark.parametrize("strategy", [Strategy.STATIC, Strategy.QPCC, Strategy.TWO_STAGE])
+def test_every_strategy_drives_the_stepper(strategy: Strategy) -> None:
+    """Eq. (12), Eq. (13): the same steps with another search; all static takes one QP, two where that has no solution."""
+    settings = LocomotionSettings(strategy=strategy, qp_limit=6, qp_solver=QpSolver.DAQP)
+    _, reports = run_hop(muscular_block(settings=settings), 6)
+    assert all(report.converged for report in reports)
+    assert strategy is not Strategy.STATIC or max(report.qp_count for report in reports) <= 2
+
+
+class LateStepper(LocomotionStepper):
+    """Says of every step longer than ``longest`` that it did not converge."""
+
+    longest = 0.0
+
+    def step(
+        self, state: BodyState, memory: StepMemory, objectives: list[Objective | SpinObjective], dt: float
+    ) -> tuple[BodyState, StepMemory, StepReport]:
+        end, after, report = super().step(state, memory, objectives, dt)
+        return end, after, replace(report, converged=dt <= self.longest)
+
+
+@pytest.mark.parametrize(("longest", "parts"), [(1.0, 1), (0.6, 2), (0.3, 4), (0.01, 16)])
+def test_a_step_that_does_not_converge_is_subdivided(longest: float, parts: int) -> None:
+    """Halved until it converges, four times over at most; the parts make up the step and the last failure stays reported."""
+    made = muscular_block()
+    stepper = LateStepper(made.body, made.muscles, made.geometry, device="cpu")
+    stepper.longest = longest * DT
+    start = BodyState(made.body.mesh.nodes, np.zeros_like(made.body.mesh.nodes))
+    end, _, reports = stepper.advance(start, stepper.initial_memory(), hop(made.body, 0), DT)
+    assert len(reports) == parts
+    assert sum(report.dt for report in reports) == pytest.approx(DT)
+    assert end.time == pytest.approx(DT)
+    assert [report.converged for report in reports] == [longest > 0.05] * parts
+
+
+def test_flight_needs_no_qp_contacts_and_keeps_the_parabola() -> None:
+    """Eq. (4): in the air there is no contact and muscles move the centre of mass by nothing."""
+    stepper = muscular_block()
+    body = stepper.body
+    state = BodyState(body.mesh.nodes + [0, 0, 1.0], np.tile([0.5, 0.0, 1.0], (len(body.mesh.nodes), 1)))
+    memory, start = stepper.initial_memory(), body.centre_of_mass(state.positions)
+    for i in range(6):
+        state, memory, reports = stepper.advance(state, memory, hop(body, i), DT)
+        assert all(r.contacts.count == 0 and r.forces.shape == (0, 3) for r in reports)
+    discrete = start + 6 * DT * np.array([0.5, 0.0, 1.0]) + 0.5 * DT**2 * 6 * 7 * body.gravity
+    assert np.abs(body.centre_of_mass(state.positions) - discrete).max() < 1e-6 * body.height

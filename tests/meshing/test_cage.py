@@ -1,0 +1,268 @@
+"""The cage: enclosure, quality, flat floor, determinism; isosurface stuffing; the voxel solid."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from egs_warp.assets import pawn
+from egs_warp.errors import UserError
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.io import read_capture
+from egs_warp.kernels.meshing.occupancy import enclosed_kernel
+from egs_warp.meshing.cage import Cage, CageMethod, build_cage
+from egs_warp.meshing.occupancy import solid_from_gaussians
+from egs_warp.meshing.stuffing import stuff
+from egs_warp.segmentation.base_plane import find_base_plane
+
+_UP = np.array([0.0, 0.0, 1.0])
+_FLOOR = Plane(_UP, 0.0)
+
+
+def _cloud(points: np.ndarray, sigma: float, opacity: float = 0.9, device: str | None = None) -> GaussianCloud:
+    """Round Gaussians."""
+    count = len(points)
+    return GaussianCloud.from_numpy(
+        points,
+        np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+        np.full((count, 3), np.log(sigma)),
+        np.full(count, np.log(opacity / (1.0 - opacity))),
+        np.zeros((count, 1, 3)),
+        device=device,
+    )
+
+
+def _box_surface(low: tuple[float, ...], high: tuple[float, ...], count: int, seed: int = 0) -> np.ndarray:
+    """Random points on the six sides of a box."""
+    random = np.random.default_rng(seed)
+    points = random.uniform(low, high, (count, 3))
+    axis, side = random.integers(0, 3, count), random.integers(0, 2, count)
+    points[np.arange(count), axis] = np.where(side, np.take(high, axis), np.take(low, axis))
+    return points
+
+
+def _check(cage: Cage, plane: Plane, *, flat: float = 1e-9) -> None:
+    """What every cage holds."""
+    height = cage.height(plane)
+    above = plane.heights(cage.mesh.nodes)
+    assert above.min() >= -flat * height
+    assert np.sum(np.abs(above) < flat * height) >= 12
+    assert cage.enclosed_opacity_mass >= 0.999
+    assert cage.min_dihedral_degrees >= 8.0
+    assert cage.min_dihedral_degrees == pytest.approx(cage.mesh.min_dihedral_degrees())
+    assert 300 <= len(cage.mesh.nodes) <= 1500
+    assert np.all(cage.mesh.volumes() > 0.0)
+    faces = cage.mesh.boundary_faces()
+    _, uses = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
+    assert np.all(uses % 2 == 0), "the surface is not closed"
+
+
+def _digest(mesh: TetMesh) -> str:
+    return hashlib.sha256(mesh.nodes.tobytes() + mesh.tets.tobytes()).hexdigest()
+
+
+def test_pawn_cage(device: str) -> None:
+    """The built-in pawn: all promises, on every device."""
+    thing = pawn(device=device)
+    cage = build_cage(thing.cloud, thing.plane)
+    _check(cage, thing.plane)
+    assert cage.method is CageMethod.VOXEL
+    assert cage.height(thing.plane) == pytest.approx(1.0, abs=0.04)
+    # The base, 0.29 in radius, rests on a disc of that size: bottom faces cover its area within the dilation.
+    floor = [f for f in cage.mesh.boundary_faces() if np.all(cage.mesh.nodes[f, 2] < 1e-9)]
+    corners = cage.mesh.nodes[np.array(floor)][:, :, :2]
+    sides = corners[:, 1:] - corners[:, :1]
+    area = 0.5 * np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]).sum()
+    assert np.pi * 0.25**2 < area < np.pi * 0.33**2
+
+
+def test_same_bits_in_another_process() -> None:
+    """Two processes build the same pawn and the same cage, bit by bit."""
+    program = (
+        "import hashlib; from egs_warp.assets import pawn; from egs_warp.meshing.cage import build_cage; p = pawn();"
+        "m = build_cage(p.cloud, p.plane).mesh;"
+        "print('digest', hashlib.sha256(m.nodes.tobytes() + m.tets.tobytes()).hexdigest())"
+    )
+    other = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    thing = pawn()
+    assert f"digest {_digest(build_cage(thing.cloud, thing.plane).mesh)}" in other.stdout
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "up"), [("monkey.ply", (0, 1, 0)), ("plush_dog.ply", (0, -1, 0)), ("robot.spz", (0, 1, 0))]
+)
+def test_real_captures(data_dir, name: str, up: tuple[int, int, int]) -> None:
+    """Every real object gets a cage that keeps all promises."""
+    cloud = read_capture(data_dir / "objects" / name).cloud
+    plane = find_base_plane(cloud, np.array(up, float))
+    cage = build_cage(cloud, plane)
+    _check(cage, plane)
+    assert cage.floater_opacity_mass < 0.001
+    assert cage.below_plane_opacity_mass <= 0.03
+
+
+@pytest.mark.parametrize("scale", [0.1, 3.0])
+def test_scale_free(scale: float) -> None:
+    """The cage of the scaled object is the scaled cage."""
+    thing = pawn(gaussian_count=6000)
+    cage = build_cage(thing.cloud, thing.plane)
+    scaled = build_cage(thing.cloud.scaled(scale), thing.plane.scaled(scale))
+    assert abs(len(scaled.mesh.nodes) - len(cage.mesh.nodes)) < 0.05 * len(cage.mesh.nodes)
+    assert scaled.mesh.volumes().sum() == pytest.approx(scale**3 * cage.mesh.volumes().sum(), rel=0.01)
+    assert cage.scaled(scale).mesh.volumes().sum() == pytest.approx(scale**3 * cage.mesh.volumes().sum())
+
+
+def test_thin_legs_survive() -> None:
+    """Four legs of 1/20 of the height reach the floor and hang together with the seat."""
+    legs = [
+        _box_surface((x - 0.025, y - 0.025, 0.0), (x + 0.025, y + 0.025, 0.8), 1500, seed)
+        for seed, (x, y) in enumerate([(-0.3, -0.3), (0.3, -0.3), (-0.3, 0.3), (0.3, 0.3)])
+    ]
+    cloud = _cloud(np.concatenate([*legs, _box_surface((-0.35, -0.35, 0.8), (0.35, 0.35, 0.9), 4000)]), 0.008)
+    cage = build_cage(cloud, _FLOOR)
+    _check(cage, _FLOOR)
+    feet = cage.mesh.nodes[np.abs(cage.mesh.nodes[:, 2]) < 1e-9]
+    for x in (-1, 1):
+        for y in (-1, 1):
+            assert np.sum((feet[:, 0] * x > 0.2) & (feet[:, 1] * y > 0.2)) >= 4
+    assert not np.any(np.all(np.abs(feet[:, :2]) < 0.2, axis=1)), "the space between the legs was filled"
+
+
+def test_floaters_and_strays_make_no_elements() -> None:
+    """Far floaters, a faint giant and fuzz below the floor leave the cage as it is without them."""
+    body = _box_surface((-0.2, -0.2, 0.0), (0.2, 0.2, 1.0), 8000)
+    random = np.random.default_rng(1)
+    floaters = random.uniform(-4.0, 4.0, (150, 3)) * [1, 1, 0.5] + [0.0, 0.0, 4.0]
+    clean = _cloud(body, 0.01)
+    means = np.concatenate([body, floaters, [[0.0, 0.0, 0.5]], random.uniform(-0.2, 0.2, (100, 3)) - [0, 0, 0.3]])
+    logs = np.concatenate([np.full((8150, 3), np.log(0.01)), np.full((1, 3), np.log(3.0)), np.full((100, 3), -4.6)])
+    logits = np.concatenate([np.full(8150, 2.2), [-2.5], np.full(100, 2.2)])
+    dirty = GaussianCloud.from_numpy(
+        means, np.tile([1.0, 0, 0, 0], (len(means), 1)), logs, logits, np.zeros((len(means), 1, 3))
+    )
+    cage, other = build_cage(clean, _FLOOR), build_cage(dirty, _FLOOR)
+    _check(other, _FLOOR)
+    assert other.mesh.volumes().sum() == pytest.approx(cage.mesh.volumes().sum(), rel=0.05)
+    assert other.floater_opacity_mass == pytest.approx(150 / 8250, rel=0.05)
+    assert other.below_plane_opacity_mass == pytest.approx(100 / 8250, rel=0.05)
+
+
+def test_open_and_pierced_surface_is_filled() -> None:
+    """A shell without a bottom and with a hole in its side still is a solid."""
+    shell = _box_surface((-0.3, -0.3, 0.0), (0.3, 0.3, 1.0), 12000)
+    closed = build_cage(_cloud(shell, 0.01), _FLOOR)
+    shell = shell[(shell[:, 2] > 0.01) & ~((shell[:, 0] > 0.29) & (np.abs(shell[:, 2] - 0.5) < 0.06))]
+    cage = build_cage(_cloud(shell, 0.01), _FLOOR)
+    assert 0.95 < cage.mesh.volumes().sum() / closed.mesh.volumes().sum() < 1.25
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        (np.random.default_rng(0).uniform(-1, 1, (3000, 3)) * [1, 1, 0] + [0, 0, 0.001], "it is flat"),
+        (np.full((10, 3), 0.5), "at one point"),
+        (np.random.default_rng(0).uniform(-1, 1, (3000, 3)) - [0, 0, 5], "nothing opaque stands on the plane"),
+    ],
+)
+def test_degenerate_objects(points: np.ndarray, message: str) -> None:
+    """A sheet, a point, and an object below its plane are refused in one line."""
+    with pytest.raises(UserError, match=message) as caught:
+        build_cage(_cloud(points, 0.001), _FLOOR)
+    assert "\n" not in str(caught.value)
+
+
+def test_target_nodes() -> None:
+    """More nodes are given when asked; nonsense is refused."""
+    thing = pawn(gaussian_count=6000)
+    cage = build_cage(thing.cloud, thing.plane, target_nodes=1200)
+    assert len(cage.mesh.nodes) == pytest.approx(1200, rel=0.15)
+    with pytest.raises(UserError, match="cage: 3 nodes asked; give a number from 50 to 20000"):
+        build_cage(thing.cloud, thing.plane, target_nodes=3)
+
+
+@pytest.mark.slow
+def test_tetwild() -> None:
+    """fTetWild keeps the same promises where it is chosen."""
+    thing = pawn(gaussian_count=6000)
+    _check(build_cage(thing.cloud, thing.plane, method=CageMethod.TETWILD), thing.plane)
+
+
+@settings(max_examples=25, deadline=None)
+@example(325082, 0.098)
+@given(st.integers(0, 10**6), st.floats(0.08, 0.16))
+def test_stuffing_quality(seed: int, cell: float) -> None:
+    """Any smooth solid: closed surface, flat floor, no angle below 8 degrees, volume that of the level set."""
+    random = np.random.default_rng(seed)
+    axes, centre = random.uniform(0.3, 0.5, 3), np.array([0.0, 0.0, 0.31]) + random.uniform(-0.05, 0.05, 3)
+    wave = random.uniform(6.0, 12.0, 3)
+
+    def field(x: np.ndarray) -> np.ndarray:
+        return (np.linalg.norm((x - centre) / axes, axis=1) - 1.0) * axes.min() + 0.03 * np.sin(x @ wave)
+
+    low, high = np.array([-0.7, -0.7, 0.0]), np.array([0.7, 0.7, 1.0])
+    mesh = TetMesh.oriented(*stuff(field, low, high, cell))
+    faces = mesh.boundary_faces()
+    _, uses = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
+    assert np.all(uses % 2 == 0)
+    assert mesh.nodes[:, 2].min() >= 0.0
+    assert mesh.min_dihedral_degrees() >= 8.0
+    probe = random.uniform(low, high, (200_000, 3))
+    expected = np.mean(field(probe) < 0.0) * np.prod(high - low)
+    assert mesh.volumes().sum() == pytest.approx(expected, rel=0.08)
+    surface = np.unique(faces)
+    off_floor = surface[mesh.nodes[surface, 2] > 1e-9]
+    assert np.median(np.abs(field(mesh.nodes[off_floor]))) < 1e-3
+
+
+def test_stuffing_converges() -> None:
+    """The volume of a half ball converges at second order in the cell."""
+    errors = []
+    for cell in (0.2, 0.1, 0.05):
+        nodes, tets = stuff(
+            lambda x: np.linalg.norm(x, axis=1) - 1.0, np.array([-1.1, -1.1, 0.0]), np.array([1.1, 1.1, 1.1]), cell
+        )
+        errors.append(abs(TetMesh.oriented(nodes, tets).volumes().sum() - 2.0 * np.pi / 3.0))
+    assert np.log2(errors[0] / errors[2]) / 2.0 > 1.7
+
+
+def test_enclosed_kernel_against_a_slow_twin(device: str) -> None:
+    """The 26-direction fill equals a plain Python march."""
+    occupied = np.random.default_rng(3).random((7, 6, 5)) < 0.25
+    filled = wp.zeros(occupied.shape, dtype=wp.uint8, device=device)
+    wp.launch(
+        enclosed_kernel,
+        dim=occupied.shape,
+        inputs=[wp.array(occupied.astype(np.uint8), dtype=wp.uint8, device=device), 18],
+        outputs=[filled],
+        device=device,
+    )
+    expected = occupied.copy()
+    for start in np.argwhere(~occupied):
+        hits = 0
+        for step in np.argwhere(np.ones((3, 3, 3))) - 1:
+            at = start + step
+            while np.any(step) and np.all(at[:2] >= 0) and np.all(at < occupied.shape):
+                if at[2] < 0 or occupied[tuple(at)]:
+                    hits += 1
+                    break
+                at = at + step
+        expected[tuple(start)] = hits >= 18
+    assert np.array_equal(filled.numpy().astype(bool), expected)
+
+
+def test_solid_ignores_order_of_gaussians() -> None:
+    """Integer sums: any order of the Gaussians gives the same solid."""
+    thing = pawn(gaussian_count=5000)
+    shuffled = thing.cloud.subset(np.random.default_rng(0).permutation(thing.cloud.count))
+    first, second = (solid_from_gaussians(cloud, thing.plane) for cloud in (thing.cloud, shuffled))
+    assert np.array_equal(first.inside, second.inside)

@@ -1,0 +1,82 @@
+"""Feet of simple bodies, and what a trajectory says of them."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from egs_warp.errors import UserError
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.feet import feet_around, find_feet, foot_of_node
+from egs_warp.motions.footfalls import footfalls
+from tests.muscles.test_skeleton import figure, stool
+from tests.support.meshes import block_mesh
+
+STOOL = stool()
+FEET = find_feet(STOOL, STOOL.nodes[:, 2], 0.8)
+
+
+def test_a_stool_has_four_feet_with_their_legs() -> None:
+    """Each foot is one corner of the ground; its leg reaches up to the seat and moves with it less and less."""
+    corners = {tuple(np.sign(STOOL.nodes[foot.sole, :2].mean(axis=0)).astype(int)) for foot in FEET}
+    assert corners == {(1, 1), (1, -1), (-1, 1), (-1, -1)}
+    for foot in FEET:
+        assert np.all(STOOL.nodes[foot.sole, 2] == 0.0) and np.all(foot.leg[foot.sole] == 1.0)
+        assert foot.length == pytest.approx(0.6, abs=0.11)
+        along = np.flatnonzero(foot.leg)
+        assert np.all(np.sign(STOOL.nodes[along, :2]) == np.sign(STOOL.nodes[foot.sole, :2].mean(axis=0)))
+        order = along[np.argsort(STOOL.nodes[along, 2])]
+        assert np.all(np.diff(foot.leg[order]) <= 1e-12)
+    assert np.all(np.sum([foot.leg > 0 for foot in FEET], axis=0) <= 1)
+
+
+def test_feet_are_named_around_the_body() -> None:
+    """Anticlockwise from above, so that every other one is opposite."""
+    order = feet_around(FEET, STOOL.nodes, np.array([0.0, 0.0, 1.0]))
+    centres = [STOOL.nodes[FEET[index].sole, :2].mean(axis=0) for index in order]
+    turns = [np.cross([*a, 0.0], [*b, 0.0])[2] for a, b in zip(centres, [*centres[1:], centres[0]], strict=True)]
+    assert min(turns) > 0.0
+    assert np.allclose(centres[0], -centres[2], atol=1e-12) and np.allclose(centres[1], -centres[3], atol=1e-12)
+
+
+@pytest.mark.parametrize(("mesh", "height", "count"), [(block_mesh(), 1.0, 1), (figure(), 1.4, 2)])
+def test_other_bodies_have_other_numbers_of_feet_and_do_not_walk(mesh, height: float, count: int) -> None:
+    feet = find_feet(mesh, mesh.nodes[:, 2], height)
+    assert len(feet) == count
+    with pytest.raises(UserError, match=f"walk: a walk needs four separate feet, the body has {count}"):
+        feet_around(feet, mesh.nodes, np.array([0.0, 0.0, 1.0]))
+
+
+def made_trajectory() -> Trajectory:
+    """Six steps of a stool of 100 kg: foot 0 slides 1 mm a step under load for three, swings 50 mm in one, and stands still for two."""
+    strides = np.array([0.0, 0.001, 0.001, 0.001, 0.05, 0.0, 0.0]).cumsum()
+    leg = FEET[0].leg[:, None] > 0
+    positions = STOOL.nodes + strides[:, None, None] * leg * [1.0, 0.0, 0.0]
+    loaded = [0, 1, 2, 4, 5]
+    return cast(
+        Trajectory,
+        SimpleNamespace(
+            time=np.arange(7) / 60.0,
+            positions=positions,
+            node_mass=np.full(len(STOOL.nodes), 100.0 / len(STOOL.nodes)),
+            gravity=np.array([0.0, 0.0, -10.0]),
+            contact_step=np.array(loaded),
+            contact_nodes=np.full((5, 4), FEET[0].sole[0]),
+            contact_weights=np.tile([1.0, 0.0, 0.0, 0.0], (5, 1)),
+            contact_normal=np.tile([0.0, 0.0, 1.0], (5, 1)),
+            contact_force=np.tile([0.0, 0.0, 250.0], (5, 1)),
+        ),
+    )
+
+
+def test_slip_is_the_way_of_loaded_contacts_and_swings_do_not_count() -> None:
+    """3 mm over three steps; the sole's shift counts from where the foot came to stand, so 2 mm; one landing."""
+    assert foot_of_node(FEET)[FEET[0].sole[0]] == 0
+    fell = footfalls(made_trajectory(), FEET, stride=0.1)
+    assert (fell.slip, fell.sole_shift) == (pytest.approx(0.03), pytest.approx(0.02))
+    assert fell.landings == 1
+    later = footfalls(made_trajectory(), FEET, stride=0.1, first=3)
+    assert (later.slip, later.sole_shift, later.landings) == (0.0, 0.0, 1)

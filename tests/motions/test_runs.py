@@ -1,0 +1,92 @@
+"""Whole motions of the pawn: what was asked is reached, and every audit bound holds (slow)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egs_warp.assets import pawn
+from egs_warp.contact.terrain import step
+from egs_warp.fem.body import BodyState
+from egs_warp.geometry.plane import Plane
+from egs_warp.locomotion.rollout import simulate
+from egs_warp.locomotion.trajectory import Reached, audit, measure
+from egs_warp.motions.follow import Follow
+from egs_warp.motions.hop import Hop
+from egs_warp.motions.keyframes import Quantity
+from egs_warp.motions.repertoire import longest, parts_of
+from egs_warp.motions.script import parse_script
+from egs_warp.motions.sequence import MotionSequence
+from egs_warp.pipelines.creature import first_place, make_creature
+
+UP = np.array([0.0, 0.0, 1.0])
+FORWARD = np.array([1.0, 0.0, 0.0])
+
+
+def run(script: str, **ground) -> tuple[MotionSequence, list[Reached], np.ndarray]:
+    """Simulate ``script``; returns the sequence, what each motion reached, and the nodes at its end. Asserts the audit."""
+    thing = pawn(device="cpu")
+    creature = make_creature(thing.cloud, plane=thing.plane, **ground)
+    requests = parse_script(script)
+    sequence = MotionSequence(first_place(creature, FORWARD), parts_of(requests, creature.body.height))
+    simulation = simulate(
+        creature.stepper,
+        creature.geometry,
+        creature.start,
+        sequence,
+        frames=longest(requests),
+        finished=lambda: sequence.finished,
+    )
+    trajectory = simulation.trajectory
+    bounds = audit(trajectory, newton_unconverged=sum(not report.converged for report in simulation.reports))
+    assert bounds.momentum_residual <= 1e-5 and bounds.angular_momentum_residual <= 1e-4
+    assert bounds.cone_violation <= 1e-4 and bounds.penetration <= 0.01 and bounds.complementarity_gap <= 1e-4
+    assert bounds.inverted_elements == 0 and bounds.newton_unconverged == 0
+    spans = sequence.spans(trajectory.time)
+    reached = [measure(trajectory, first=first, last=last) for first, last in spans]
+    return sequence, reached, trajectory.positions[[last for _, last in spans]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("degrees", [180.0, -90.0])
+def test_twist_lands_at_its_angle_on_the_spot(degrees: float) -> None:
+    _, (reached,), _ = run(f"twist {degrees:g}")
+    assert reached.heading_degrees == pytest.approx(degrees, abs=10.0)
+    assert reached.distance <= 0.1 and reached.tilt_degrees < 10.0 and reached.airborne_frames > 10.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("script", "ground"),
+    [
+        ("hop 0.7 0.3 x2", {}),
+        ("hop 0.7 0.3", {"gravity_up": np.array([np.sin(np.radians(10.0)), 0.0, np.cos(np.radians(10.0))])}),
+        (
+            "hop 0.8 0.25",
+            {"solids": (step(Plane(UP, 0.0), 0.48 * FORWARD, FORWARD, 0.2),)},
+        ),
+    ],
+    ids=["level", "slope", "step"],
+)
+def test_hops_land_on_their_squares(script: str, ground: dict) -> None:
+    sequence, reached, ends = run(script, **ground)
+    for done, end, result in zip(sequence.done, ends, reached, strict=True):
+        assert isinstance(done.motion, Hop)
+        assert done.motion.miss(end) <= 0.1 * done.motion.target.distance
+        assert result.tilt_degrees < 12.0 and result.airborne_frames > 10.0
+
+
+@pytest.mark.slow
+def test_the_head_follows_its_key_and_the_body_comes_to_rest(tmp_path: Path) -> None:
+    """The key asks for 0.05; measured on two cores, it is missed by 0.0002. A body that only stands misses it by 0.05."""
+    file = tmp_path / "keys.csv"
+    file.write_text("time,part,quantity,x,y,z\n0.5,head,position,0.05,0,0\n")
+    sequence, (reached,), (end,) = run(f"trajectory {file}")
+    follow = sequence.done[0].motion
+    assert isinstance(follow, Follow) and sequence.finished and follow.notes() == []
+    assert follow.planned()["worst_miss"] < 0.002
+    held = follow._measured("head", Quantity.POSITION, BodyState(end, 0 * end))
+    assert np.allclose(held, [0.05, 0.0, 0.0], atol=0.002)
+    assert reached.tilt_degrees < 2.0 and reached.airborne_frames == 0.0

@@ -1,0 +1,237 @@
+"""Muscle columns (Eq. 7) and how fibres attach to the body."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sparse
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.sparse.linalg import spsolve
+
+from egs_warp.errors import UserError
+from egs_warp.fem.body import SoftBody, make_body
+from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.muscles.attachments import attachment_rows, edge_graph
+from egs_warp.muscles.fibres import Fibre, FibreKind
+from egs_warp.muscles.muscle_set import MuscleColumns, MuscleSet, attach_fibres, automatic_muscles, muscle_columns
+
+
+def box_mesh(counts: tuple[int, int, int], size: tuple[float, float, float]) -> TetMesh:
+    """A box with its base centred at the origin, each of its cells cut into six tetrahedra."""
+    grid = np.stack(np.meshgrid(*[np.arange(n + 1) for n in counts], indexing="ij"), axis=-1)
+    nodes = (grid / np.array(counts) * np.array(size) - [size[0] / 2, size[1] / 2, 0.0]).reshape(-1, 3)
+    index = np.arange(len(nodes)).reshape(grid.shape[:3])
+    cells = np.stack(
+        [index[a : a + counts[0], b : b + counts[1], c : c + counts[2]].ravel() for a, b, c in np.ndindex(2, 2, 2)],
+        axis=1,
+    )
+    # Cells mirror their neighbours, so that the mesh prefers no diagonal and mirrors in x = 0 and y = 0.
+    odd = np.stack(np.meshgrid(*[np.arange(n) % 2 for n in counts], indexing="ij"), axis=-1).reshape(-1, 3) @ [4, 2, 1]
+    cells = np.take_along_axis(cells, np.arange(8)[None] ^ odd[:, None], axis=1)
+    paths = [(0, 1, 3, 7), (0, 1, 5, 7), (0, 2, 3, 7), (0, 2, 6, 7), (0, 4, 5, 7), (0, 4, 6, 7)]
+    return TetMesh.oriented(nodes, np.concatenate([cells[:, path] for path in paths]))
+
+
+COLUMN = box_mesh((4, 4, 10), (0.4, 0.4, 1.0))
+
+
+def random_muscles(rng: np.random.Generator) -> MuscleSet:
+    fibres = [
+        Fibre(f"fibre {i}", FibreKind.USER, rng.uniform([-0.2, -0.2, 0.0], [0.2, 0.2, 1.0], (4, 3)), 10.0 ** (i - 2))
+        for i in range(5)
+    ]
+    return attach_fibres(COLUMN, fibres)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_columns_make_no_net_force_or_torque(seed: int) -> None:
+    """Eq. (7): whatever the pose, every column's nodal forces sum to nothing and turn nothing."""
+    rng = np.random.default_rng(seed)
+    muscles = random_muscles(rng)
+    positions = COLUMN.nodes + rng.normal(0.0, 0.05, COLUMN.nodes.shape) + rng.normal(0.0, 1.0, 3)
+    forces = muscle_columns(muscles, positions).reshape(-1, 3, muscles.segment_count)
+    scale = np.abs(forces).sum(axis=(0, 1))
+    assert np.all(np.abs(forces.sum(axis=0)) <= 1e-14 * scale)
+    torques = np.cross(positions[:, :, None], forces, axis=1).sum(axis=0)
+    assert np.all(np.abs(torques) <= 1e-14 * scale * np.abs(positions).max())
+
+
+def test_columns_are_equation_7(device: str) -> None:
+    """Eq. (7): column j is k_j (B_i^T u - B_k^T u), u from end i to end k; dense, sparse and by hand agree."""
+    rng = np.random.default_rng(1)
+    muscles = random_muscles(rng)
+    positions = COLUMN.nodes + rng.normal(0.0, 0.05, COLUMN.nodes.shape)
+    columns = MuscleColumns(muscles, device=device)
+    dense = columns.dense(positions)
+    rows = muscles.end_rows.toarray()
+    expected = np.zeros_like(dense)
+    for j, (i, k) in enumerate(muscles.segments):
+        u = rows[k] @ positions - rows[i] @ positions
+        u /= np.linalg.norm(u)
+        expected[:, j] = muscles.stiffness[j] * np.outer(rows[i] - rows[k], u).ravel()
+    np.testing.assert_allclose(dense, expected, rtol=0, atol=1e-13 * np.abs(expected).max())
+    assert np.array_equal(columns.sparse(positions).toarray(), dense)
+
+
+def test_positive_activation_contracts() -> None:
+    """The virtual work of a column is -k_j times the rate of the segment's length (finite differences)."""
+    rng = np.random.default_rng(2)
+    muscles = random_muscles(rng)
+    velocity = rng.normal(size=COLUMN.nodes.shape)
+    step = 1e-6
+    rate = (muscles.lengths(COLUMN.nodes + step * velocity) - muscles.lengths(COLUMN.nodes - step * velocity)) / (
+        2 * step
+    )
+    power = muscle_columns(muscles, COLUMN.nodes).T @ velocity.ravel()
+    np.testing.assert_allclose(power, -muscles.stiffness * rate, rtol=1e-6, atol=1e-9 * np.abs(power).max())
+
+
+def test_bounds_and_strength() -> None:
+    """|a_j| <= s_max L_j and k_j = F_max / (s_max L_j): at its bound a segment pulls with its fibre's strength."""
+    fibre = Fibre("spine", FibreKind.LONGITUDINAL, np.array([[0.0, 0.0, 0.2], [0.0, 0.0, 0.5], [0.0, 0.0, 0.9]]), 7.0)
+    muscles = attach_fibres(COLUMN, [fibre], max_strain=0.25)
+    np.testing.assert_allclose(muscles.rest_lengths, [0.3, 0.4], rtol=0.03)
+    np.testing.assert_allclose(muscles.bounds, 0.25 * muscles.rest_lengths)
+    np.testing.assert_allclose(muscles.max_forces, 7.0)
+    np.testing.assert_allclose(muscles.lengths(COLUMN.nodes), muscles.rest_lengths)
+
+
+def test_attachments_spread_and_keep_their_centroid() -> None:
+    """Rows are non-negative, sum to 1, hold no node above 40 %; centroids lie within a tenth of an edge."""
+    points = np.random.default_rng(3).uniform([-0.15, -0.15, 0.05], [0.15, 0.15, 0.95], (50, 3))
+    rows = attachment_rows(COLUMN, points)
+    assert rows.min() >= 0.0
+    assert rows.max() <= 0.4
+    np.testing.assert_allclose(rows.sum(axis=1), 1.0, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(rows @ COLUMN.nodes, points, rtol=0, atol=0.1 * edge_graph(COLUMN).data.mean())
+
+
+def test_attachments_do_not_cross_gaps() -> None:
+    """Two legs side by side: a point in one leg never pulls a node of the other, though it is within reach."""
+    bar = box_mesh((9, 2, 9), (0.9, 0.2, 0.9))
+    centres = bar.nodes[bar.tets].mean(axis=1)
+    arch = bar.tets[(centres[:, 2] > 0.6) | (np.abs(centres[:, 0]) > 0.05)]
+    used, tets = np.unique(arch, return_inverse=True)
+    mesh = TetMesh(bar.nodes[used], tets.reshape(-1, 4).astype(np.int32))
+    row = attachment_rows(mesh, np.array([[0.07, 0.0, 0.1]])).toarray()[0]
+    assert row[mesh.nodes[:, 0] > 0.0].sum() == pytest.approx(1.0, abs=1e-15)
+
+
+def test_unusable_fibres_are_refused() -> None:
+    ends = np.array([[0.0, 0.0, 0.2], [0.0, 0.0, 0.8]])
+    with pytest.raises(UserError, match="muscles: the body has no fibre; give at least one"):
+        attach_fibres(COLUMN, [])
+    with pytest.raises(UserError, match='two fibres are named "a"; give each its own name'):
+        attach_fibres(COLUMN, [Fibre("a", FibreKind.USER, ends, 1.0), Fibre("a", FibreKind.USER, ends + 0.1, 1.0)])
+    with pytest.raises(UserError, match='a segment of fibre "b" has no length inside the body'):
+        attach_fibres(COLUMN, [Fibre("b", FibreKind.USER, ends[[0, 0]], 1.0)])
+
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def column_body() -> SoftBody:
+    return make_body(COLUMN, Plane(UP, 0.0), device="cpu")
+
+
+@pytest.fixture(scope="module")
+def column_muscles(column_body: SoftBody) -> MuscleSet:
+    return automatic_muscles(COLUMN, UP, body_weight=column_body.weight, height=column_body.height)
+
+
+def linear_response(body: SoftBody, muscles: MuscleSet, segments: np.ndarray) -> np.ndarray:
+    """(N, 3) static displacement when ``segments`` contract by 2 % of their lengths and the base is clamped."""
+    upper = body.assembly.matrix(body.assembly.matrix_entries(COLUMN.nodes))
+    stiffness = (upper + sparse.triu(upper, 1).T).tocsc()
+    activation = np.zeros(muscles.segment_count)
+    activation[segments] = 0.02 * muscles.rest_lengths[segments]
+    force = muscle_columns(muscles, COLUMN.nodes) @ activation
+    free = np.flatnonzero(np.repeat(COLUMN.nodes[:, 2] > 1e-9, 3))
+    moved = np.zeros(force.shape)
+    moved[free] = spsolve(stiffness[free][:, free], force[free])
+    return moved.reshape(-1, 3)
+
+
+def twist(moved: np.ndarray) -> float:
+    """Mean rotation of the upper half about the vertical axis, radians."""
+    top = COLUMN.nodes[:, 2] > 0.5
+    x, u = COLUMN.nodes[top], moved[top]
+    return float((x[:, 0] * u[:, 1] - x[:, 1] * u[:, 0]).sum() / (x[:, :2] ** 2).sum())
+
+
+def rise(moved: np.ndarray) -> float:
+    """Mean upward displacement of the upper half, metres."""
+    return float(moved[COLUMN.nodes[:, 2] > 0.5, 2].mean())
+
+
+def lean(moved: np.ndarray) -> np.ndarray:
+    """(2,) mean horizontal displacement of the upper half, metres."""
+    return moved[COLUMN.nodes[:, 2] > 0.5, :2].mean(axis=0)
+
+
+def test_longitudinal_fibres_shorten_and_on_one_side_bend(column_body: SoftBody, column_muscles: MuscleSet) -> None:
+    """Eq. (7), DESIGN 6: all of them lower the top without leaning; those on +x alone lean it towards +x."""
+    segments = column_muscles.segments_of_kind(FibreKind.LONGITUDINAL)
+    together = linear_response(column_body, column_muscles, segments)
+    assert rise(together) < -1e-3
+    assert np.linalg.norm(lean(together)) < 0.1 * abs(rise(together))
+    middles = column_muscles.end_points(COLUMN.nodes)[column_muscles.segments[segments]].mean(axis=1)
+    one_sided = lean(linear_response(column_body, column_muscles, segments[middles[:, 0] > 0.05]))
+    other_side = lean(linear_response(column_body, column_muscles, segments[middles[:, 0] < -0.05]))
+    assert one_sided[0] > 1e-3
+    assert abs(one_sided[1]) < 0.3 * one_sided[0]
+    assert other_side[0] == pytest.approx(-one_sided[0], rel=0.15)
+
+
+def test_radial_fibres_lengthen(column_body: SoftBody, column_muscles: MuscleSet) -> None:
+    """Eq. (7), DESIGN 6: thinning the body raises its top (Poisson's ratio)."""
+    moved = linear_response(column_body, column_muscles, column_muscles.segments_of_kind(FibreKind.RADIAL))
+    assert rise(moved) > 1e-5
+    assert np.linalg.norm(lean(moved)) < 0.3 * rise(moved)
+
+
+def test_oblique_fibres_twist_by_their_hand_and_hoops_do_not(column_body: SoftBody, column_muscles: MuscleSet) -> None:
+    """Eq. (7), DESIGN 6: right- and left-handed helices twist opposite ways; hoops and radial fibres hardly at all.
+
+    A right-handed helix that contracts unwinds: seen from above its upper end turns clockwise (negative).
+    """
+    turned = {
+        kind: twist(linear_response(column_body, column_muscles, column_muscles.segments_of_kind(kind)))
+        for kind in FibreKind
+        if len(column_muscles.segments_of_kind(kind))
+    }
+    assert turned[FibreKind.OBLIQUE_RIGHT] < -1e-3
+    assert turned[FibreKind.OBLIQUE_LEFT] == pytest.approx(-turned[FibreKind.OBLIQUE_RIGHT], rel=0.1)
+    for kind in (FibreKind.CIRCULAR, FibreKind.RADIAL, FibreKind.LONGITUDINAL):
+        assert abs(turned[kind]) < 0.05 * turned[FibreKind.OBLIQUE_LEFT]
+
+
+def test_hoops_make_no_axial_torque_between_halves(column_muscles: MuscleSet) -> None:
+    """A planar hoop's forces turn neither half of the body about the axis, whatever its activations (erratum, DESIGN 6)."""
+    columns = muscle_columns(column_muscles, COLUMN.nodes).reshape(-1, 3, column_muscles.segment_count)
+    x = COLUMN.nodes
+    torque = x[:, 0, None] * columns[:, 1] - x[:, 1, None] * columns[:, 0]
+    crossing = np.abs(torque[x[:, 2] > 0.5].sum(axis=0)) / column_muscles.stiffness
+    hoops = column_muscles.segments_of_kind(FibreKind.CIRCULAR)
+    helices = column_muscles.segments_of_kind(FibreKind.OBLIQUE_LEFT, FibreKind.OBLIQUE_RIGHT)
+    assert crossing[hoops].max() < 0.05 * crossing[helices].max()
+
+
+def test_automatic_muscles_of_a_column(column_body: SoftBody, column_muscles: MuscleSet) -> None:
+    """Every kind is there, mirrored, reaches the ground all round, within budget; the same call gives the same bits."""
+    muscles = column_muscles
+    assert set(muscles.fibre_kinds) == set(FibreKind) - {FibreKind.USER}
+    assert 60 <= muscles.segment_count <= 112
+    assert np.all(muscles.fibre_partners >= 0)
+    assert np.array_equal(muscles.fibre_partners[muscles.fibre_partners], np.arange(muscles.fibre_count))
+    low = muscles.end_points(COLUMN.nodes)
+    low = low[low[:, 2] < 0.1]
+    angles = np.sort(np.degrees(np.arctan2(low[:, 1], low[:, 0])))
+    assert np.diff(np.append(angles, angles[0] + 360.0)).max() < 60.0
+    again = automatic_muscles(COLUMN, UP, body_weight=column_body.weight, height=column_body.height)
+    assert np.array_equal(again.end_rows.toarray(), muscles.end_rows.toarray())
+    assert np.array_equal(again.stiffness, muscles.stiffness)

@@ -1,0 +1,146 @@
+"""Curve skeleton of simple bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.muscles.ascent import ascent_field, base_nodes
+from egs_warp.muscles.attachments import mean_edge_length
+from egs_warp.muscles.fibres import FibreKind
+from egs_warp.muscles.muscle_set import automatic_muscles
+from egs_warp.muscles.skeleton import skeleton
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def carved(size: tuple[float, float, float], cell: float, keep: Callable[[np.ndarray], np.ndarray]) -> TetMesh:
+    """Cells of a lattice over a box standing on z = 0 whose centres ``keep`` accepts, six tetrahedra each."""
+    counts = np.round(np.array(size) / cell).astype(int)
+    grid = np.stack(np.meshgrid(*[np.arange(n + 1) for n in counts], indexing="ij"), axis=-1)
+    nodes = (grid * cell - [size[0] / 2, size[1] / 2, 0.0]).reshape(-1, 3)
+    index = np.arange(len(nodes)).reshape(grid.shape[:3])
+    cells = np.stack(
+        [index[a : a + counts[0], b : b + counts[1], c : c + counts[2]].ravel() for a, b, c in np.ndindex(2, 2, 2)],
+        axis=1,
+    )
+    cells = cells[keep(nodes[cells].mean(axis=1))]
+    paths = [(0, 1, 3, 7), (0, 1, 5, 7), (0, 2, 3, 7), (0, 2, 6, 7), (0, 4, 5, 7), (0, 4, 6, 7)]
+    used, tets = np.unique(np.concatenate([cells[:, path] for path in paths]), return_inverse=True)
+    return TetMesh.oriented(nodes[used], tets.reshape(-1, 4))
+
+
+def column() -> TetMesh:
+    return carved((0.3, 0.3, 1.2), 0.1, lambda c: np.ones(len(c), dtype=bool))
+
+
+def stool() -> TetMesh:
+    """Four legs under a seat."""
+    return carved(
+        (0.7, 0.7, 0.8), 0.1, lambda c: (c[:, 2] > 0.6) | ((np.abs(c[:, 0]) > 0.15) & (np.abs(c[:, 1]) > 0.15))
+    )
+
+
+def figure() -> TetMesh:
+    """Two legs, a trunk that ends in a head, two arms held out."""
+
+    def keep(c: np.ndarray) -> np.ndarray:
+        x, z = np.abs(c[:, 0]), c[:, 2]
+        legs = (z < 0.5) & (x > 0.1) & (x < 0.3)
+        trunk = (z > 0.5) & (x < 0.3)
+        arms = (z > 0.8) & (z < 1.0)
+        return legs | trunk | arms
+
+    return carved((1.6, 0.2, 1.4), 0.1, keep)
+
+
+def test_ascent_is_height_on_a_column() -> None:
+    """The drainage field of an upright prism depends on height alone, so phi is the height itself."""
+    mesh = column()
+    np.testing.assert_allclose(ascent_field(mesh, UP), mesh.nodes[:, 2], atol=0.04)
+    assert set(base_nodes(mesh, UP)) == set(np.flatnonzero(mesh.nodes[:, 2] < 1e-9))
+
+
+def test_a_column_is_one_branch_from_the_ground_to_the_top() -> None:
+    (trunk,) = skeleton(column(), UP).branches
+    assert trunk.starts_on_ground
+    assert trunk.ends_freely
+    assert trunk.points[0, 2] == pytest.approx(0.0, abs=1e-12)
+    assert trunk.points[-1, 2] == pytest.approx(1.2, abs=0.05)
+    assert np.abs(trunk.points[:, :2]).max() < 0.02
+    assert trunk.volume == pytest.approx(0.3 * 0.3 * 1.2)
+    np.testing.assert_allclose(trunk.radii[3:-3], np.sqrt(0.3 * 0.3 / np.pi), rtol=0.15)
+
+
+def test_a_stool_has_four_like_legs() -> None:
+    branches = skeleton(stool(), UP).branches
+    assert len(branches) == 4
+    feet = np.array([branch.points[0] for branch in branches])
+    assert all(branch.starts_on_ground for branch in branches)
+    assert {(float(np.sign(x)), float(np.sign(y))) for x, y, _ in feet} == {(1, 1), (1, -1), (-1, 1), (-1, -1)}
+    np.testing.assert_allclose(np.abs(feet[:, :2]), 0.25, atol=0.03)
+    lengths = np.array([branch.length for branch in branches])
+    assert lengths.max() < 1.15 * lengths.min()
+
+
+def test_a_figure_has_legs_trunk_and_arms() -> None:
+    mesh = figure()
+    branches = skeleton(mesh, UP).branches
+    legs = [branch for branch in branches if branch.starts_on_ground]
+    arms = [branch for branch in branches if np.abs(branch.points[-1, 0]) > 0.6]
+    (trunk,) = [b for b in branches if not b.starts_on_ground and np.abs(b.points[-1, 0]) < 0.6]
+    assert (len(legs), len(arms)) == (2, 2)
+    assert legs[0].points[0, 0] * legs[1].points[0, 0] < 0
+    assert arms[0].points[-1, 0] * arms[1].points[-1, 0] < 0
+    assert trunk.points[-1, 2] > 1.25
+    assert trunk.volume == max(branch.volume for branch in branches)
+
+
+def test_small_bumps_are_no_branches() -> None:
+    def keep(c: np.ndarray) -> np.ndarray:
+        bump = (c[:, 2] > 0.6) & (c[:, 2] < 0.7) & (c[:, 0] > 0.2) & (np.abs(c[:, 1]) < 0.06)
+        return ((np.abs(c[:, 0]) < 0.2) & (c[:, 2] < 1.2)) | bump
+
+    assert len(skeleton(carved((0.6, 0.4, 1.2), 0.1, keep), UP).branches) == 1
+
+
+def test_the_skeleton_follows_its_up_axis_and_its_bits_repeat() -> None:
+    """The same figure lying in other axes has the same skeleton; two calls agree to the bit."""
+    mesh = figure()
+    turned = TetMesh(np.ascontiguousarray(mesh.nodes[:, [1, 2, 0]]), mesh.tets)
+    first, second = skeleton(mesh, UP), skeleton(mesh, UP)
+    other = skeleton(turned, np.array([0.0, 1.0, 0.0]))
+    assert len(first.branches) == len(other.branches)
+    for one, same, rotated in zip(first.branches, second.branches, other.branches, strict=True):
+        assert np.array_equal(one.points, same.points)
+        assert one.volume == pytest.approx(rotated.volume, rel=1e-6)
+
+
+@pytest.mark.parametrize(("make", "branch_count"), [(column, 1), (stool, 4), (figure, 5)])
+def test_every_branch_gets_every_kind_of_fibre(make: Callable[[], TetMesh], branch_count: int) -> None:
+    """DESIGN 6: four or more longitudinal fibres and all other kinds on each branch, within the budget of segments."""
+    mesh = make()
+    muscles = automatic_muscles(mesh, UP, body_weight=100.0, height=1.0)
+    assert muscles.segment_count <= (120 if make is stool else 112)
+    assert muscles.rest_lengths.min() >= 0.25 * mean_edge_length(mesh)
+    kinds = np.array([kind.value for kind in muscles.fibre_kinds])
+    assert set(muscles.fibre_groups) == set(range(branch_count))
+    for group in range(branch_count):
+        of_group = kinds[muscles.fibre_groups == group]
+        assert set(of_group) == {kind.value for kind in FibreKind} - {"user"}
+        assert (of_group == "longitudinal").sum() >= 4
+
+
+def test_legs_bend_both_ways_at_once() -> None:
+    """Each leg of a four-legged body has three segments or more on each of four sides, and muscles that do not crumple it."""
+    mesh = stool()
+    muscles = automatic_muscles(mesh, UP, body_weight=100.0, height=0.8, young_modulus=1e4)
+    longitudinal = muscles.segments_of_kind(FibreKind.LONGITUDINAL)
+    fibres, counts = np.unique(muscles.fibre_from_segment[longitudinal], return_counts=True)
+    assert len(fibres) == 16 and counts.min() >= 3
+    section = np.pi * 0.15**2
+    together = muscles.max_forces[longitudinal].reshape(16, -1).min(axis=1)[:4].sum()
+    assert together < 0.45 * 1e4 * section

@@ -1,0 +1,158 @@
+"""``animate SCENE --object``: slips are told first, nothing is lost, and a film comes out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from egs_warp.cli import main
+from egs_warp.errors import UserError
+from egs_warp.inpainting.inpainters import OpenCvInpainter, OpenCvMethod
+from egs_warp.io import read_capture, write_ply
+from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene
+from egs_warp.segmentation.clearance import Clearing
+from egs_warp.segmentation.object_mask import ObjectSpec
+from tests.segmentation.test_object_mask import ball_on_floor
+
+
+@pytest.fixture(scope="module")
+def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A ball on a floor."""
+    path = tmp_path_factory.mktemp("scene") / "scene.ply"
+    write_ply(path, ball_on_floor()[0])
+    return path
+
+
+@pytest.fixture(scope="module")
+def prepared() -> PreparedScene:
+    """The ball taken off its floor, whose hole is left."""
+    options = SceneOptions(clearing=Clearing.SPLIT, inpaint=False)
+    return prepare_scene(ball_on_floor()[0], ObjectSpec(point=np.array([0.0, -0.5, 0.5])), options=options)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--motion", "nothing"], "unknown motion 'nothing'"),
+        (["--motion", "twist 180", "--distance", "nan"], "--distance nan"),
+        (["--motion", "trajectory {tmp}/no.json"], "no.json: cannot be read"),
+        (["--muscles", "{tmp}/no.json"], "no.json: cannot be read"),
+        (["--terrain", "{tmp}/no.json"], "no.json: cannot be read"),
+        (["--inpainter", "lama"], "--inpainter lama: give patch, telea, ns or a TorchScript file"),
+        (["--inpainter", "ns", "--no-inpaint"], "--inpainter: --no-inpaint leaves the floor as captured"),
+        (["--object", ""], "--object: nothing is given; give a mask.png"),
+        (["--object", "0,0,0.5", "--up", ""], "--up : give one of x, y, z"),
+        (["--background", "{tmp}/no.ply"], "--background: with --object the rest of the scene is behind the object"),
+    ],
+)
+def test_a_slip_is_told_before_the_scene_is_taken_apart(
+    scene_file: Path,
+    tmp_path: Path,
+    flags: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def too_late(*_: object, **__: object) -> None:
+        pytest.fail("the scene is being taken apart")
+
+    monkeypatch.setattr("egs_warp.pipelines.prepare_scene.prepare_scene", too_late)
+    given = [flag.format(tmp=tmp_path) for flag in flags]
+    scene = ["animate", str(scene_file), "--object", "0,0,0.5", "--out", str(tmp_path / "out")]
+    assert main([*scene, *given]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ["--cameras", "no.json"],
+        ["--view", "0"],
+        ["--no-inpaint"],
+        ["--inpainter", "ns"],
+        ["--straddling", "split"],
+    ],
+)
+def test_what_only_a_scene_takes_needs_the_object(
+    scene_file: Path, tmp_path: Path, flags: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["animate", str(scene_file), *flags, "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"egs-warp: {flags[0]}: needs --object") and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def _noting(told: dict[str, Any]) -> Callable[..., None]:
+    """Stands for a function: ends the command, and keeps the arguments that it was given by name."""
+
+    def note(*_: object, **named: Any) -> None:
+        told.update(named)
+        raise UserError("far enough")
+
+    return note
+
+
+def test_animate_passes_on_how_the_scene_is_taken_apart(
+    scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: dict[str, Any] = {}
+    monkeypatch.setattr("egs_warp.pipelines.prepare_scene.prepare_scene", _noting(told))
+    flags = ["--object", "0,0,0.5", "--inpainter", "ns", "--straddling", "remove", "--out", str(tmp_path / "out")]
+    assert main(["animate", str(scene_file), *flags]) == 2
+    assert told["options"].inpainter == OpenCvInpainter(OpenCvMethod.NAVIER_STOKES)
+    assert told["options"].clearing is Clearing.REMOVE
+
+
+def test_the_parts_of_earlier_steps_are_animated(
+    tmp_path: Path, prepared: PreparedScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepared.write(tmp_path)
+    told: dict[str, Any] = {}
+    monkeypatch.setattr("egs_warp.pipelines.animate.animate", _noting(told))
+    flags = ["--plane", str(tmp_path / "plane.json"), "--background", str(tmp_path / "background.ply")]
+    assert main(["animate", str(tmp_path / "object.ply"), *flags, "--out", str(tmp_path / "out")]) == 2
+    assert told["background"].count == prepared.background.count
+    np.testing.assert_allclose(told["plane"].normal, prepared.plane.normal, atol=1e-9)
+
+
+def test_one_command_from_a_scene_to_a_film(
+    scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As without PyTorch, whose training takes a minute."""
+    monkeypatch.setattr("egs_warp.pipelines.prepare_scene.has_torch", lambda: False)
+    scene, out = str(scene_file), tmp_path / "out"
+    flags = ["--object", "0,-0.5,0.5", "--frames", "1", "--size", "64", "--out", str(out)]
+    assert main(["animate", scene, *flags]) == 0
+    wrote = capsys.readouterr().out.splitlines()[-1]
+    assert (out / "jump.mp4").stat().st_size > 0
+    parts, pictures = ("object.ply", "background.ply", "plane.json"), ("plane.png", "segment.png", "filled.png")
+    for name in ("sheet.png", "report.json", "trajectory.npz", *parts, *pictures):
+        assert (out / name).stat().st_size > 0 and name in wrote
+    rest = read_capture(out / "background.ply").cloud.means.numpy()
+    ball = read_capture(out / "object.ply").cloud.means.numpy()
+    assert not ((rest[:, 2] > 0.05) & (np.linalg.norm(rest - [0.0, 0.0, 0.5], axis=1) < 0.55)).any()
+    assert (np.linalg.norm(ball - [0.0, 0.0, 0.5], axis=1) < 0.55).sum() > 1400
+    # There is floor where it stood.
+    assert ((np.abs(rest[:, 2]) < 0.05) & (np.linalg.norm(rest[:, :2], axis=1) < 0.1)).sum() > 20
+
+
+def test_an_animation_that_fails_loses_none_of_the_parts(
+    scene_file: Path, tmp_path: Path, prepared: PreparedScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_: object, **__: object) -> None:
+        raise UserError("animate: cannot")
+
+    monkeypatch.setattr("egs_warp.pipelines.prepare_scene.prepare_scene", lambda *_, **__: prepared)
+    monkeypatch.setattr("egs_warp.pipelines.animate.animate", failing)
+    out = tmp_path / "out"
+    assert main(["animate", str(scene_file), "--object", "0,0,0.5", "--out", str(out)]) == 2
+    assert read_capture(out / "object.ply").cloud.count == prepared.object.count
+    assert read_capture(out / "background.ply").cloud.count == prepared.background.count
+    for name in ("plane.json", "plane.png", "segment.png"):
+        assert (out / name).is_file()
+    assert not (out / "filled.png").exists(), "no floor was filled"

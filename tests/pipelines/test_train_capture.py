@@ -1,0 +1,194 @@
+"""Photos with poses become a capture: ``egs_warp.pipelines.train_capture`` and ``egs-warp train``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from egs_warp.cli import main
+from egs_warp.errors import UserError
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.io import read_capture
+from egs_warp.render import render
+from tests.training.test_finetune import ball, ring
+
+pytest.importorskip("torch")
+from egs_warp.pipelines.train_capture import train
+from egs_warp.training.finetune import TrainingView, psnr
+from egs_warp.training.posed_photos import backdrop_colour, laid_over, read_views
+from egs_warp.training.rough_cloud import middle_of, rough_cloud
+
+
+def posed_folder(folder: Path, *, count: int = 9, size: int = 32, alpha: bool = False) -> Path:
+    """Renders of a ball of Gaussians as a NeRF-synthetic set."""
+    folder.mkdir(parents=True, exist_ok=True)
+    cloud = GaussianCloud.from_numpy(**ball(80), device="cpu")
+    frames = []
+    for number, camera in enumerate(ring(count, size)):
+        picture = render(cloud, camera, background=(0.2, 0.3, 0.4))
+        pixels = picture.colour_srgb8()[:, :, ::-1]
+        if alpha:
+            pixels = np.dstack([pixels, np.rint(picture.alpha.numpy() * 255).astype(np.uint8)])
+        assert cv2.imwrite(str(folder / f"r_{number}.png"), pixels)
+        matrix = np.eye(4)
+        matrix[:3, :3] = camera.rotation.T @ np.diag([1.0, -1.0, -1.0])
+        matrix[:3, 3] = camera.centre
+        frames.append({"file_path": f"r_{number}.png", "transform_matrix": matrix.tolist()})
+    shared = {"w": size, "h": size, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    (folder / "transforms.json").write_text(json.dumps({**shared, "frames": frames}))
+    return folder
+
+
+def run(folder: Path, out: Path, *flags: str) -> int:
+    return main(["train", str(folder), "--out", str(out), "--iterations", "60", "--gaussians", "300", *flags])
+
+
+def test_command_writes_capture_report_and_sheet(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    posed = posed_folder(tmp_path / "posed")
+    out = tmp_path / "made" / "ball.ply"
+    assert run(posed, out, "--sh-degree", "1") == 0
+    printed = capsys.readouterr()
+    assert "held out: " in printed.out and f"wrote {out}" in printed.out
+    assert "training 60/60" in printed.err and "frames/s" in printed.err
+    assert sorted(path.name for path in out.parent.iterdir()) == ["ball.ply", "ball.report.json", "ball.sheet.png"]
+    capture = read_capture(out, device="cpu").cloud
+    assert capture.sh.shape[1] == 4
+    report = json.loads((out.parent / "ball.report.json").read_text())
+    assert report["gaussians"] == capture.count <= 300
+    assert report["iterations"] == 60 and report["photos"] == 9 and report["photo_size"] == [32, 32]
+    # Every eighth photo is held out: numbers 0 and 8.
+    assert [score["name"] for score in report["scores"] if score["held_out"]] == ["r_0.png", "r_8.png"]
+    held_out = [score["psnr"] for score in report["scores"] if score["held_out"]]
+    assert report["mean"]["held_out"]["psnr"] == pytest.approx(np.mean(held_out))
+    photo = read_views(posed)[0].image
+    flat = psnr(np.broadcast_to(photo.mean(axis=(0, 1)), photo.shape), photo)
+    assert report["mean"]["held_out"]["psnr"] > flat + 1.0
+    sheet = cv2.imread(str(out.parent / "ball.sheet.png"))
+    assert sheet is not None and sheet.shape[:2] == (64, 64)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--iterations", "0"], "--iterations 0: give a whole number of at least 1"),
+        (["--gaussians", "5"], "--gaussians 5: give a whole number of at least 100"),
+        (["--max-side", "1"], "--max-side 1: give a whole number of at least 16"),
+        (["--sh-degree", "4"], "--sh-degree 4: give 0, 1, 2 or 3"),
+        (["--background", "red"], "--background red: give three numbers r,g,b from 0 to 1"),
+        (["--background", "0,0,2"], "--background 0,0,2: give three numbers r,g,b from 0 to 1"),
+        (["--device", "tpu"], "--device tpu: this machine has cpu"),
+        (["--out", "made/x.obj"], "--out made/x.obj: give a name that ends in"),
+        ([], "nowhere: no such file or folder"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    flags: list[str],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["train", "nowhere", "--out", "made/x.ply", *flags]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.startswith("egs-warp: ") and error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_photo_missing_late_leaves_an_earlier_result_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    posed = posed_folder(tmp_path / "posed")
+    (posed / "r_5.png").unlink()
+    out = tmp_path / "ball.ply"
+    out.write_bytes(b"precious")
+    assert run(posed, out) == 2
+    assert "the photo r_5.png is not beside the poses" in capsys.readouterr().err
+    assert out.read_bytes() == b"precious"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply", "posed"]
+
+
+def test_reduced_photos_keep_their_colours_and_field_of_view(tmp_path: Path) -> None:
+    """Halved, a photo's mean stays and its camera sees as far to each side; transparent pixels do not bleed."""
+    posed = posed_folder(tmp_path / "posed", alpha=True)
+    full, half = read_views(posed)[3], read_views(posed, max_side=16)[3]
+    assert full.alpha is not None and half.alpha is not None
+    assert half.image.shape == (16, 16, 3)
+    assert half.camera.width / half.camera.fx == pytest.approx(full.camera.width / full.camera.fx)
+    one, other = (laid_over(view, (1.0, 0.0, 0.5)).image for view in (full, half))
+    np.testing.assert_allclose(one.reshape(16, 2, 16, 2, 3).mean(axis=(1, 3)), other, atol=1e-5)
+
+
+def test_masks_beside_the_photos_cut_the_object_out(tmp_path: Path) -> None:
+    """COLMAP's ``masks/PHOTO.png``: what the mask leaves out is background, whatever the photo shows there."""
+    posed = posed_folder(tmp_path / "set" / "images")
+    masks = tmp_path / "set" / "masks"
+    masks.mkdir()
+    plain = read_views(posed)
+    assert all(view.alpha is None for view in plain)
+    rim = np.concatenate([plain[0].image[0], plain[0].image[-1], plain[0].image[:, 0], plain[0].image[:, -1]])
+    np.testing.assert_allclose(backdrop_colour(plain[:1]), rim.mean(axis=0), atol=1e-6)
+    half = np.zeros((32, 32), np.uint8)
+    half[:, 16:] = 255
+    for number in range(9):
+        cv2.imwrite(str(masks / f"r_{number}.png.png"), half)
+    views = read_views(posed)
+    assert backdrop_colour(views) == (1.0, 1.0, 1.0)
+    laid = laid_over(views[2], (0.0, 1.0, 0.0)).image
+    np.testing.assert_array_equal(laid[:, :16], np.broadcast_to([0.0, 1.0, 0.0], (32, 16, 3)).astype(np.float32))
+    np.testing.assert_array_equal(laid[:, 16:], plain[2].image[:, 16:])
+    result = train(posed, iterations=3, max_gaussians=100, sh_degree=0, device="cpu")
+    assert np.array_equal(result.views[2].image[:, :16], np.ones((32, 16, 3), np.float32))
+    cv2.imwrite(str(masks / "r_4.png.png"), half[:8])
+    with pytest.raises(UserError, match=r"r_4.png.png: 32 x 8 pixels, but its photo has 32 x 32; make the mask"):
+        read_views(posed)
+
+
+def test_the_middle_is_where_the_cameras_look() -> None:
+    shift = np.array([3.0, -2.0, 5.0])
+    cameras = [replace(camera, translation=camera.translation - camera.rotation @ shift) for camera in ring(7)]
+    np.testing.assert_allclose(middle_of(cameras), shift, atol=1e-9)
+
+
+def test_the_first_cloud_fills_the_silhouettes_and_nothing_else() -> None:
+    """Masks of a small sphere: all points are inside of nine masks in ten, and spread over the whole of it."""
+    centre, radius = np.array([0.1, -0.05, 0.0]), 0.2
+    views = []
+    for camera in ring(12, 64):
+        rows, columns = np.mgrid[:64, :64] + 0.5
+        rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones((64, 64))], -1)
+        rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)) @ camera.rotation
+        to_centre = centre - camera.centre
+        off = np.linalg.norm(to_centre - (rays @ to_centre)[..., None] * rays, axis=-1)
+        image = np.broadcast_to([0.8, 0.3, 0.1], (64, 64, 3)).astype(np.float32)
+        views.append(TrainingView(camera, image, alpha=(off < radius).astype(np.float32)))
+    cloud = rough_cloud(views, count=500, sh_degree=1, device="cpu")
+    means = cloud.means.numpy()
+    assert len(means) == 500
+    for view in views[::3]:
+        p = means @ view.camera.rotation.T + view.camera.translation
+        column = view.camera.fx * p[:, 0] / p[:, 2] + view.camera.cx
+        row = view.camera.fy * p[:, 1] / p[:, 2] + view.camera.cy
+        assert view.alpha is not None
+        assert view.alpha[row.astype(int), column.astype(int)].mean() > 0.85
+    distance = np.linalg.norm(means - centre, axis=1)
+    assert 0.6 * radius < np.median(distance) < radius
+    assert np.abs(means.mean(axis=0) - centre).max() < 0.2 * radius
+    # Each Gaussian has about the room that 500 of them leave one another.
+    spacing = (4 / 3 * np.pi * radius**3 / 500) ** (1 / 3)
+    assert 0.3 * spacing < np.exp(cloud.log_scales.numpy()).mean() < 1.2 * spacing
+    np.testing.assert_allclose(cloud.sh.numpy()[:, 0] * 0.28209479 + 0.5, np.tile([0.8, 0.3, 0.1], (500, 1)), atol=1e-5)
+
+
+def test_cameras_that_see_nothing_in_common_are_refused() -> None:
+    camera = ring(1)[0]
+    away = replace(camera, rotation=camera.rotation, near=1e9)
+    view = TrainingView(away, np.zeros((camera.height, camera.width, 3), np.float32))
+    with pytest.raises(UserError, match="train: the cameras do not look at a place in common; check the poses"):
+        rough_cloud([view], count=100, sh_degree=0, device="cpu")

@@ -1,0 +1,173 @@
+"""What reaches across the plane: its measure, the half above, and the loss that pushes it off (Eq. 20, 21)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import norm
+
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.segmentation.clearance import (
+    Clearing,
+    ClearingOptions,
+    Reach,
+    clear_plane,
+    foot_ring,
+    half_space,
+    reach_across,
+    views_above,
+)
+
+PLANE = Plane.from_coefficients(0.3, -0.5, 0.8, 0.1)
+
+
+def cloud_near(plane: Plane, device: str, count: int = 60, seed: int = 0) -> GaussianCloud:
+    random = np.random.default_rng(seed)
+    means = random.uniform(-1.0, 1.0, (count, 3))
+    means += (random.uniform(0.0, 0.3, count) - plane.heights(means))[:, None] * plane.normal
+    return GaussianCloud.from_numpy(
+        means,
+        random.normal(size=(count, 4)),
+        random.uniform(-4.0, -1.5, (count, 3)),
+        random.uniform(-1.0, 3.0, count),
+        random.normal(size=(count, 1, 3)),
+        device=device,
+    )
+
+
+def covariances(cloud: GaussianCloud) -> np.ndarray:
+    turns = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]].astype(np.float64)).as_matrix()
+    axes = turns * np.exp(cloud.log_scales.numpy().astype(np.float64))[:, None, :]
+    return axes @ axes.transpose(0, 2, 1)
+
+
+def test_reach_is_that_of_the_six_tips_or_of_the_whole_ellipsoid(device: str) -> None:
+    """Eq. (20): the farthest axis tip; the ellipsoid reaches farther, by at most sqrt 3."""
+    cloud = cloud_near(PLANE, device)
+    turns = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
+    arms = turns * np.exp(cloud.log_scales.numpy())[:, None, :]
+    tips = 3.0 * np.abs(np.einsum("nij,i->nj", arms, PLANE.normal)).max(axis=1)
+    heights, reach = reach_across(cloud, PLANE, Reach.AXIS_TIPS)
+    np.testing.assert_allclose(heights, PLANE.heights(cloud.means.numpy()), atol=1e-5)
+    np.testing.assert_allclose(reach, tips, rtol=1e-4)
+    _, whole = reach_across(cloud, PLANE)
+    expected = 3.0 * np.sqrt(np.einsum("i,nij,j->n", PLANE.normal, covariances(cloud), PLANE.normal))
+    np.testing.assert_allclose(whole, expected, rtol=1e-4)
+    assert ((whole > reach * 0.9999) & (whole < np.sqrt(3.0) * reach * 1.0001)).all()
+
+
+def test_half_above_has_the_moments_of_the_cut_normal_distribution(device: str) -> None:
+    """Against scipy's truncated normal along N; the spread across N follows from the regression on it."""
+    cloud = cloud_near(PLANE, device)
+    chosen = np.arange(cloud.count) % 3 != 0
+    half = half_space(cloud, PLANE, chosen)
+    sigma0, sigma1 = covariances(cloud), covariances(half)
+    means0, means1 = cloud.means.numpy().astype(np.float64), half.means.numpy().astype(np.float64)
+    n = PLANE.normal
+    for k in np.flatnonzero(chosen):
+        spread = np.sqrt(n @ sigma0[k] @ n)
+        t = -PLANE.heights(means0[k]) / spread
+        hazard = norm.pdf(t) / norm.sf(t)
+        along = sigma0[k] @ n / spread
+        np.testing.assert_allclose(means1[k], means0[k] + hazard * along, atol=2e-5)
+        expected = sigma0[k] - hazard * (hazard - t) * np.outer(along, along)
+        np.testing.assert_allclose(sigma1[k], expected, atol=3e-5 * np.trace(sigma0[k]) + 1e-9)
+        assert PLANE.heights(means1[k]) > 0.0
+    np.testing.assert_array_equal(means1[~chosen], means0[~chosen])
+    assert (half.opacities()[chosen] <= cloud.opacities()[chosen] + 1e-5).all()
+
+
+def test_far_above_the_plane_the_half_is_the_whole(device: str) -> None:
+    cloud = cloud_near(PLANE, device)
+    far = Plane(PLANE.normal, PLANE.offset + 50.0)
+    half = half_space(cloud, far, np.ones(cloud.count, bool))
+    np.testing.assert_allclose(half.means.numpy(), cloud.means.numpy(), atol=1e-6)
+    np.testing.assert_allclose(covariances(half), covariances(cloud), rtol=1e-3, atol=1e-7)
+    np.testing.assert_allclose(half.opacities(), cloud.opacities(), atol=1e-5)
+
+
+def test_flat_splats_survive_the_cut() -> None:
+    """Scales down to e^-10 would be lost in a float32 covariance."""
+    values = cloud_near(PLANE, "cpu")
+    scales = values.log_scales.numpy().copy()
+    scales[:, 1] = -10.0
+    flat = GaussianCloud.from_numpy(
+        values.means.numpy(), values.rotations.numpy(), scales, values.opacity_logits.numpy(), values.sh.numpy()
+    )
+    half = half_space(flat, PLANE, np.ones(flat.count, bool))
+    thin = np.sort(half.log_scales.numpy(), axis=1)[:, 0]
+    assert np.isfinite(half.log_scales.numpy()).all()
+    assert (np.abs(thin + 10.0) < 1.2).all()
+
+
+def test_removing_leaves_nothing_across_the_plane() -> None:
+    cloud = cloud_near(PLANE, "cpu")
+    heights, reach = reach_across(clear_plane(cloud, PLANE, Clearing.REMOVE), PLANE)
+    assert (np.abs(heights) >= reach).all()
+    assert clear_plane(cloud, PLANE, Clearing.NONE) is cloud
+
+
+def test_loss_is_the_sum_over_straddling_gaussians() -> None:
+    """Eq. (21): the sum of eta_seg - |d0| where it is positive, with gradients that finite differences confirm."""
+    torch = pytest.importorskip("torch")
+    from egs_warp.segmentation.clearance import straddling_loss
+    from egs_warp.training.finetune import GaussianTensors
+
+    cloud = cloud_near(PLANE, "cpu", count=20)
+    names = {"means": "means", "rotations": "rotations", "log_scales": "log_scales", "opacity_logits": "opacity_logits"}
+    leaves = {
+        name: torch.tensor(getattr(cloud, field).numpy().astype(np.float64), requires_grad=True)
+        for name, field in names.items()
+    }
+    rest = {"sh_band_0": torch.zeros(20, 1, 3), "sh_rest": torch.zeros(20, 0, 3)}
+    normal, near = torch.tensor(PLANE.normal), torch.arange(20)
+    for reach in Reach:
+        heights, eta = reach_across(cloud, PLANE, reach)
+        expected = np.maximum(eta - np.abs(heights), 0.0).sum()
+        loss = straddling_loss(GaussianTensors(**leaves, **rest), near, normal, PLANE.offset, reach)
+        assert float(loss.detach()) == pytest.approx(expected, rel=1e-4)
+        assert expected > 0.0
+        inputs = [leaves[name] for name in ("means", "rotations", "log_scales")]
+
+        def value(means, rotations, log_scales, reach=reach):
+            tensors = GaussianTensors(means, rotations, log_scales, leaves["opacity_logits"], **rest)
+            return straddling_loss(tensors, near, normal, PLANE.offset, reach)
+
+        assert torch.autograd.gradcheck(value, inputs, eps=1e-7, atol=1e-4)
+
+
+def test_finetuning_clears_the_plane_and_keeps_the_looks() -> None:
+    """Eq. (20), (21): a small ball on its plane; what crossed it is clear of it afterwards, and the picture stays."""
+    pytest.importorskip("torch")
+    from egs_warp.geometry.camera import Camera
+    from egs_warp.render import render
+    from egs_warp.training.finetune import psnr
+
+    random = np.random.default_rng(2)
+    floor = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+    points = random.normal(size=(400, 3))
+    points = 0.5 * points / np.linalg.norm(points, axis=1, keepdims=True) + [0.0, 0.0, 0.45]
+    points = points[points[:, 2] > 0.0]
+    ball = GaussianCloud.from_numpy(
+        points,
+        random.normal(size=(len(points), 4)),
+        np.full((len(points), 3), -2.9),
+        np.full(len(points), 3.0),
+        random.uniform(-0.8, 0.8, (len(points), 1, 3)),
+    )
+    before, eta = reach_across(ball, floor)
+    crossing = float(np.maximum(eta - np.abs(before), 0.0).sum())
+    assert (np.abs(before) < eta).sum() > 20
+    cameras = foot_ring(ball, floor, size=72)[::3]
+    options = ClearingOptions(iterations=120, subdivisions=0, weight=3.0)
+    tuned = clear_plane(ball, floor, Clearing.FINETUNE, cameras=cameras, options=options)
+    after, eta = reach_across(tuned, floor)
+    assert float(np.maximum(eta - np.abs(after), 0.0).sum()) < 0.35 * crossing
+    assert (after > 0.0).all()
+    camera = Camera.look_at(np.array([0.3, -3.0, 1.0]), np.array([0.0, 0.0, 0.5]), floor.normal, width=96, height=96)
+    view = views_above(ball, floor, [camera])[0]
+    pictures = [render(one, camera, background=(0.0, 0.0, 0.0)).colour.numpy() for one in (ball, tuned)]
+    counted = view.weight[..., None] > 0
+    assert psnr(np.where(counted, pictures[0], 0.0), np.where(counted, pictures[1], 0.0)) > 30.0

@@ -1,0 +1,259 @@
+"""The object among a scene's Gaussians, from masks, a box, a point or a click; clear errors for what cannot be it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from egs_warp.assets import scene
+from egs_warp.commands.object_flag import point_at, read_mask, read_object
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera_ring import ring_cameras, write_cameras
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.io import read_cameras, read_capture
+from egs_warp.pipelines.prepare_scene import locate_plane
+from egs_warp.segmentation.connectivity import connected_parts, enclosed
+from egs_warp.segmentation.object_mask import Box, ObjectSpec, masks_from_selection, segment
+from egs_warp.segmentation.plane_search import find_planes, plane_under
+from egs_warp.segmentation.votes import MaskedView
+
+FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+
+
+def ball_on_floor(lift: float = 0.0) -> tuple[GaussianCloud, np.ndarray]:
+    """A hollow ball with loose matter inside, on a square of floor, with a floater above; and which are the ball's."""
+    random = np.random.default_rng(1)
+    shell = random.normal(size=(1500, 3))
+    shell = 0.5 * shell / np.linalg.norm(shell, axis=1, keepdims=True) + [0.0, 0.0, 0.5 + lift]
+    inner = random.normal(scale=0.05, size=(20, 3)) + [0.0, 0.0, 0.5 + lift]
+    grid = np.stack(np.meshgrid(*[np.linspace(-1.5, 1.5, 60)] * 2), axis=-1).reshape(-1, 2)
+    floor = np.column_stack([grid, random.normal(0.0, 0.002, len(grid))])
+    floater = np.array([[0.55, 0.0, 1.0]])
+    means = np.concatenate([shell, inner, floater, floor])
+    scales = np.full((len(means), 3), np.log(0.025))
+    scales[len(shell) + len(inner) + 1 :, 2] = np.log(0.004)
+    cloud = GaussianCloud.from_numpy(
+        means,
+        np.tile([1.0, 0.0, 0.0, 0.0], (len(means), 1)),
+        scales,
+        np.full(len(means), 3.0),
+        random.uniform(-1.0, 1.0, (len(means), 1, 3)),
+    )
+    return cloud, np.arange(len(means)) < len(shell) + len(inner)
+
+
+def check(cloud: GaussianCloud, truth: np.ndarray, spec: ObjectSpec) -> None:
+    found = segment(cloud, FLOOR, spec)
+    heights = FLOOR.heights(cloud.means.numpy())
+    clear = heights > 0.05
+    # A few of the floor's at the very point of contact, which nobody can tell apart.
+    assert (found.object_mask & ~truth & (np.abs(heights) > 0.01)).sum() == 0
+    assert (found.object_mask & ~truth).sum() <= 4
+    assert (truth & clear & ~found.object_mask).sum() == 0
+    assert not (found.object_mask & found.background_mask).any()
+    parts = found.object_mask.astype(int) + found.buried_mask + found.floater_mask + found.background_mask
+    assert (parts == 1).all()
+    assert 1.2 < found.size < 1.8
+
+
+def test_shreds_of_the_floor_do_not_go_along() -> None:
+    """Wide floor-coloured Gaussians at the foot of a dark ball belong to neither; a dark one as wide stays the ball's."""
+    cloud, truth = ball_on_floor()
+    random = np.random.default_rng(5)
+    angles = np.arange(6)
+    shreds = np.column_stack([0.3 * np.cos(angles), 0.3 * np.sin(angles), np.full(6, 0.09)])
+    tone = np.concatenate([np.where(truth, -1.0, 1.0), np.ones(5), [-1.0]])
+    whole = GaussianCloud.from_numpy(
+        np.concatenate([cloud.means.numpy(), shreds]),
+        np.tile([1.0, 0.0, 0.0, 0.0], (cloud.count + 6, 1)),
+        np.concatenate([cloud.log_scales.numpy(), np.tile(np.log([0.1, 0.01, 0.01]), (6, 1))]),
+        np.full(cloud.count + 6, 3.0),
+        tone[:, None, None] + random.normal(0.0, 0.05, (cloud.count + 6, 1, 3)),
+    )
+    found = segment(whole, FLOOR, ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
+    assert found.floater_mask[cloud.count :].tolist() == [True] * 5 + [False]
+    assert found.object_mask[-1]
+    assert (truth & (cloud.means.numpy()[:, 2] > 0.05) & ~found.object_mask[: cloud.count]).sum() == 0
+
+
+@pytest.mark.parametrize("views", [1, 3])
+def test_masks_of_one_view_or_several(views: int) -> None:
+    cloud, truth = ball_on_floor()
+    cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.8, count=views, size=96)
+    check(cloud, truth, ObjectSpec(masks=tuple(masks_from_selection(cloud, truth, cameras))))
+
+
+def test_box_and_point_find_the_same_hollow_ball_with_what_is_inside() -> None:
+    cloud, truth = ball_on_floor()
+    check(cloud, truth, ObjectSpec(box=Box(np.array([-0.6, -0.6, -0.1]), np.array([0.6, 0.6, 1.1]))))
+    check(cloud, truth, ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
+
+
+def test_what_no_mask_can_mean_is_said() -> None:
+    cloud, truth = ball_on_floor()
+    camera = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.8, count=1, size=96)[0]
+    mask = masks_from_selection(cloud, truth, [camera])[0].mask
+    sky = np.zeros_like(mask)
+    sky[:3, :3] = True
+    away = Camera.look_at(np.array([0.0, 0.0, 9.0]), np.array([0.0, 1.0, 20.0]), np.eye(3)[1], width=96, height=96)
+    floor_only = np.zeros_like(mask)
+    floor_only[-8:, 30:60] = True
+    for view, message in (
+        (MaskedView(camera, mask[:50], "m.png"), "m.png: the mask is 96 x 50 pixels, its camera 96 x 96"),
+        (MaskedView(camera, np.zeros_like(mask), "m.png"), "m.png: the mask is empty; mark the object in it"),
+        (MaskedView(camera, sky), "nothing of the capture shows inside the masks"),
+        (MaskedView(away, mask), "the masks' cameras see nothing of the capture"),
+        (MaskedView(camera, floor_only), "nothing of it lies above the plane"),
+    ):
+        with pytest.raises(UserError, match=message):
+            segment(cloud, FLOOR, ObjectSpec(masks=(view,)))
+    with pytest.raises(UserError, match="nothing solid above the plane within"):
+        segment(cloud, FLOOR, ObjectSpec(point=np.array([9.0, 9.0, 0.5])))
+    with pytest.raises(UserError, match="nothing of it lies above the plane"):
+        segment(cloud, FLOOR, ObjectSpec(box=Box(np.array([5.0, 5.0, 0.0]), np.array([6.0, 6.0, 1.0]))))
+    hovering, _ = ball_on_floor(lift=0.6)
+    with pytest.raises(UserError, match=r"it touches no plane: its lowest part is 0\.\d+ of its size above"):
+        segment(hovering, FLOOR, ObjectSpec(point=np.array([0.0, -0.5, 1.1])))
+
+
+def test_plane_and_object_from_a_click_alone() -> None:
+    """Nobody says where the plane is, nor which way is up."""
+    cloud, _ = ball_on_floor()
+    located = locate_plane(cloud, ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
+    assert located.plane.normal[2] > np.cos(np.radians(0.3))
+    assert abs(located.plane.offset) < 0.02
+    assert 1400 < located.segmentation.object_mask.sum() < 1521
+    with pytest.raises(UserError, match="plane: none in sight"):
+        locate_plane(cloud.subset(cloud.means.numpy()[:, 2] > 0.2), ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
+
+
+def test_several_planes_widest_first() -> None:
+    random = np.random.default_rng(3)
+    table = np.column_stack([random.uniform(-0.5, 0.5, (800, 2)), np.full(800, 0.8)])
+    ground = np.column_stack([random.uniform(-1.5, 1.5, (3000, 2)), np.zeros(3000)])
+    means = np.concatenate([table, ground])
+    cloud = GaussianCloud.from_numpy(
+        means,
+        np.tile([1.0, 0.0, 0.0, 0.0], (len(means), 1)),
+        np.full((len(means), 3), -4.0),
+        np.full(len(means), 3.0),
+        np.zeros((len(means), 1, 3)),
+    )
+    found = find_planes(cloud, np.array([0.1, 0.0, 1.0]), count=2)
+    assert [round(-one.plane.offset, 3) for one in found] == [0.0, 0.8]
+    assert found[0].support > 0.7 and 0.15 < found[1].support < 0.3
+    for height, offset in ((1.0, -0.8), (0.5, 0.0)):
+        under = plane_under(found, np.array([0.0, 0.0, height]), tolerance=0.0)
+        assert under is not None and abs(under.offset - offset) < 1e-3
+    assert plane_under(found, np.array([0.0, 0.0, -1.0]), tolerance=0.0) is None
+
+
+def test_parts_and_insides() -> None:
+    """Two clusters are two parts unless a long Gaussian reaches from one to the other; a shell encloses its inside."""
+    random = np.random.default_rng(0)
+    clusters = np.concatenate([random.normal(scale=0.03, size=(50, 3)) + [x, 0.0, 1.0] for x in (-0.4, 0.4)])
+    means = np.concatenate([clusters, [[0.0, 0.0, 1.0]]])
+    scales = np.full((101, 3), -4.0)
+    scales[100] = [np.log(0.3), -5.0, -5.0]
+    cloud = GaussianCloud.from_numpy(
+        means, np.tile([1.0, 0, 0, 0], (101, 1)), scales, np.full(101, 3.0), np.zeros((101, 1, 3))
+    )
+    both = connected_parts(cloud, np.arange(100), cell=0.1, plane=FLOOR, above=0.0)
+    assert len(set(both[:50])) == len(set(both[50:])) == 1 and both[0] != both[99]
+    bridged = connected_parts(cloud, np.arange(101), cell=0.1, plane=FLOOR, above=0.0)
+    assert len(set(bridged)) == 1
+    ring = np.stack([np.cos(np.linspace(0, 6.28, 200)), np.sin(np.linspace(0, 6.28, 200))], axis=1)
+    assert enclosed(np.array([[0.0, 0.0], [1.0, 0.0], [1.3, 0.0]]), ring, 0.05).tolist() == [True, True, False]
+
+
+def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
+    cloud, _ = ball_on_floor()
+    cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.8, count=3, size=64)
+    names = [f"IMG_{k:02d}.jpg" for k in range(3)]
+    write_cameras(tmp_path / "cameras.json", cameras, names)
+    posed = read_cameras(tmp_path / "cameras.json")
+    for one, camera in zip(posed, cameras, strict=True):
+        np.testing.assert_allclose(one.camera.rotation, camera.rotation, atol=1e-12)
+        np.testing.assert_allclose(one.camera.centre, camera.centre, atol=1e-12)
+    mask = np.zeros((64, 64), np.uint8)
+    mask[20:40, 20:40] = 1
+    Image.fromarray(mask).save(tmp_path / "IMG_01_mask.png")
+    spec = read_object(str(tmp_path / "IMG_01_mask.png"), cloud, posed)
+    np.testing.assert_array_equal(spec.masks[0].mask, mask > 0)
+    np.testing.assert_allclose(spec.masks[0].camera.centre, cameras[1].centre, atol=1e-12)
+    cut_out = np.zeros((64, 64, 4), np.uint8)
+    cut_out[..., 3] = 255 * mask
+    Image.fromarray(cut_out).save(tmp_path / "other.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "other.png"), mask > 0)
+    np.testing.assert_array_equal(read_object("1,2,3", cloud, []).point, [1.0, 2.0, 3.0])
+    box = read_object("1,2,3,0,5,1", cloud, []).box
+    assert box is not None and box.low.tolist() == [0.0, 2.0, 1.0] and box.high.tolist() == [1.0, 5.0, 3.0]
+    clicked = read_object("32,32", cloud, posed, view="0").point
+    assert clicked is not None
+    np.testing.assert_allclose(np.linalg.norm(clicked - [0.0, 0.0, 0.5]), 0.5, atol=0.04)
+    for text, given, view, message in (
+        ("nothing.png", posed, None, "--object nothing.png: no such file, nor numbers"),
+        ("1,2,3,4", posed, None, "--object 1,2,3,4: 4 numbers"),
+        ("1,2,3,1,5,6", posed, None, "the box is flat"),
+        ("5,5", [], None, "a pixel needs cameras"),
+        ("5,5", posed, None, "3 cameras; say which with --view"),
+        ("5,5", posed, "nobody", "--view nobody: no such camera; there are 3"),
+        ("1,1", posed, "2", "the capture shows nothing there"),
+        ("99,1", posed, "2", "outside of the view's 64 x 64 pixels"),
+        (str(tmp_path / "other.png"), posed, None, "no camera's photo is called other"),
+        (str(tmp_path / "other.png"), [], None, "a mask needs the camera that it was drawn in"),
+        (str(tmp_path / "cameras.json"), posed, "0", "not a readable picture"),
+    ):
+        with pytest.raises(UserError, match=message):
+            read_object(text, cloud, given, view=view)
+    Image.fromarray(mask[:30]).save(tmp_path / "IMG_02.png")
+    with pytest.raises(UserError, match=r"the mask is 64 x 30 pixels, the photo IMG_02\.jpg 64 x 64"):
+        read_object(str(tmp_path / "IMG_02.png"), cloud, posed)
+
+
+@pytest.mark.parametrize("name", ["pawn", "stool", "figurine"])
+def test_built_in_scenes_come_apart(name: str) -> None:
+    """Against the known object: all of it above the foot, and none of the room but what nobody can see."""
+    made = scene(name)
+    cloud, truth = made.whole()
+    camera = made.camera(width=200, height=200)
+    spec = ObjectSpec(masks=tuple(masks_from_selection(cloud, truth, [camera])))
+    found = segment(cloud, made.plane, spec)
+    heights = made.plane.heights(cloud.means.numpy())
+    assert (truth & (heights > 0.03) & ~found.object_mask).sum() <= 0.001 * truth.sum()
+    assert (~truth & found.object_mask).sum() <= 0.001 * truth.sum()
+    assert (~truth & (heights > 0.03) & ~found.background_mask).sum() == 0
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("file", "click", "normal", "heights"),
+    [
+        ("koala.ply", (0.1, -0.7, 0.15), (0.003, -1.0, -0.018), (0.02, 0.08)),
+        ("fox.ply", (0.0, 0.0, 2.0), (-0.03, -0.03, 0.999), (0.10, 0.13)),
+        ("narcissus.sog", (0.0, -0.8, 0.0), (0.004, -1.0, 0.002), (0.005, 0.03)),
+    ],
+)
+def test_real_captures_from_one_click(
+    data_dir: Path, file: str, click: tuple, normal: tuple, heights: tuple[float, float]
+) -> None:
+    """The plane that the data's own page gives, which was fitted to the Gaussians, not to rendered depth."""
+    cloud = read_capture(data_dir / "scenes" / file).cloud
+    located = locate_plane(cloud, ObjectSpec(point=np.array(click)))
+    unit = np.array(normal) / np.linalg.norm(normal)
+    assert located.plane.normal @ unit > np.cos(np.radians(0.6))
+    assert heights[0] < -located.plane.offset < heights[1]
+    share = located.segmentation.object_mask.mean()
+    assert 0.5 < share < 0.95
+
+
+def test_point_at_hits_the_surface() -> None:
+    cloud, _ = ball_on_floor()
+    camera = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.8, count=1, size=128)[0]
+    hit = point_at(cloud, camera, 64.0, 64.0)
+    np.testing.assert_allclose(np.linalg.norm(hit - [0.0, 0.0, 0.5]), 0.5, atol=0.03)

@@ -1,0 +1,102 @@
+"""The plane from rendered depth: closed forms, outliers, several views, clear errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.plane import Plane
+from egs_warp.segmentation.plane_fit import PlaneView, camera_rays, fit_plane, plane_depth
+
+TRUTH = Plane.from_coefficients(0.2, -0.9, 0.3, 0.4)
+
+
+def camera_over(plane: Plane, azimuth: float, *, elevation: float = 0.6, width: int = 120, height: int = 90) -> Camera:
+    first, second = plane.tangents()
+    target = -plane.offset * plane.normal
+    level = np.cos(azimuth) * first + np.sin(azimuth) * second
+    eye = target + 3.0 * (np.cos(elevation) * level + np.sin(elevation) * plane.normal)
+    return Camera.look_at(eye, target, plane.normal, width=width, height=height)
+
+
+def spoiled_view(plane: Plane, azimuth: float, seed: int) -> PlaneView:
+    """30 % of the depths are wrong, all have 1 % noise."""
+    random = np.random.default_rng(seed)
+    camera = camera_over(plane, azimuth)
+    depth = plane_depth(plane, camera)
+    mask = (depth > 0.0) & (depth < 12.0)
+    wrong = mask & (random.random(depth.shape) < 0.3)
+    depth = np.where(wrong, depth * random.uniform(0.3, 1.5, depth.shape), depth)
+    return PlaneView(camera, depth * (1.0 + 0.01 * random.normal(size=depth.shape)), mask)
+
+
+def angle(a: Plane, b: Plane) -> float:
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a.normal, b.normal)), a.normal @ b.normal)))
+
+
+def test_plane_measures_height_towards_the_objects_side() -> None:
+    """Eq. (1): N.x + d is the distance to the plane, positive where N points, in any units."""
+    plane = Plane.from_coefficients(0.0, 0.0, -2.0, 3.0)
+    np.testing.assert_allclose(plane.normal, [0.0, 0.0, -1.0])
+    np.testing.assert_allclose(plane.heights(np.array([[5.0, 1.0, 1.5], [0.0, 0.0, 0.5]])), [0.0, 1.0])
+    np.testing.assert_allclose(plane.scaled(10.0).heights(np.array([0.0, 0.0, 5.0])), 10.0)
+    first, second = plane.tangents()
+    np.testing.assert_allclose(np.cross(first, second), plane.normal, atol=1e-12)
+
+
+def test_depth_puts_every_pixel_on_the_plane() -> None:
+    """Eq. (18): walking D_p along the ray ends on the plane; the ray's z-depth is 1, and the sky has none."""
+    camera = camera_over(TRUTH, 0.3, elevation=0.1)
+    depth, rays = plane_depth(TRUTH, camera), camera_rays(camera)
+    np.testing.assert_allclose(rays @ camera.rotation[2], 1.0, atol=1e-12)
+    hit = depth > 0.0
+    assert 0.2 < hit.mean() < 0.9, "the horizon must be in the picture"
+    np.testing.assert_allclose(TRUTH.heights((camera.centre + depth[..., None] * rays)[hit]), 0.0, atol=1e-9)
+    assert (rays[~hit] @ TRUTH.normal > 0.0).all()
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 1.0, 2.5])
+@pytest.mark.parametrize("paper_start", [False, True])
+def test_one_view_with_outliers_and_noise(azimuth: float, paper_start: bool) -> None:
+    """Eq. (18), (19): 0.1 degree and 0.1 % of the extent, also from the paper's start (look direction, d = 0)."""
+    view = spoiled_view(TRUTH, azimuth, seed=3)
+    start = Plane(view.camera.rotation[2], 0.0) if paper_start else None
+    fit = fit_plane([view], start=start)
+    assert angle(fit.plane, TRUTH) < 0.1
+    extent = 4.0
+    assert abs(float(fit.plane.heights(-TRUTH.offset * TRUTH.normal))) < 1e-3 * extent
+    assert fit.plane.heights(view.camera.centre) > 0.0
+    assert 0.008 < fit.noise < 0.012
+    assert 0.6 < fit.inlier_share < 0.75
+
+
+def test_exact_depth_gives_the_exact_plane() -> None:
+    """Eq. (19) without noise: to rounding."""
+    camera = camera_over(TRUTH, 0.7)
+    depth = plane_depth(TRUTH, camera)
+    fit = fit_plane([PlaneView(camera, depth, depth > 0.0)])
+    assert angle(fit.plane, TRUTH) < 1e-5
+    assert abs(fit.plane.offset - TRUTH.offset) < 1e-6
+
+
+def test_several_views_are_fitted_together() -> None:
+    """Eq. (19): three noisy views agree better with the truth than each alone, on average."""
+    views = [spoiled_view(TRUTH, azimuth, seed) for seed, azimuth in enumerate((0.0, 2.0, 4.0))]
+    alone = [angle(fit_plane([view]).plane, TRUTH) for view in views]
+    assert angle(fit_plane(views).plane, TRUTH) < np.mean(alone)
+
+
+def test_what_cannot_be_fitted_is_said() -> None:
+    camera = camera_over(TRUTH, 0.0)
+    depth = plane_depth(TRUTH, camera)
+    with pytest.raises(UserError, match=r"mask of view 0 is \(50, 40\), its camera \(120, 90\) pixels"):
+        fit_plane([PlaneView(camera, depth, np.ones((40, 50), bool))])
+    with pytest.raises(UserError, match="the masks hold 0 pixels with anything rendered, fewer than 30"):
+        fit_plane([PlaneView(camera, np.zeros_like(depth), np.ones_like(depth, bool))])
+    with pytest.raises(UserError, match="there are no views"):
+        fit_plane([])
+    noise = np.random.default_rng(0).uniform(0.5, 20.0, depth.shape)
+    with pytest.raises(UserError, match="plane: none in sight"):
+        fit_plane([PlaneView(camera, noise, np.ones_like(depth, bool))])

@@ -1,0 +1,79 @@
+"""Captures for the tests of reading and writing them."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.io import read_capture, write_compressed_ply, write_ply, write_sog, write_splat, write_spz
+
+ARRAYS = ("means", "rotations", "log_scales", "opacity_logits", "sh")
+
+
+def make_cloud(count: int, degree: int = 0, *, seed: int = 1, device: str = "cpu") -> GaussianCloud:
+    """Random Gaussians whose values every format can hold."""
+    rng = np.random.default_rng(seed)
+    return GaussianCloud.from_numpy(
+        rng.uniform(-2.0, 2.0, (count, 3)),
+        rng.normal(size=(count, 4)),
+        rng.uniform(-8.0, -1.0, (count, 3)),
+        rng.uniform(-5.0, 5.0, count),
+        rng.uniform(-0.9, 0.9, (count, (degree + 1) ** 2, 3)),
+        device=device,
+    )
+
+
+def assert_same_bits(actual: GaussianCloud, expected: GaussianCloud) -> None:
+    for name in ARRAYS:
+        np.testing.assert_array_equal(getattr(actual, name).numpy(), getattr(expected, name).numpy(), err_msg=name)
+
+
+def small_cloud() -> GaussianCloud:
+    rng = np.random.default_rng(5)
+    return GaussianCloud.from_numpy(
+        rng.normal(size=(7, 3)),
+        rng.normal(size=(7, 4)),
+        rng.normal(size=(7, 3)) - 4.0,
+        rng.normal(size=7),
+        0.3 * rng.normal(size=(7, 4, 3)),
+        device="cpu",
+    )
+
+
+WRITERS: dict[str, Callable[..., None]] = {
+    "a.ply": write_ply,
+    "b.ply": write_compressed_ply,
+    "a.spz": write_spz,
+    "a.splat": write_splat,
+    "a.sog": write_sog,
+}
+
+
+@cache
+def good_bytes(name: str) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        WRITERS[name](path, small_cloud())
+        return path.read_bytes()
+
+
+def message(path: Path) -> str:
+    """The one line that reading ``path`` ends with, without the path it starts with."""
+    with pytest.raises(UserError) as caught:
+        read_capture(path, device="cpu")
+    text = str(caught.value)
+    assert "\n" not in text
+    assert text.startswith(f"{path}: ")
+    return text.removeprefix(f"{path}: ")
+
+
+def written(path: Path, data: bytes) -> Path:
+    path.write_bytes(data)
+    return path

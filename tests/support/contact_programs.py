@@ -1,0 +1,87 @@
+"""Small random contact programs whose every contact state can be tried."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from egs_warp.contact.detection import tangent_directions
+from egs_warp.locomotion.complementarity import SEPARATE, ContactLayout
+from egs_warp.locomotion.program import ContactProgram, LinearResponse, contact_rows
+from egs_warp.locomotion.solvers import QpSolver, quadratic_program
+
+FRICTION = 0.8
+
+
+@dataclass(frozen=True)
+class SmallProblem:
+    """A program and the mechanics behind it; units of weight and speed are 1."""
+
+    program: ContactProgram
+    linear: LinearResponse
+    frame: np.ndarray
+    """(3n, d) contact velocities of d generalised velocities."""
+    shift: np.ndarray
+
+    def velocities(self, y: np.ndarray) -> np.ndarray:
+        """(n, 3) of the contacts."""
+        return (self.frame @ (self.linear.base + self.linear.response @ y)).reshape(-1, 3)
+
+
+def small_problem(
+    seed: int,
+    *,
+    contacts: int = 2,
+    activations: int = 3,
+    directions: int = 4,
+    freedoms: int = 8,
+    frame: np.ndarray | None = None,
+) -> SmallProblem:
+    """v = base + R a + J^T f with random J whose normals share a direction, asked to reach a random velocity.
+
+    ``frame`` replaces J.
+    """
+    rng = np.random.default_rng(seed)
+    layout = ContactLayout(activations, contacts, directions)
+    if frame is None:
+        frame = rng.standard_normal((3 * contacts, freedoms))
+        frame[0::3, 0] = 2.0
+    freedoms = frame.shape[1]
+    base = rng.standard_normal(freedoms) - 1.5 * np.eye(freedoms)[0]
+    push = frame.T.reshape(freedoms, contacts, 3)
+    table = tangent_directions(directions)
+    tangent = np.einsum("vnt,dt->vnd", push[:, :, 1:], table).reshape(freedoms, -1)
+    zeros = np.zeros((freedoms, contacts))
+    response = np.hstack([rng.standard_normal((freedoms, activations)), push[:, :, 0], tangent, zeros])
+    shift = rng.uniform(-0.1, 0.3, contacts)
+    wanted = rng.standard_normal((4, freedoms))
+    rows, gap = wanted @ response, wanted @ base - rng.standard_normal(4)
+    P = 2.0 * rows.T @ rows + 1e-7 * np.eye(layout.variables)
+    m = np.arange(activations)
+    P[m, m] += 1e-3
+    set_of: Any = SimpleNamespace(frame=frame, count=contacts)
+    linear = LinearResponse(base, response)
+    A, offset = contact_rows(linear, set_of, shift, layout, FRICTION, 1.0)
+    program = ContactProgram(layout, FRICTION, P, 2.0 * rows.T @ gap, float(gap @ gap), A, offset)
+    return SmallProblem(program, linear, frame, shift)
+
+
+def all_states(layout: ContactLayout) -> list[np.ndarray]:
+    """Every combination of separate, static, slide k and slide between k and k + 1."""
+    choices = range(SEPARATE, 2 * layout.directions)
+    return [np.array(states) for states in itertools.product(choices, repeat=layout.contacts)]
+
+
+def optimum_of_each(program: ContactProgram) -> dict[tuple[int, ...], tuple[float, np.ndarray]]:
+    """Objective and y of every feasible choice of states."""
+    qp = quadratic_program(program.P, program.q, program.A, solver=QpSolver.DAQP)
+    found = {}
+    for states in all_states(program.layout):
+        solution = qp.solve(*program.bounds(states))
+        if solution.usable:
+            found[tuple(states)] = (program.objective(solution.x), solution.x)
+    return found
