@@ -25,6 +25,7 @@ setup: $(VENV)/setup.stamp
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-logo
 
 types: setup
 	$(BIN)/pyright

@@ -26,9 +26,8 @@ import numpy as np
 import warp as wp
 
 from egs_warp.assets import scene
-from egs_warp.assets.rooms import joined
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.holes import Hole, disc, footprint
 from egs_warp.inpainting.inpaint import InpaintOptions, InpaintResult, inpaint

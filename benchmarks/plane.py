@@ -20,13 +20,13 @@ import numpy as np
 from mesh_scenes import data_folder, environment
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.plane import Plane
 from egs_warp.io import read_capture
 from egs_warp.segmentation.base_plane import guess_up
 from egs_warp.segmentation.object_mask import ObjectSpec, segment
-from egs_warp.segmentation.plane_fit import PlaneView, camera_rays, fit_plane, plane_depth
+from egs_warp.segmentation.plane_fit import PlaneView, fit_plane, plane_depth
 from egs_warp.segmentation.plane_search import find_planes, plane_views
 
 WRONG, NOISE = 0.30, 0.01

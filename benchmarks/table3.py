@@ -29,7 +29,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io import read_capture
 from egs_warp.io.video import write_png
-from egs_warp.pipelines.prepare_scene import LocatedPlane, locate_plane
+from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane
 from egs_warp.render import render
 from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane
 from egs_warp.segmentation.object_mask import ObjectSpec, masks_from_selection

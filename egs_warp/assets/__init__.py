@@ -1,4 +1,7 @@
-"""Scenes made by the package: nothing to download."""
+"""Objects and rooms made by the package: nothing to download.
+
+In: a name, a seed. Out: a cloud, its plane and cameras.
+"""
 
 from egs_warp.assets.figurine import figurine
 from egs_warp.assets.object import BuiltInObject

@@ -15,7 +15,7 @@ from egs_warp.assets.surface import (
     lit_colour,
     sh_from_colour,
 )
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import GaussianCloud, joined
 
 Paint = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Linear albedo (n, 3) and gloss (n,) at points (n, 3)."""
@@ -123,22 +123,6 @@ def cloth_table(*, radius: float = 1.7, seed: int = 1, device: str | None = None
         return colour * weave[:, None], np.full(len(points), 0.03)
 
     return joined(_paint_level(top, paint, random, device), _paint_level(skirt, paint, random, device))
-
-
-def joined(*clouds: GaussianCloud) -> GaussianCloud:
-    """One cloud with all Gaussians in turn; all of the same SH degree."""
-
-    def stack(name: str) -> np.ndarray:
-        return np.concatenate([getattr(cloud, name).numpy() for cloud in clouds])
-
-    return GaussianCloud.from_numpy(
-        stack("means"),
-        stack("rotations"),
-        stack("log_scales"),
-        stack("opacity_logits"),
-        stack("sh"),
-        device=str(clouds[0].device),
-    )
 
 
 def _grain(along: np.ndarray, across: np.ndarray) -> np.ndarray:

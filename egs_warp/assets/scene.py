@@ -10,11 +10,11 @@ import numpy as np
 from egs_warp.assets.figurine import figurine
 from egs_warp.assets.object import BuiltInObject
 from egs_warp.assets.pawn import pawn
-from egs_warp.assets.rooms import bedroom, chess_board, cloth_table, joined
+from egs_warp.assets.rooms import bedroom, chess_board, cloth_table
 from egs_warp.assets.stool import stool
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.geometry.plane import Plane
 
 

@@ -117,6 +117,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[dict, str]:
     from egs_warp.io.atomic import writable_folder
     from egs_warp.pipelines.animate import animate
     from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene, viewing_direction
+    from egs_warp.training.photo_colours import photographs_in_colours_of
 
     if chosen.background is not None:
         raise UserError("--background: with --object the rest of the scene is behind the object; leave one of them out")
@@ -132,7 +133,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[dict, str]:
         given.cloud,
         given.spec,
         cameras=given.cameras,
-        photographs=given.photographs(),
+        photographs=photographs_in_colours_of(given.cloud, given.posed),
         up=given.up,
         plane=given.plane,
         options=SceneOptions(clearing=clearing_of(chosen), inpaint=not chosen.no_inpaint, inpainter=inpainter),

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera import Camera, camera_rays, shrunk
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.cameras import PosedImage
 from egs_warp.render.rasteriser import render
 from egs_warp.segmentation.object_mask import Box, ObjectSpec
-from egs_warp.segmentation.plane_fit import camera_rays
 from egs_warp.segmentation.votes import MaskedView
 
 MAX_MASK_SIDE = 800
@@ -61,23 +59,6 @@ def point_at(cloud: GaussianCloud, camera: Camera, u: float, v: float) -> np.nda
     if image.alpha.numpy()[row, column] < 0.5:
         raise UserError(f"--object {u:g},{v:g}: the capture shows nothing there; click on the object")
     return small.centre + float(image.depth.numpy()[row, column]) * camera_rays(small)[row, column]
-
-
-def shrunk(camera: Camera, side: int) -> Camera:
-    """The same view with its sides divided by the least whole number that makes them at most ``side`` pixels."""
-    factor = -(-max(camera.width, camera.height) // side)
-    if factor <= 1:
-        return camera
-    width, height = max(camera.width // factor, 1), max(camera.height // factor, 1)
-    return replace(
-        camera,
-        width=width,
-        height=height,
-        fx=camera.fx / factor,
-        fy=camera.fy / factor,
-        cx=camera.cx / factor,
-        cy=camera.cy / factor,
-    )
 
 
 def _view_named(posed: Sequence[PosedImage], view: str | None, what: str) -> PosedImage:

@@ -11,26 +11,18 @@ import numpy as np
 from egs_warp.commands.object_flag import read_object
 from egs_warp.commands.scene_flags import SceneInput
 from egs_warp.errors import UserError
-from egs_warp.geometry.bitmaps import connected_parts
-from egs_warp.geometry.camera_ring import ring_cameras, write_cameras
+from egs_warp.geometry.camera import camera_rays
+from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
-from egs_warp.inpainting.rectified import near_plane
 from egs_warp.io.atomic import writable_folder
+from egs_warp.io.cameras import write_cameras
 from egs_warp.io.planes import write_planes
 from egs_warp.io.video import write_png
-from egs_warp.pipelines.prepare_scene import locate_plane
+from egs_warp.pipelines.locate_plane import locate_plane
 from egs_warp.render.rasteriser import render
-from egs_warp.segmentation.object_mask import lies_along
-from egs_warp.segmentation.plane_fit import PlaneView, camera_rays, fit_plane
-from egs_warp.segmentation.plane_search import FoundPlane, find_planes
-
-_MIN_SUPPORT = 0.005
-"""Of the visible surface that lies level: less is no plane but an accident."""
-_CELL = 0.1
-"""Of the object's size: cells of the grid on which a plane must be one patch."""
-_COVERED = 0.3
-"""Of a cell, for it to be part of the patch."""
+from egs_warp.segmentation.plane_fit import PlaneView, fit_plane
+from egs_warp.segmentation.plane_search import further_planes
 
 
 @dataclass(frozen=True)
@@ -81,44 +73,11 @@ def planes_of_scene(given: SceneInput, *, plane_mask: str | None, view: str | No
         size = 2.0 * float(np.median(np.linalg.norm(points - centre, axis=1)))
         notes = ()
         facts = {"noise": fit.noise, "inlier_share": fit.inlier_share, "pixels": fit.pixel_count}
-    others = _further(given.cloud, plane, size, count - 1) if count > 1 else []
+    others = further_planes(given.cloud, plane, size, count - 1) if count > 1 else []
     planes = [plane, *(one.plane for one in others)]
     if len(planes) < count:
         notes = (*notes, f"{len(planes)} of {count} planes found")
     return ScenePlanes(planes, [facts, *({"support": one.support} for one in others)], centre, size, notes)
-
-
-def _further(cloud: GaussianCloud, plane: Plane, size: float, count: int) -> list[FoundPlane]:
-    """At most ``count`` other planes level with ``plane``, widest first."""
-    # Without this, slices of walls and of the object count, too.
-    lying = lies_along(cloud, plane)
-    if not lying.any():
-        return []
-    level = cloud.subset(lying)
-    return [
-        one
-        for one in find_planes(level, plane.normal, count=count + 4, tilt_degrees=5.0)
-        if one.support > _MIN_SUPPORT
-        and _differ(one.plane, plane, size)
-        and _is_one_patch(level, one.plane, _CELL * size)
-    ][:count]
-
-
-def _is_one_patch(level: GaussianCloud, plane: Plane, cell: float) -> bool:
-    """Whether one patch of well covered cells (scene units) holds most of what lies near ``plane``."""
-    near = level.subset(near_plane(level, plane, 0.5 * cell))
-    flat = near.means.numpy() @ np.stack(plane.tangents(), axis=1)
-    area = near.opacities() * np.exp(np.sort(near.log_scales.numpy(), axis=1)[:, 1:].sum(axis=1))
-    place = np.floor((flat - flat.min(axis=0)) / cell).astype(int)
-    cover = np.zeros(place.max(axis=0) + 1)
-    np.add.at(cover, tuple(place.T), area / cell**2)
-    parts, _ = connected_parts(cover > _COVERED)
-    return bool(np.bincount(parts.ravel(), cover.ravel())[1:].max(initial=0.0) > 0.5 * cover.sum())
-
-
-def _differ(a: Plane, b: Plane, size: float) -> bool:
-    apart = abs(float(a.offset / (a.normal @ b.normal) - b.offset))
-    return bool(a.normal @ b.normal < np.cos(np.radians(5.0)) or apart > 0.05 * size)
 
 
 def write_ring(folder: Path, cloud: GaussianCloud, plane: Plane, centre: np.ndarray, size: float) -> None:

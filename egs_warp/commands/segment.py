@@ -48,6 +48,7 @@ def _segment(chosen: argparse.Namespace) -> int:
     from egs_warp.io.video import write_png
     from egs_warp.pipelines.pictures import picture_cameras, segmentation_picture
     from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene
+    from egs_warp.training.photo_colours import photographs_in_colours_of
 
     if not chosen.object:
         raise UserError("segment: give --object: a mask, a point, a box or a pixel")
@@ -58,7 +59,7 @@ def _segment(chosen: argparse.Namespace) -> int:
         given.cloud,
         given.spec,
         cameras=given.cameras,
-        photographs=given.photographs(),
+        photographs=photographs_in_colours_of(given.cloud, given.posed),
         up=given.up,
         plane=given.plane,
         options=SceneOptions(clearing=clearing_of(chosen), inpaint=False),

@@ -10,6 +10,7 @@ import scipy.sparse.linalg as sparse_linalg
 
 from egs_warp.errors import UserError
 from egs_warp.fem.elasticity import ElasticAssembly, Material
+from egs_warp.geometry.frames import best_turn
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
 
@@ -159,9 +160,3 @@ def _first_frequency(assembly: ElasticAssembly, node_mass: np.ndarray, free: np.
     start = np.ones(len(kept))
     value = sparse_linalg.eigsh(stiffness, k=1, M=mass, sigma=0.0, v0=start, return_eigenvectors=False)[0]
     return float(np.sqrt(value))
-
-
-def best_turn(masses: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation that best carries the arms ``before`` (n, 3) to those ``after``, by ``masses`` (n,) (Kabsch)."""
-    u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", masses, after, before))
-    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt

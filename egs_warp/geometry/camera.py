@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -61,3 +61,27 @@ class Camera:
             near=near,
             far=far,
         )
+
+
+def shrunk(camera: Camera, side: int) -> Camera:
+    """The same view with its sides divided by the least whole number that makes them at most ``side`` pixels."""
+    factor = -(-max(camera.width, camera.height) // side)
+    if factor <= 1:
+        return camera
+    width, height = max(camera.width // factor, 1), max(camera.height // factor, 1)
+    return replace(
+        camera,
+        width=width,
+        height=height,
+        fx=camera.fx / factor,
+        fy=camera.fy / factor,
+        cx=camera.cx / factor,
+        cy=camera.cy / factor,
+    )
+
+
+def camera_rays(camera: Camera) -> np.ndarray:
+    """(H, W, 3) world-space rays r = R^T K^-1 [u, v, 1] of Eq. (18), of z-depth 1."""
+    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
+    return rays @ camera.rotation

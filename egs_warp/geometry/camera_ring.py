@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.plane import Plane
-from egs_warp.io.atomic import atomic_write
 
 ELEVATIONS = (12.0, 30.0, 52.0)
 """Degrees above the plane."""
@@ -51,22 +48,3 @@ def ring_cameras(
             )
         )
     return cameras
-
-
-def write_cameras(path: Path | str, cameras: Sequence[Camera], names: Sequence[str]) -> None:
-    """INRIA ``cameras.json``, which ``read_cameras`` and most tools read; principal points must be in the middle."""
-    entries = [
-        {
-            "id": number,
-            "img_name": name,
-            "width": camera.width,
-            "height": camera.height,
-            "position": camera.centre.tolist(),
-            "rotation": camera.rotation.T.tolist(),
-            "fx": camera.fx,
-            "fy": camera.fy,
-        }
-        for number, (camera, name) in enumerate(zip(cameras, names, strict=True))
-    ]
-    with atomic_write(path) as temporary:
-        temporary.write_text(json.dumps(entries, indent=1))

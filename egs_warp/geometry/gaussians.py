@@ -129,3 +129,19 @@ def unit_quaternions(quaternions: np.ndarray) -> np.ndarray:
     unit[off] = quaternions[off] / np.maximum(lengths[off], 1e-300)[:, None]
     unit[lengths == 0.0] = (1.0, 0.0, 0.0, 0.0)
     return unit
+
+
+def joined(*clouds: GaussianCloud) -> GaussianCloud:
+    """One cloud with all Gaussians in turn; all of the same SH degree."""
+
+    def stack(name: str) -> np.ndarray:
+        return np.concatenate([getattr(cloud, name).numpy() for cloud in clouds])
+
+    return GaussianCloud.from_numpy(
+        stack("means"),
+        stack("rotations"),
+        stack("log_scales"),
+        stack("opacity_logits"),
+        stack("sh"),
+        device=str(clouds[0].device),
+    )

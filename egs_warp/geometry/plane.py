@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from egs_warp.errors import UserError
+from egs_warp.geometry.frames import square_to
 
 
 @dataclass(frozen=True)
@@ -41,11 +42,3 @@ class Plane:
     def tangents(self) -> tuple[np.ndarray, np.ndarray]:
         """Two unit vectors (3,) that span the plane; (t1, t2, N) is right-handed."""
         return square_to(self.normal)
-
-
-def square_to(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Two unit vectors (3,) square to the unit ``direction`` (3,), right-handed before it."""
-    helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
-    first = np.cross(helper, direction)
-    first /= np.linalg.norm(first)
-    return first, np.cross(direction, first)

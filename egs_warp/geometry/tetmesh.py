@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import scipy.sparse as sp
 
 from egs_warp.errors import UserError
 
@@ -76,3 +77,17 @@ class TetMesh:
 def _signed_volumes(nodes: np.ndarray, tets: np.ndarray) -> np.ndarray:
     x = nodes[tets]
     return np.einsum("ti,ti->t", x[:, 1] - x[:, 0], np.cross(x[:, 2] - x[:, 0], x[:, 3] - x[:, 0])) / 6.0
+
+
+def edge_graph(mesh: TetMesh) -> sp.csr_matrix:
+    """(N, N) symmetric; entry (a, b) is the length in metres of the edge from node a to node b."""
+    pairs = mesh.tets[:, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]].reshape(-1, 2)
+    pairs = np.unique(np.sort(pairs, axis=1), axis=0)
+    lengths = np.linalg.norm(mesh.nodes[pairs[:, 0]] - mesh.nodes[pairs[:, 1]], axis=1)
+    graph = sp.coo_matrix((lengths, (pairs[:, 0], pairs[:, 1])), shape=(len(mesh.nodes),) * 2)
+    return (graph + graph.T).tocsr()
+
+
+def mean_edge_length(mesh: TetMesh) -> float:
+    """Mean length in metres of the edges of ``mesh``."""
+    return float(edge_graph(mesh).data.mean())

@@ -16,14 +16,18 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.rectified import PlaneWindow, rectify
+from egs_warp.segmentation.connectivity import enclosed
+from egs_warp.segmentation.object_mask import CELLS, Segmentation
 from egs_warp.segmentation.votes import MaskedView, check_size
 
 _TEXELS = 256
 """Across the window in which a hole is drawn."""
 _CONTACT = 0.05
 """Of the object's height: what of it lies lower hides the floor from every side."""
-
-
+_LOW = 0.08
+"""Of the object's size: under what it has below this height the floor is unseen, or seen so badly that it is smeared."""
+_LOW_TEXELS = 200
+"""Across the window of the hole under an object."""
 _BRIDGED = 0.1
 """Of the footprint's span: gaps twice as wide are bridged."""
 
@@ -126,6 +130,21 @@ def footprint(thing: GaussianCloud, plane: Plane) -> Hole:
     closed = (depth_inside(wide) > reach) | covered
     inner = (slice(_TEXELS // 2, -(_TEXELS // 2)),) * 2
     return Hole(window, np.asarray(ndimage.binary_fill_holes(closed))[inner])
+
+
+def hole_under(cloud: GaussianCloud, plane: Plane, found: Segmentation) -> Hole:
+    """Where the floor is missing: the outline of the object's low part and of what was dropped from under it, filled."""
+    means = cloud.means.numpy().astype(np.float64)
+    low = found.buried_mask | (found.object_mask & (plane.heights(means) < _LOW * found.size))
+    middle = 0.5 * (means[low].min(axis=0) + means[low].max(axis=0))
+    tangents = np.stack(plane.tangents(), axis=1)
+    flat = means[low] @ tangents
+    texel = 1.2 * float(np.ptp(flat, axis=0).max()) / _LOW_TEXELS
+    window = PlaneWindow(plane, middle - plane.heights(middle) * plane.normal, texel, _LOW_TEXELS, _LOW_TEXELS)
+    columns, rows = np.meshgrid(np.arange(_LOW_TEXELS) + 0.5, np.arange(_LOW_TEXELS) + 0.5)
+    places = window.points(np.stack([columns.ravel(), rows.ravel()], axis=1))
+    inside = enclosed(places @ tangents, flat, found.size / CELLS)
+    return Hole(window, inside.reshape(_LOW_TEXELS, _LOW_TEXELS))
 
 
 def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:

@@ -15,15 +15,15 @@ import numpy as np
 import warp as wp
 from scipy import ndimage
 
-from egs_warp.assets.rooms import joined
 from egs_warp.errors import UserError
 from egs_warp.geometry.bitmaps import connected_parts, depth_inside, distance_to
-from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud, joined
 from egs_warp.inpainting.holes import Hole
 from egs_warp.inpainting.inpainters import Inpainter
 from egs_warp.inpainting.new_floor import flat_gaussians, rim_heights, with_gloss
 from egs_warp.inpainting.patch_synthesis import PatchSynthesis
-from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, matte, near_plane, rectify
+from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, matte, rectify
+from egs_warp.segmentation.plane_search import near_plane
 
 _MARGIN = 0.01
 """Of the hole's side: the floor at its very edge is stained by the object and by its shadow; gaps in the floor that touch

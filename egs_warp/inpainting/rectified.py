@@ -12,6 +12,7 @@ from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.kernels.inpainting.rectified import mean_colour_kernel
 from egs_warp.render import render
+from egs_warp.segmentation.plane_search import near_plane
 
 _SEEN_FROM = 40.0
 """Degrees above the plane, from all around: the directions that a floor is looked at from. Straight down, few captures
@@ -97,11 +98,6 @@ class RectifiedImage:
     """(rows, columns) float32, 0 to 1."""
     height: np.ndarray
     """(rows, columns) float32: of the surface above the plane, scene units; 0 where nothing lies."""
-
-
-def near_plane(cloud: GaussianCloud, plane: Plane, thickness: float) -> np.ndarray:
-    """(n,) bool: Gaussians whose mean is within ``thickness`` (scene units) of the plane."""
-    return np.abs(plane.heights(cloud.means.numpy())) < thickness
 
 
 def mean_colours(cloud: GaussianCloud, plane: Plane) -> np.ndarray:

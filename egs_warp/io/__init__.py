@@ -1,4 +1,7 @@
-"""Reading and writing: captures and camera poses."""
+"""Files of others, in and out: captures, camera poses, planes, texts, pictures and videos.
+
+In: paths. Out: the records of ``geometry``; each file is written whole or not at all.
+"""
 
 from egs_warp.io.atomic import atomic_write, writable_folder
 from egs_warp.io.cameras import PosedImage, read_cameras

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
+from egs_warp.io.atomic import atomic_write
 from egs_warp.io.colmap import read_colmap_model
 
 _IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".webp")
@@ -226,3 +228,22 @@ class _Record:
 
     def _wrong(self, key: str, expected: str) -> UserError:
         return UserError(f"{self.source}: {self.where}: {key} is not {expected}; export the poses again")
+
+
+def write_cameras(path: Path | str, cameras: Sequence[Camera], names: Sequence[str]) -> None:
+    """INRIA ``cameras.json``, which ``read_cameras`` and most tools read; principal points must be in the middle."""
+    entries = [
+        {
+            "id": number,
+            "img_name": name,
+            "width": camera.width,
+            "height": camera.height,
+            "position": camera.centre.tolist(),
+            "rotation": camera.rotation.T.tolist(),
+            "fx": camera.fx,
+            "fy": camera.fy,
+        }
+        for number, (camera, name) in enumerate(zip(cameras, names, strict=True))
+    ]
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(entries, indent=1))

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 
 from egs_warp.contact.detection import ContactSet
 from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.geometry.plane import square_to
+from egs_warp.geometry.frames import square_to
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from egs_warp.contact.detection import ContactGeometry
-from egs_warp.fem.body import BodyState, SoftBody, best_turn
+from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.geometry.frames import best_turn
 from egs_warp.io.atomic import atomic_write
 from egs_warp.locomotion.stepper import StepReport
 

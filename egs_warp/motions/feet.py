@@ -10,9 +10,8 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.geometry.tetmesh import TetMesh, edge_graph
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.muscles.attachments import edge_graph
 
 _GROUND = 0.02
 """Body heights: nodes at most this high stand on the ground."""

@@ -9,7 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import UserError
-from egs_warp.fem.body import BodyState, best_turn
+from egs_warp.fem.body import BodyState
+from egs_warp.geometry.frames import best_turn
 from egs_warp.locomotion.objectives import (
     BodyPart,
     Coordinates,

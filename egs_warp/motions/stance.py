@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from egs_warp.fem.body import BodyState, SoftBody, best_turn
+from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.geometry.frames import best_turn
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.objectives import Objective, SpinObjective, centre_of_mass_velocity, node_velocities
 from egs_warp.locomotion.stepper import StepReport

@@ -11,8 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from egs_warp.geometry.tetmesh import TetMesh
-from egs_warp.muscles.attachments import edge_graph
+from egs_warp.geometry.tetmesh import TetMesh, edge_graph
 
 _BASE_FRACTION = 0.02
 """Nodes lower than this part of the body's height above its lowest point are its base (or half an edge, if more)."""

@@ -6,27 +6,13 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import dijkstra
 
-from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.geometry.tetmesh import TetMesh, edge_graph
 
 MIN_ATTACHMENT_NODES = 8
 """Fewer nodes than this would concentrate the force on one or two elements, which then crumple."""
 
 _NEWTON_ITERATIONS = 30
 _MULTIPLIER_PENALTY = 0.05
-
-
-def edge_graph(mesh: TetMesh) -> sp.csr_matrix:
-    """(N, N) symmetric; entry (a, b) is the length in metres of the edge from node a to node b."""
-    pairs = mesh.tets[:, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]].reshape(-1, 2)
-    pairs = np.unique(np.sort(pairs, axis=1), axis=0)
-    lengths = np.linalg.norm(mesh.nodes[pairs[:, 0]] - mesh.nodes[pairs[:, 1]], axis=1)
-    graph = sp.coo_matrix((lengths, (pairs[:, 0], pairs[:, 1])), shape=(len(mesh.nodes),) * 2)
-    return (graph + graph.T).tocsr()
-
-
-def mean_edge_length(mesh: TetMesh) -> float:
-    """Mean length in metres of the edges of ``mesh``."""
-    return float(edge_graph(mesh).data.mean())
 
 
 def attachment_rows(mesh: TetMesh, points: np.ndarray, *, radius: float | None = None) -> sp.csr_matrix:

@@ -24,10 +24,9 @@ from typing import Any
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.plane import square_to
-from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.geometry.frames import square_to
+from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
 from egs_warp.io.text import parse_json, read_text
-from egs_warp.muscles.attachments import mean_edge_length
 from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.muscle_set import MuscleSet, attach_fibres
 

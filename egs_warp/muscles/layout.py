@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from egs_warp.geometry.plane import square_to
-from egs_warp.geometry.tetmesh import TetMesh
-from egs_warp.muscles.attachments import mean_edge_length
+from egs_warp.geometry.frames import square_to
+from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
 from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.skeleton import Branch, Skeleton
 from egs_warp.muscles.tube import Detail, Surface, Tube

@@ -12,9 +12,9 @@ import scipy.sparse as sp
 import warp as wp
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
 from egs_warp.kernels.muscles.columns import muscle_columns_kernel, muscle_entries_kernel
-from egs_warp.muscles.attachments import attachment_rows, mean_edge_length
+from egs_warp.muscles.attachments import attachment_rows
 from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.layout import is_legged, lay_fibres
 from egs_warp.muscles.skeleton import skeleton

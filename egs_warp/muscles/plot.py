@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.plane import square_to
+from egs_warp.geometry.frames import square_to
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.muscles.fibres import FibreKind
 from egs_warp.muscles.muscle_set import MuscleSet

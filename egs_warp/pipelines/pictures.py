@@ -7,8 +7,7 @@ from colorsys import hsv_to_rgb
 
 import numpy as np
 
-from egs_warp.commands.object_flag import shrunk
-from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera import Camera, shrunk
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane

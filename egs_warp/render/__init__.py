@@ -1,4 +1,7 @@
-"""Tile-based Gaussian splatting in Warp kernels: ``render``; and pictures and videos on disk."""
+"""Tile-based Gaussian splatting (Kerbl et al. 2023): projection, tiles, compositing, and its gradients.
+
+In: a cloud and a camera. Out: colour, alpha and depth; with ``autograd``, gradients for PyTorch.
+"""
 
 from egs_warp.render.compositing import RenderedImage
 from egs_warp.render.rasteriser import render, render_views

@@ -11,11 +11,10 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from egs_warp.assets.rooms import joined
 from egs_warp.deformation.splitting import SplitRule, child_layout, child_opacities
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_cameras
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.geometry.plane import Plane
 from egs_warp.kernels.deformation.splitting import split_kernel
 from egs_warp.kernels.segmentation.clearance import half_space_kernel, reach_kernel

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.connectivity import close_to, connected_parts, enclosed
+from egs_warp.segmentation.plane_search import lies_along
 from egs_warp.segmentation.votes import MaskedView, Votes, blending_votes, check_size
 
 _NOTHING_ABOVE = "object: nothing of it lies above the plane; check the masks, box or point, or give --plane"
@@ -128,15 +128,6 @@ def segment(cloud: GaussianCloud, plane: Plane, spec: ObjectSpec) -> Segmentatio
         halo |= wisps
     floaters = (halo | (claimed & above)) & ~object_mask & ~buried
     return Segmentation(object_mask, buried, floaters, size)
-
-
-def lies_along(cloud: GaussianCloud, plane: Plane) -> np.ndarray:
-    """(n,) bool: flat Gaussians that lie along ``plane``, at whatever height, as a floor's do."""
-    scales = cloud.log_scales.numpy()
-    turns = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
-    thin = np.take_along_axis(turns, scales.argmin(axis=1)[:, None, None], axis=2)[:, :, 0]
-    ordered = np.sort(scales, axis=1)
-    return (np.abs(thin @ plane.normal) > 0.85) & (ordered[:, 1] - ordered[:, 0] > np.log(2.0))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.plane import Plane
 
 _MAX_PIXELS = 20_000
@@ -54,13 +54,6 @@ def plane_depth(plane: Plane, camera: Camera) -> np.ndarray:
     height = float(plane.heights(camera.centre))
     depth = -height / np.where(slope == 0.0, np.inf, slope)
     return np.where(depth > 0.0, depth, 0.0)
-
-
-def camera_rays(camera: Camera) -> np.ndarray:
-    """(H, W, 3) world-space rays r = R^T K^-1 [u, v, 1] of Eq. (18), of z-depth 1."""
-    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
-    return rays @ camera.rotation
 
 
 def fit_plane(views: Sequence[PlaneView], *, start: Plane | None = None, seed: int = 0) -> PlaneFit:

@@ -6,13 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.bitmaps import connected_parts
+from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.render.rasteriser import render
-from egs_warp.segmentation.plane_fit import PlaneFit, PlaneView, camera_rays, fit_plane
+from egs_warp.segmentation.plane_fit import PlaneFit, PlaneView, fit_plane
 
 _TRIALS = 1500
 _SAMPLE = 4000
@@ -20,6 +22,12 @@ _MIN_OPACITY = 0.3
 _BAND = 0.03
 """Of the radius looked at: what lies nearer to the plane is taken for part of it. With 0.06 the single views of a real
 table disagreed by 0.8 degree, with 0.03 by 0.3."""
+_MIN_SUPPORT = 0.005
+"""Of the visible surface that lies level: less is no plane but an accident."""
+_CELL = 0.1
+"""Of the object's size: cells of the grid on which a plane must be one patch."""
+_COVERED = 0.3
+"""Of a cell, for it to be part of the patch."""
 
 
 @dataclass(frozen=True)
@@ -185,3 +193,50 @@ def plane_views(
         if mask.sum() >= 50:
             views.append(PlaneView(camera, depth, mask))
     return views
+
+
+def near_plane(cloud: GaussianCloud, plane: Plane, thickness: float) -> np.ndarray:
+    """(n,) bool: Gaussians whose mean is within ``thickness`` (scene units) of the plane."""
+    return np.abs(plane.heights(cloud.means.numpy())) < thickness
+
+
+def lies_along(cloud: GaussianCloud, plane: Plane) -> np.ndarray:
+    """(n,) bool: flat Gaussians that lie along ``plane``, at whatever height, as a floor's do."""
+    scales = cloud.log_scales.numpy()
+    turns = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()
+    thin = np.take_along_axis(turns, scales.argmin(axis=1)[:, None, None], axis=2)[:, :, 0]
+    ordered = np.sort(scales, axis=1)
+    return (np.abs(thin @ plane.normal) > 0.85) & (ordered[:, 1] - ordered[:, 0] > np.log(2.0))
+
+
+def further_planes(cloud: GaussianCloud, plane: Plane, size: float, count: int) -> list[FoundPlane]:
+    """At most ``count`` other planes level with ``plane``, widest first."""
+    # Without this, slices of walls and of the object count, too.
+    lying = lies_along(cloud, plane)
+    if not lying.any():
+        return []
+    level = cloud.subset(lying)
+    return [
+        one
+        for one in find_planes(level, plane.normal, count=count + 4, tilt_degrees=5.0)
+        if one.support > _MIN_SUPPORT
+        and _differ(one.plane, plane, size)
+        and _is_one_patch(level, one.plane, _CELL * size)
+    ][:count]
+
+
+def _is_one_patch(level: GaussianCloud, plane: Plane, cell: float) -> bool:
+    """Whether one patch of well covered cells (scene units) holds most of what lies near ``plane``."""
+    near = level.subset(near_plane(level, plane, 0.5 * cell))
+    flat = near.means.numpy() @ np.stack(plane.tangents(), axis=1)
+    area = near.opacities() * np.exp(np.sort(near.log_scales.numpy(), axis=1)[:, 1:].sum(axis=1))
+    place = np.floor((flat - flat.min(axis=0)) / cell).astype(int)
+    cover = np.zeros(place.max(axis=0) + 1)
+    np.add.at(cover, tuple(place.T), area / cell**2)
+    parts, _ = connected_parts(cover > _COVERED)
+    return bool(np.bincount(parts.ravel(), cover.ravel())[1:].max(initial=0.0) > 0.5 * cover.sum())
+
+
+def _differ(a: Plane, b: Plane, size: float) -> bool:
+    apart = abs(float(a.offset / (a.normal @ b.normal) - b.offset))
+    return bool(a.normal @ b.normal < np.cos(np.radians(5.0)) or apart > 0.05 * size)

@@ -10,18 +10,18 @@ import pytest
 from PIL import Image
 
 from egs_warp.assets import scene
-from egs_warp.assets.rooms import joined
 from egs_warp.cli import main
 from egs_warp.commands.scene_flags import SceneInput
 from egs_warp.commands.scene_planes import planes_of_scene
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.camera_ring import ring_cameras, write_cameras
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.camera_ring import ring_cameras
+from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.inpaint import InpaintOptions, inpaint
 from egs_warp.inpainting.inpainters import inpainter_by_name
 from egs_warp.io import read_capture, write_ply
+from egs_warp.io.cameras import write_cameras
 from egs_warp.io.planes import read_planes, read_planes_and_facts, write_planes
 from egs_warp.pipelines.pictures import picture_cameras, plane_picture
 from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene, viewing_direction
@@ -130,8 +130,9 @@ def test_mistakes_are_one_line(
 def test_photographs_beside_the_cameras_clear_the_plane(folder: Path) -> None:
     """Eq. (21) against photographs of the whole scene; a photo of another size than its camera is no photo of it."""
     pytest.importorskip("torch")
-    from egs_warp.commands.scene_flags import SceneInput, in_colours_of
+    from egs_warp.commands.scene_flags import SceneInput
     from egs_warp.io import read_cameras
+    from egs_warp.training.photo_colours import in_colours_of, photographs_in_colours_of
 
     cloud, truth = ball_on_floor()
     posed = read_cameras(folder / "cameras.json")
@@ -141,7 +142,7 @@ def test_photographs_beside_the_cameras_clear_the_plane(folder: Path) -> None:
         picture = render(cloud, one.camera, background=(0.0, 0.0, 0.0)).colour_srgb8()
         Image.fromarray(picture[:50] if one is posed[4] else picture).save(images / one.name)
     given = SceneInput(cloud, read_cameras(folder / "cameras.json"), None, None, None, ())
-    photographs = given.photographs()
+    photographs = photographs_in_colours_of(given.cloud, given.posed)
     assert len(photographs) == 4
     assert photographs[0].image.shape == (96, 96, 3)
     expected = render(cloud, posed[0].camera, background=(0.0, 0.0, 0.0)).colour.numpy()

@@ -12,8 +12,8 @@ from scipy.sparse.linalg import spsolve
 from egs_warp.errors import UserError
 from egs_warp.fem.body import SoftBody, make_body
 from egs_warp.geometry.plane import Plane
-from egs_warp.geometry.tetmesh import TetMesh
-from egs_warp.muscles.attachments import attachment_rows, edge_graph
+from egs_warp.geometry.tetmesh import TetMesh, edge_graph
+from egs_warp.muscles.attachments import attachment_rows
 from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.muscle_set import MuscleColumns, MuscleSet, attach_fibres, automatic_muscles, muscle_columns
 

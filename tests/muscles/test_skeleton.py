@@ -7,9 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
 from egs_warp.muscles.ascent import ascent_field, base_nodes
-from egs_warp.muscles.attachments import mean_edge_length
 from egs_warp.muscles.fibres import FibreKind
 from egs_warp.muscles.muscle_set import automatic_muscles
 from egs_warp.muscles.skeleton import skeleton

@@ -12,11 +12,12 @@ from egs_warp.assets import scene
 from egs_warp.commands.object_flag import point_at, read_mask, read_object
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.camera_ring import ring_cameras, write_cameras
+from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io import read_cameras, read_capture
-from egs_warp.pipelines.prepare_scene import locate_plane
+from egs_warp.io.cameras import write_cameras
+from egs_warp.pipelines.locate_plane import locate_plane
 from egs_warp.segmentation.connectivity import connected_parts, enclosed
 from egs_warp.segmentation.object_mask import Box, ObjectSpec, masks_from_selection, segment
 from egs_warp.segmentation.plane_search import find_planes, plane_under

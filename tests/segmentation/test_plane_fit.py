@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.plane import Plane
-from egs_warp.segmentation.plane_fit import PlaneView, camera_rays, fit_plane, plane_depth
+from egs_warp.segmentation.plane_fit import PlaneView, fit_plane, plane_depth
 
 TRUTH = Plane.from_coefficients(0.2, -0.9, 0.3, 0.4)
 

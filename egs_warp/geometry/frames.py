@@ -1,0 +1,19 @@
+"""Orthonormal directions and rotations."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def square_to(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two unit vectors (3,) square to the unit ``direction`` (3,), right-handed before it."""
+    helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
+    first = np.cross(helper, direction)
+    first /= np.linalg.norm(first)
+    return first, np.cross(direction, first)
+
+
+def best_turn(masses: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation that best carries the arms ``before`` (n, 3) to those ``after``, by ``masses`` (n,) (Kabsch)."""
+    u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", masses, after, before))
+    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
