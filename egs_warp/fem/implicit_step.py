@@ -69,7 +69,7 @@ class ImplicitStep:
     newton_iterations: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
-        self.body.assembly.begin_step(self.state.positions)
+        self._damping = self.body.assembly.damping(self.state.positions, self.dt)
         self._mass = self.body.node_mass[:, None]
 
     def end_positions(self, velocities: np.ndarray) -> np.ndarray:
@@ -79,14 +79,14 @@ class ImplicitStep:
     def energy(self, velocities: np.ndarray, force: np.ndarray) -> float:
         """Phi, joules; infinite where an element is inverted."""
         change = velocities - self.state.velocities
-        elastic = self.body.assembly.energy(self.end_positions(velocities), self.dt)
+        elastic = self.body.assembly.energy(self.end_positions(velocities), self._damping)
         inertia = 0.5 * float((self._mass * change**2).sum())
         drag = 0.5 * self.dt * self.drag * float((self._mass * velocities**2).sum())
         return inertia + elastic + drag - self.dt * float((velocities * force).sum())
 
     def gradient(self, velocities: np.ndarray, force: np.ndarray) -> np.ndarray:
         """(N, 3) dPhi/dv, N s."""
-        internal = self.body.assembly.gradient(self.end_positions(velocities), self.dt)
+        internal = self.body.assembly.gradient(self.end_positions(velocities), self._damping)
         inertia = self._mass * (velocities - self.state.velocities + self.dt * self.drag * velocities)
         return inertia + self.dt * (internal - force)
 
@@ -94,7 +94,7 @@ class ImplicitStep:
         """Upper entries of S = (1 + dt alpha) M + dt C + dt^2 K, the second derivative of Phi, at the end positions of ``velocities``."""
         assembly = self.body.assembly
         entries = assembly.matrix_entries(
-            self.end_positions(velocities), self.dt, factor=self.dt**2, projected=projected
+            self.end_positions(velocities), self._damping, factor=self.dt**2, projected=projected
         )
         entries[assembly.diagonal_entries] += (1.0 + self.dt * self.drag) * np.repeat(self.body.node_mass, 3)
         return entries
