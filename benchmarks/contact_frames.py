@@ -60,7 +60,9 @@ class BenchBody:
 
 
 def body_named(name: str, device: str, *, nodes: int = 250) -> BenchBody:
-    """A built-in body ("pawn", "stool") or a real capture of ``CAPTURES``, 1 m tall, with a cage of about ``nodes`` nodes."""
+    """A built-in body ("pawn", "stool") or a real capture of ``CAPTURES``, 1 m tall,
+    with a cage of about ``nodes`` nodes.
+    """
     if name in CAPTURES:
         file, up = CAPTURES[name]
         cloud = read_capture(data_folder() / "objects" / file, device=device).cloud
@@ -86,7 +88,9 @@ def body_named(name: str, device: str, *, nodes: int = 250) -> BenchBody:
 
 
 def grouped_segments(muscles: MuscleSet, nodes: np.ndarray, groups: int, seed: int) -> np.ndarray:
-    """(M, groups) 0 or 1: each group is neighbouring segments of a like direction that act as one; ``nodes`` (N, 3) at rest."""
+    """(M, groups) 0 or 1: each group is neighbouring segments of a like direction that act as one;
+    ``nodes`` (N, 3) at rest.
+    """
     ends = muscles.end_points(nodes)
     first, second = ends[muscles.segments[:, 0]], ends[muscles.segments[:, 1]]
     upright = np.abs(second - first)[:, 2] / np.linalg.norm(second - first, axis=1)

@@ -42,8 +42,8 @@ class Drop:
     def at_impact(self, points: np.ndarray) -> np.ndarray:
         """Where ``points`` (P, 3) of the rest shape are in the frame of greatest deformation.
 
-        Between the nodes, and around them where a coarse cage does not reach, the motion is the affine one that fits the nearest nodes
-        best, their weights falling smoothly to nothing (moving least squares).
+        Between the nodes, and around them where a coarse cage does not reach, the motion is the affine one that fits
+        the nearest nodes best, their weights falling smoothly to nothing (moving least squares).
         """
         count = min(NEAREST, len(self.rest))
         distance, near = cKDTree(self.rest).query(points, k=count)

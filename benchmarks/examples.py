@@ -1,4 +1,5 @@
-"""Every example as the paper's supplement tabulates its own: sizes of the body, contacts, QPs and milliseconds a frame by stage.
+"""Every example as the paper's supplement tabulates its own: sizes of the body, contacts, QPs and milliseconds a frame
+by stage.
 
 python benchmarks/examples.py [--quick] [--device cpu] [--json PATH] [--plot PATH]
 """

@@ -2,8 +2,8 @@
 
 Cases: the three built-in scenes (floor under the object taken out, dark haze put in its place, as a capture has it) and
 holes cut into uncovered floor of real captures. Unseen cameras compare the hole's pixels with the untouched floor.
-Rows: this package; ``cv2.inpaint`` in every picture (the better of its two methods); training without the plane: as many
-Gaussians, scattered where the object stood, against the same one inpainted picture.
+Rows: this package; ``cv2.inpaint`` in every picture (the better of its two methods); training without the plane: as
+many Gaussians, scattered where the object stood, against the same one inpainted picture.
 
 Aims: ``beats_cv2_by_3db``, ``beats_no_prior_by_3db`` (mean PSNR over the cases), ``seconds_on_gpu`` (every case at most
 20 s), ``hole_size_independent`` (seconds vary at most 1.5 times over a fourfold area of the hole).

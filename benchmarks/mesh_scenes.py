@@ -77,7 +77,9 @@ def _standing(vertices: np.ndarray) -> np.ndarray:
 
 
 def _subdivided(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges are halved until none is longer than ``LONGEST_EDGE``: a deformed mesh is the truth, and a long straight edge is not."""
+    """Edges are halved until none is longer than ``LONGEST_EDGE``:
+    a deformed mesh is the truth, and a long straight edge is not.
+    """
     while True:
         sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2)
         long = np.linalg.norm(vertices[sides[..., 0]] - vertices[sides[..., 1]], axis=2) > LONGEST_EDGE
@@ -159,7 +161,9 @@ def stool() -> PaintedMesh:
 
 
 def bar() -> PaintedMesh:
-    """The checkered bar of Figure 8: a quarter as thick as it is high, in bricks of long sides, as long Gaussians want."""
+    """The checkered bar of Figure 8: a quarter as thick as it is high, in bricks of long sides,
+    as long Gaussians want.
+    """
     corners = np.array([[x, y, z] for x in (-0.125, 0.125) for y in (-0.125, 0.125) for z in (0.0, 1.0)])
     faces = np.array(
         [[0, 1, 3], [0, 3, 2], [4, 7, 5], [4, 6, 7], [0, 5, 1], [0, 4, 5], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4]]

@@ -1,11 +1,12 @@
 """How well is the plane found? 100 synthetic depth pictures with outliers and noise, and real captures view by view.
 
 A synthetic picture is one view, 240 x 180 pixels, of a random plane with a ball that stands on it (about half of the
-outliers) and scattered wrong depths (the rest): 30 % of the masked pixels are wrong, all have 1 % noise. The extent is the
-diagonal of what is seen of the plane. Real captures: each of eight views alone against all views together.
+outliers) and scattered wrong depths (the rest): 30 % of the masked pixels are wrong, all have 1 % noise. The extent is
+the diagonal of what is seen of the plane. Real captures: each of eight views alone against all views together.
 
-Aims: ``normal`` (within 0.1 degree in every scene), ``offset`` (within 0.1 % of the extent in every scene), ``paper_start``
-(the paper's start leads to the same planes), ``real_views_agree`` (each view alone within 0.5 degree of all together).
+Aims: ``normal`` (within 0.1 degree in every scene), ``offset`` (within 0.1 % of the extent in every scene),
+``paper_start`` (the paper's start leads to the same planes), ``real_views_agree`` (each view alone within 0.5 degree of
+all together).
 """
 
 from __future__ import annotations
@@ -155,7 +156,8 @@ def main() -> None:
             continue
         real.append(real_row(name, click, radius, options.device))
         print(
-            f"{name}: worst view {real[-1]['worst_view_degrees']:.3f}, median {real[-1]['median_view_degrees']:.3f} degree"
+            f"{name}: worst view {real[-1]['worst_view_degrees']:.3f},"
+            f" median {real[-1]['median_view_degrees']:.3f} degree"
         )
     agree = all(row["worst_view_degrees"] <= 0.5 for row in real)
     aims = {

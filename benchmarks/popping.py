@@ -1,11 +1,12 @@
 """Does a split pop? Frame-to-frame difference after motion compensation, over an animation that bends and twists.
 
-Every frame is drawn together with how far each pixel moves to the next one; the next frame, moved back by that, is compared
-with this one. What is left is smooth over time unless something pops. Three clouds: unsplit; split once for the whole
-motion, as the engine does; and, as a control that must be caught, split in each frame by what that frame bends.
+Every frame is drawn together with how far each pixel moves to the next one; the next frame, moved back by that, is
+compared with this one. What is left is smooth over time unless something pops. Three clouds: unsplit; split once for
+the whole motion, as the engine does; and, as a control that must be caught, split in each frame by what that frame
+bends.
 
-A frame pops where the difference exceeds 1.3 times that of the frames around it. Aims: ``no_popping`` (split for the motion, no
-frame pops), ``control_pops`` (the measure sees what it is meant to see).
+A frame pops where the difference exceeds 1.3 times that of the frames around it. Aims: ``no_popping`` (split for the
+motion, no frame pops), ``control_pops`` (the measure sees what it is meant to see).
 """
 
 from __future__ import annotations
@@ -143,8 +144,9 @@ def main() -> None:
             }
         )
         print(
-            f"{name:22} {clouds[0].count:6} to {clouds[-1].count:6} Gaussians, difference {1e3 * np.median(values):.3f}e-3 "
-            f"(median), worst frame {ratios.max():.2f} times its neighbours, {rows[-1]['frames_that_pop']} pop",
+            f"{name:22} {clouds[0].count:6} to {clouds[-1].count:6} Gaussians,"
+            f" difference {1e3 * np.median(values):.3f}e-3 (median), worst frame {ratios.max():.2f} times its"
+            f" neighbours, {rows[-1]['frames_that_pop']} pop",
             flush=True,
         )
     aims = {"no_popping": rows[1]["frames_that_pop"] == 0, "control_pops": rows[2]["frames_that_pop"] > 0}

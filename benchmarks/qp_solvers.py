@@ -2,10 +2,11 @@
 
 python benchmarks/qp_solvers.py [--quick] [--device cpu] [--seed 0] [--body pawn] [--json PATH] [--plot PATH]
 
-The programs are steps of an animation (Eq. 13) with 40 muscle groups, 4 friction directions and 1 to 32 contacts. ``first`` is
-set-up and solve, ``again`` a re-solve for other contact states by a change of bounds alone, ``search`` the whole two-stage
-search of a step. Both solvers get the same programs in turn. ``breach`` is the worst violation of a bound (forces in body
-weights, speeds in sqrt(g H)); ``objective`` is relative to DAQP's. No aim is named for this benchmark.
+The programs are steps of an animation (Eq. 13) with 40 muscle groups, 4 friction directions and 1 to 32 contacts.
+``first`` is set-up and solve, ``again`` a re-solve for other contact states by a change of bounds alone, ``search`` the
+whole two-stage search of a step. Both solvers get the same programs in turn. ``breach`` is the worst violation of a
+bound (forces in body weights, speeds in sqrt(g H)); ``objective`` is relative to DAQP's. No aim is named for this
+benchmark.
 """
 
 from __future__ import annotations

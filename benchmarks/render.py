@@ -85,7 +85,8 @@ def cuda_rows(points: dict[str, np.ndarray], *, cells: tuple, seed: int, repeats
         for label, call in (("forward", forward), ("forward_backward", both)):
             calls = {name: (lambda call=call, name=name: call(name)) for name in renderers}
             row[label] = median_ms(calls, repeats=repeats, synchronise=torch.cuda.synchronize)
-        # Matching settings: gswarp stops every splat at three sigma and at an alpha of 0.99, which below 0.35 do nothing.
+        # Matching settings: gswarp stops every splat at three sigma and at an alpha of 0.99, which below 0.35 do
+        # nothing.
         fainter = replace(plain, opacities=plain.opacities.detach() * 0.35)
         faint = {name: peers.ours_scene(fainter) if name == "ours" else fainter for name in renderers}
         with torch.no_grad():
@@ -229,8 +230,8 @@ def judge(rows: list[dict[str, Any]]) -> tuple[dict[str, bool | None], dict[str,
     differences = [d for row in cuda for d in row["difference"].values()] + [
         row["difference"] for row in rows if row["kind"] == "cpu"
     ]
-    # A splat at its alpha cut, worth at most 1/255, may come or go with the last bit: that shows above 1e-3 in fewer than
-    # one pixel in a thousand, and never as more than two such splats.
+    # A splat at its alpha cut, worth at most 1/255, may come or go with the last bit: that shows above 1e-3 in fewer
+    # than one pixel in a thousand, and never as more than two such splats.
     aims["same_picture"] = all(
         d["mean"] < 1e-5 and d["above_1e-3"] < 1e-3 and d["largest"] < 2 / 255 for d in differences
     )
@@ -247,8 +248,8 @@ def judge(rows: list[dict[str, Any]]) -> tuple[dict[str, bool | None], dict[str,
             aims["cpu_two_threads"] = reached
         else:
             why["cpu_two_threads"] = (
-                f"in the same run this machine's two threads did plain arithmetic only {machine:.2f} times as fast as one:"
-                " its cores are busy or are halves of one core"
+                f"in the same run this machine's two threads did plain arithmetic only {machine:.2f} times as fast as"
+                " one: its cores are busy or are halves of one core"
             )
     return aims, why
 

@@ -1,4 +1,6 @@
-"""What limits each stage of the renderer: bytes that must move, operations that must be done, and the machine's speed at both."""
+"""What limits each stage of the renderer:
+bytes that must move, operations that must be done, and the machine's speed at both.
+"""
 
 # Kernel bodies are not Python to a type checker.
 # pyright: reportIndexIssue=false, reportOperatorIssue=false

@@ -1,8 +1,10 @@
-"""How visible is a split? Image error of every rule, over opacity and viewing direction, and the opacities of least error.
+"""How visible is a split? Image error of every rule, over opacity and viewing direction, and the opacities of least
+error.
 
-A round needle (thickness 0.3 of its length) is drawn whole and as children, from seven directions spread over the sphere;
-the error is root mean square over directions and pixels, in percent of the opacity. The last columns are the opacities of
-the outer and the middle child of the MEASURED rule that minimise it: the table in egs_warp/deformation/splitting.py.
+A round needle (thickness 0.3 of its length) is drawn whole and as children, from seven directions spread over the
+sphere; the error is root mean square over directions and pixels, in percent of the opacity. The last columns are the
+opacities of the outer and the middle child of the MEASURED rule that minimise it: the table in
+egs_warp/deformation/splitting.py.
 
 Aims: ``table_is_optimal`` (no opacity of the table is more than 0.002 from the optimum found here),
 ``measured_beats_paper`` (at every opacity).
@@ -27,7 +29,9 @@ ALONG, ACROSS = np.linspace(-4.0, 4.0, 81), np.linspace(0.0, 3.0, 16)
 
 
 def image_error(opacity: float, rule: SplitRule, peaks: np.ndarray, tilt: float) -> np.ndarray:
-    """Children minus parent over the opacity, on a grid (16, 81); ``tilt`` is the angle of the axis to the line of sight."""
+    """Children minus parent over the opacity, on a grid (16, 81);
+    ``tilt`` is the angle of the axis to the line of sight.
+    """
     offsets, shrink = child_layout(rule)
 
     def width(length: float) -> float:
@@ -42,7 +46,9 @@ def image_error(opacity: float, rule: SplitRule, peaks: np.ndarray, tilt: float)
 
 
 def all_errors(opacity: float, rule: SplitRule, peaks: np.ndarray) -> np.ndarray:
-    """Errors of all directions, weighted by their share of the sphere; the root of the sum of squares is the measure."""
+    """Errors of all directions, weighted by their share of the sphere;
+    the root of the sum of squares is the measure.
+    """
     shares = np.sin(TILTS) / np.sin(TILTS).sum()
     parts = [image_error(opacity, rule, peaks, tilt).ravel() for tilt in TILTS]
     return np.concatenate([np.sqrt(share / part.size) * part for share, part in zip(shares, parts, strict=True)])

@@ -1,11 +1,12 @@
-"""Robustness: bodies x motions x friction x sag x solver step, each run judged by its targets and by every bound of the audit.
+"""Robustness: bodies x motions x friction x sag x solver step, each run judged by its targets and by every bound of the
+audit.
 
 python benchmarks/sweep.py [--quick] [--workers 2] [--device cpu] [--seed 0] [--json PATH] [--join PATH] [--plot PATH]
 
-A run succeeds if the motion reaches what was asked (distance and height within 15 %, a twist's heading within 10 degrees and
-its drift within 0.1 body heights, a walk's distance within 10 % and its feet slipping less than 2 % of a stride), the body
-ends upright (tilt under 10 degrees) and the audit holds. Each failure has its reason. Captures take part where they are found
-(``EGS_WARP_DATA``, else ../shared/data).
+A run succeeds if the motion reaches what was asked (distance and height within 15 %, a twist's heading within 10
+degrees and its drift within 0.1 body heights, a walk's distance within 10 % and its feet slipping less than 2 % of a
+stride), the body ends upright (tilt under 10 degrees) and the audit holds. Each failure has its reason. Captures take
+part where they are found (``EGS_WARP_DATA``, else ../shared/data).
 """
 
 from __future__ import annotations
@@ -196,7 +197,8 @@ def main() -> None:
             row = rows[-1]
             what = f"{row['body']} {row['motion']} mu {row['friction']} sag {row['sag']} step 1/{1 / row['step']:.0f}"
             print(
-                f"{len(rows):>4}/{len(runs) + len(known)} {what}: {row['reason'] or 'success'} ({row['seconds']:.0f} s)",
+                f"{len(rows):>4}/{len(runs) + len(known)} {what}: {row['reason'] or 'success'}"
+                f" ({row['seconds']:.0f} s)",
                 flush=True,
             )
             result = summary(rows, device=arguments.device, seed=arguments.seed)

@@ -1,15 +1,16 @@
 """Table 1: five ways of carrying Gaussians with a cage, against the truth of a deformed mesh.
 
 Three objects with true meshes are photographed at rest by a ray caster, trained to Gaussians by the project's own
-trainer, and then bent, twisted and dropped on the floor: one displacement of the cage nodes, known or simulated, carries the
-mesh's vertices and the Gaussians alike. Unseen cameras compare the two. Two more objects (``--held-out``) had no part in
-choosing any setting.
+trainer, and then bent, twisted and dropped on the floor: one displacement of the cage nodes, known or simulated,
+carries the mesh's vertices and the Gaussians alike. Unseen cameras compare the two. Two more objects (``--held-out``)
+had no part in choosing any setting.
 
 Aims: ``best_psnr_every_deformation`` and ``best_ssim_every_deformation`` (ours is best in the mean over objects),
-``margin_over_vrgs`` (by at least the paper's margins over the local-tetrahedron row), ``split_helps`` (splitting beats no
-splitting in PSNR and SSIM, every deformation).
+``margin_over_vrgs`` (by at least the paper's margins over the local-tetrahedron row), ``split_helps`` (splitting beats
+no splitting in PSNR and SSIM, every deformation).
 
-Splitting is finer here than the library's default (``--misfit 7e-4 --depth 3 --growth 4``), which keeps fuzzy captures at rest as they are.
+Splitting is finer here than the library's default (``--misfit 7e-4 --depth 3 --growth 4``), which keeps fuzzy captures
+at rest as they are.
 """
 
 from __future__ import annotations
@@ -58,7 +59,9 @@ OURS, UNSPLIT, VRGS = CarryMethod.BIDIRECTIONAL, CarryMethod.BIDIRECTIONAL_NO_SP
 
 
 def motions_of(mesh: scenes.PaintedMesh, cloud: GaussianCloud, folder: Path | None) -> dict[str, scenes.Motion]:
-    """What is done to one object. The drop is simulated with a coarse cage; ``cloud`` tells where it touches the floor."""
+    """What is done to one object. The drop is simulated with a coarse cage;
+    ``cloud`` tells where it touches the floor.
+    """
     kept = folder / f"{mesh.name}_drop.npz" if folder else None
     if kept is not None and kept.exists():
         with np.load(kept) as arrays:

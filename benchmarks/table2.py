@@ -1,18 +1,19 @@
 """Table 2: quadratic programs and objective of every strategy for the contact states, frame by frame.
 
-python benchmarks/table2.py [--quick] [--device cpu] [--seed 0] [--solver daqp] [--bodies pawn stool monkey] [--json PATH] [--plot PATH]
+python benchmarks/table2.py [--quick] [--device cpu] [--seed 0] [--solver daqp] [--bodies pawn stool monkey]
+    [--json PATH] [--plot PATH]
 
-The paper's protocol: 50 frames made with known activations, 10 muscle groups and 5 contacts of 8 friction directions, that is
-60 variables and 50 complementarity pairs a frame. Each frame is one program (Eq. 13) that asks for the animation's own motion;
-every strategy gets the same programs. A second table holds smaller problems of the same bodies, and random ones, against the
-true optimum over all contact states (branch and bound).
+The paper's protocol: 50 frames made with known activations, 10 muscle groups and 5 contacts of 8 friction directions,
+that is 60 variables and 50 complementarity pairs a frame. Each frame is one program (Eq. 13) that asks for the
+animation's own motion; every strategy gets the same programs. A second table holds smaller problems of the same bodies,
+and random ones, against the true optimum over all contact states (branch and bound).
 
-``qpcc`` starts from all-static and moves one contact at a time as its own multipliers say; where all-static has no solution it is
-given the states that follow from the last activations. ``qpcc-our-moves`` differs from it only in our rules for the moves, so
-that rules and start can be judged apart.
+``qpcc`` starts from all-static and moves one contact at a time as its own multipliers say; where all-static has no
+solution it is given the states that follow from the last activations. ``qpcc-our-moves`` differs from it only in our
+rules for the moves, so that rules and start can be judged apart.
 
-Aims, over all frames together: ``qps_vs_qpcc`` (two-stage takes at most 0.37 of qpcc's QPs) and ``objective_vs_qpcc`` (its
-mean objective is at most 0.64 of qpcc's): the paper's own ratios.
+Aims, over all frames together: ``qps_vs_qpcc`` (two-stage takes at most 0.37 of qpcc's QPs) and ``objective_vs_qpcc``
+(its mean objective is at most 0.64 of qpcc's): the paper's own ratios.
 """
 
 from __future__ import annotations
@@ -57,7 +58,9 @@ def solve_all(frames: list[Frame], solver: QpSolver) -> dict[Strategy, np.ndarra
 
 
 def lively_frames(bench: BenchBody, strength: float, **options: Any) -> tuple[list[Frame], float]:
-    """Frames of an animation, as strong as the body bears: halved from ``strength`` until every step of it converges."""
+    """Frames of an animation, as strong as the body bears:
+    halved from ``strength`` until every step of it converges.
+    """
     while True:
         try:
             return animation_frames(bench, strength=strength, **options), strength

@@ -1,9 +1,10 @@
 """Table 3 of the paper: an object cut off at its plane, seen from within the plane. Also writes its figure 9.
 
-Scenes are taken apart as ``egs-warp segment`` does, from masks in 18 views: of the true object in the built-in scenes, and
-in real captures of what a click finds. ``mask only`` is everything that the masks claim, the plane left aside. Four cameras
-of 800 x 800 pixels lie in the plane, so that its horizon is the middle row. PSNR and SSIM compare the upper halves with
-those of ``mask only``, on black; the residual is the sum of the pixels of the lower half over that of the upper half.
+Scenes are taken apart as ``egs-warp segment`` does, from masks in 18 views: of the true object in the built-in scenes,
+and in real captures of what a click finds. ``mask only`` is everything that the masks claim, the plane left aside. Four
+cameras of 800 x 800 pixels lie in the plane, so that its horizon is the middle row. PSNR and SSIM compare the upper
+halves with those of ``mask only``, on black; the residual is the sum of the pixels of the lower half over that of the
+upper half.
 
 Aims: ``residual`` (L_seg: at most 0.002 in every scene), ``psnr`` (L_seg: at least 35.3 dB in every scene). ``L_seg, no
 subdivision`` is the paper's own way; ours splits straddling Gaussians twice before it trains.

@@ -176,7 +176,9 @@ def _write_pictures(folder: Path, given: SceneInput, scene: PreparedScene) -> li
 
 
 def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
-    """What the flags say of the motion, as arguments of ``animate``. Raises ``UserError`` for what can be told at once."""
+    """What the flags say of the motion, as arguments of ``animate``.
+    Raises ``UserError`` for what can be told at once.
+    """
     from egs_warp.contact.terrain import read_terrain
     from egs_warp.io.text import parse_json, read_text
     from egs_warp.motions.repertoire import longest

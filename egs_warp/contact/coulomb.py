@@ -16,10 +16,12 @@ def coulomb_forces(
     tolerance: float = 1e-12,
     iteration_limit: int = 60,
 ) -> tuple[np.ndarray, float]:
-    """Forces f (n, 3) with 0 <= f_n, 0 <= u_n + shift, complementary, and exact Coulomb friction; u = free + G f (Eq. 8, 9).
+    """Forces f (n, 3) with 0 <= f_n, 0 <= u_n + shift, complementary, and exact Coulomb friction; u = free + G f
+    (Eq. 8, 9).
 
-    ``delassus`` G (3n, 3n) m/(N s); ``free_velocity`` (3n,) m/s; ``shift`` (n,) m/s; ``start`` (n, 3). Semismooth Newton on the
-    projection equations of Alart and Curnier, started from block Gauss-Seidel. Returns the residual (m/s) too.
+    ``delassus`` G (3n, 3n) m/(N s); ``free_velocity`` (3n,) m/s; ``shift`` (n,) m/s; ``start`` (n, 3). Semismooth
+    Newton on the projection equations of Alart and Curnier, started from block Gauss-Seidel. Returns the residual (m/s)
+    too.
     """
     count = len(shift)
     if count == 0:

@@ -28,7 +28,9 @@ class Prediction:
 
 @dataclass(frozen=True)
 class PenaltyContact:
-    """Normal force -k_n min(0, c) and friction of Huber slope min(k_f |u_t|, cap); c is the normal measure of DESIGN 7."""
+    """Normal force -k_n min(0, c) and friction of Huber slope min(k_f |u_t|, cap);
+    c is the normal measure of DESIGN 7.
+    """
 
     contacts: ContactSet
     step: ImplicitStep

@@ -23,7 +23,9 @@ MAX_STRETCH = 1.5
 """An arm may be stretched this many times more than the matter at its two ends; beyond that it would be a spike."""
 
 LEAST_BRIDGE = 1e-3
-"""Arms shorter than this, over the cage's diagonal, are never carried by a difference of positions: float32 is too coarse."""
+"""Arms shorter than this, over the cage's diagonal, are never carried by a difference of positions:
+float32 is too coarse.
+"""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,9 @@ class DeformedGaussians:
     cloud: GaussianCloud
     """(n,) at their new places. ``opacity_logits`` is the rest cloud's own array."""
     turns: wp.array
-    """(n,) vec4, unit quaternions w, x, y, z: the rotation R_polar of F by which each Gaussian and its colour were turned."""
+    """(n,) vec4, unit quaternions w, x, y, z:
+    the rotation R_polar of F by which each Gaussian and its colour were turned.
+    """
 
 
 @dataclass(frozen=True)

@@ -51,8 +51,8 @@ def carry(
 ) -> list[GaussianCloud]:
     """The cloud in each of ``frames``: node positions (N, 3) or (N,) vec3d, metres, of the cage ``mesh``.
 
-    ``rule``, ``threshold_degrees``, ``min_error``, ``max_depth`` and ``max_growth`` are those of ``split_for_motion`` and
-    matter to ``BIDIRECTIONAL``.
+    ``rule``, ``threshold_degrees``, ``min_error``, ``max_depth`` and ``max_growth`` are those of ``split_for_motion``
+    and matter to ``BIDIRECTIONAL``.
     """
     cage = mesh if isinstance(mesh, CageLocator) else CageLocator(mesh, device=cloud.device)
     if method in (CarryMethod.BIDIRECTIONAL, CarryMethod.BIDIRECTIONAL_NO_SPLIT):

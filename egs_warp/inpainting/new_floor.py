@@ -62,9 +62,9 @@ def flat_gaussians(
     spacing: int,
     device: str | None = None,
 ) -> GaussianCloud:
-    """Gaussians of SH degree 0 every ``spacing`` texels over ``hole`` (rows, columns) and its ``known`` rim, in the colours of
-    ``painted`` (rows, columns, 3), at ``heights`` (rows, columns) above the plane; those of the rim a little lower,
-    where they only show through gaps."""
+    """Gaussians of SH degree 0 every ``spacing`` texels over ``hole`` (rows, columns) and its ``known`` rim, in the
+    colours of ``painted`` (rows, columns, 3), at ``heights`` (rows, columns) above the plane; those of the rim a little
+    lower, where they only show through gaps."""
     size = (np.array(hole.shape) // spacing) * spacing
 
     def blocks(values: np.ndarray) -> np.ndarray:

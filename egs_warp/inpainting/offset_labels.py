@@ -179,8 +179,8 @@ def _label(
 
 
 def _expanded(labels: np.ndarray, data: np.ndarray, colour: np.ndarray, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """``labels`` (n,) improved by expansion moves: ``data`` (n, k) is the price of each label, ``colour`` (n, k, 3) what it
-    paints; seams are between neighbours ``p`` and ``q`` (m,)."""
+    """``labels`` (n,) improved by expansion moves: ``data`` (n, k) is the price of each label, ``colour`` (n, k, 3)
+    what it paints; seams are between neighbours ``p`` and ``q`` (m,)."""
 
     def seam(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         cost = np.linalg.norm(colour[p, a] - colour[p, b], axis=-1) + np.linalg.norm(
@@ -213,7 +213,9 @@ def _expanded(labels: np.ndarray, data: np.ndarray, colour: np.ndarray, p: np.nd
 
 
 def _places(domain: np.ndarray, offsets: Offsets, is_source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n, k, 2) where each offset leads from each pixel, kept inside the picture; and (n, k) bool whether to a source."""
+    """(n, k, 2) where each offset leads from each pixel, kept inside the picture;
+    and (n, k) bool whether to a source.
+    """
     place = domain[:, None] + offsets.steps[None]
     bounded = np.clip(place, 0, np.array(is_source.shape) - 1)
     return bounded, (place == bounded).all(axis=-1) & is_source[bounded[..., 0], bounded[..., 1]]

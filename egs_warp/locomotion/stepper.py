@@ -1,4 +1,6 @@
-"""The two-stage stepper: predict the contact states, optimise the muscles, correct with the full mechanics (Eq. 12, 13)."""
+"""The two-stage stepper: predict the contact states, optimise the muscles,
+correct with the full mechanics (Eq. 12, 13).
+"""
 
 from __future__ import annotations
 
@@ -46,11 +48,11 @@ class LocomotionSettings:
     qp_solver: QpSolver | str = QpSolver.OSQP
     strategy: Strategy | str = Strategy.TWO_STAGE
     activation_weight: float = 2e-4
-    """For a step of sqrt(H / g) / 19 and a muscle of 4 body weights. Shorter steps change speeds by less, so they weigh activations
-    less: by the square of their share. Stronger muscles weigh more, as their force."""
+    """For a step of sqrt(H / g) / 19 and a muscle of 4 body weights. Shorter steps change speeds by less, so they weigh
+    activations less: by the square of their share. Stronger muscles weigh more, as their force."""
     activation_change_weight: float = 3e-4
-    """Likewise, by the step's share, and by the square of the force: the strong muscles of a stiff body would else play full
-    strokes against each other from step to step, further than the linearised program knows the way."""
+    """Likewise, by the step's share, and by the square of the force: the strong muscles of a stiff body would else play
+    full strokes against each other from step to step, further than the linearised program knows the way."""
     drag: float = 0.0
     """alpha, 1/s."""
 

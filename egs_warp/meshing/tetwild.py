@@ -22,7 +22,9 @@ class SampledField(Protocol):
 
 
 def flat_bottomed_surface(field: SampledField) -> tuple[np.ndarray, np.ndarray]:
-    """Marching-cubes vertices (v, 3) and outward faces (f, 3) of the field, closed by an exactly flat bottom at z = 0."""
+    """Marching-cubes vertices (v, 3) and outward faces (f, 3) of the field,
+    closed by an exactly flat bottom at z = 0.
+    """
     values, start = field.samples()
     closed = np.concatenate([np.full_like(values[:, :, :1], 2.0), values], axis=2)
     vertices, faces, _, _ = measure.marching_cubes(closed, 0.0)

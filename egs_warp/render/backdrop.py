@@ -1,4 +1,6 @@
-"""What is behind the moving object: a plain floor with a grid, or a captured scene; and the object's soft shadow on it."""
+"""What is behind the moving object: a plain floor with a grid, or a captured scene;
+and the object's soft shadow on it.
+"""
 
 from __future__ import annotations
 
@@ -40,8 +42,8 @@ class ContactShadow:
     def __init__(
         self, camera: Camera, plane: Plane, *, centre: np.ndarray, reach: float, depth: np.ndarray | None = None
     ) -> None:
-        """``centre`` (3,) and ``reach`` (world units) bound the part of the plane that can be in shadow; ``depth`` (H, W) is
-        the z-depth of the uneven ground that it falls on, 0 where that is the plane."""
+        """``centre`` (3,) and ``reach`` (world units) bound the part of the plane that can be in shadow; ``depth`` (H,
+        W) is the z-depth of the uneven ground that it falls on, 0 where that is the plane."""
         self._plane, self._centre, self._reach = plane, centre, reach
         self._tangents = np.stack(plane.tangents())
         u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)

@@ -92,7 +92,9 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, thr
 
 
 def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int) -> TileLists:
-    """Radix sort of all (tile, Gaussian) pairs by tile and the leading bits of depth; 32 bits sort twice as fast as 64."""
+    """Radix sort of all (tile, Gaussian) pairs by tile and the leading bits of depth;
+    32 bits sort twice as fast as 64.
+    """
     device = projected.ellipse.device
     count, pairs = projected.slot_end.shape[0], projected.slot_count
     if pairs == 0:

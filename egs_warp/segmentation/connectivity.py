@@ -40,7 +40,8 @@ def connected_parts(cloud: GaussianCloud, chosen: np.ndarray, *, cell: float, pl
 
 
 def enclosed(points: np.ndarray, shell: np.ndarray, cell: float) -> np.ndarray:
-    """(n,) bool: whether ``points`` (n, k) lie in or within the closed shell of ``shell`` (m, k), on a grid of ``cell``.
+    """(n,) bool: whether ``points`` (n, k) lie in or within the closed shell of ``shell`` (m, k), on a grid of
+    ``cell``.
 
     Gaps of up to four cells are closed.
     """
