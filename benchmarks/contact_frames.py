@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
@@ -27,6 +25,7 @@ from egs_warp.motions.stance import Weights
 from egs_warp.muscles.muscle_set import MuscleColumns, MuscleSet, automatic_muscles
 from egs_warp.muscles.tension import MuscleTension
 from egs_warp.segmentation.base_plane import find_base_plane
+from harness import data_folder
 
 CAPTURES = {"monkey": ("monkey.ply", (0.0, 1.0, 0.0)), "plush dog": ("plush_dog.ply", (0.0, -1.0, 0.0))}
 """File and up axis of real captures in the data folder."""
@@ -43,11 +42,6 @@ class Frame:
     """(M,) the known activations of the step before, in their bounds."""
     known: np.ndarray
     """(M,) those of this step."""
-
-
-def data_folder() -> Path:
-    """Folder of the real captures: $EGS_WARP_DATA, else beside the repository."""
-    return Path(os.environ.get("EGS_WARP_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 
 @dataclass(frozen=True)
@@ -95,7 +89,8 @@ def grouped_segments(muscles: MuscleSet, nodes: np.ndarray, groups: int, seed: i
     first, second = ends[muscles.segments[:, 0]], ends[muscles.segments[:, 1]]
     upright = np.abs(second - first)[:, 2] / np.linalg.norm(second - first, axis=1)
     features = np.column_stack([0.5 * (first + second), 0.5 * upright * np.ptp(nodes, axis=0).max()])
-    _, group = kmeans2(features, groups, minit="++", seed=seed)
+    # scipy 1.15 renamed the argument, with other random numbers under the new name.
+    _, group = kmeans2(features, groups, minit="++", seed=seed)  # pyright: ignore[reportCallIssue]
     return np.eye(groups)[group]
 
 
