@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.bitmaps import depth_inside, distance_to
-from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.rectified import PlaneWindow, rectify
@@ -196,9 +196,7 @@ def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
 
 def _on_plane(plane: Plane, camera: Camera, mask: np.ndarray) -> np.ndarray:
     """(n, 3) points of the plane behind the pixels of ``mask``; none for those that miss it."""
-    rows, columns = np.nonzero(mask)
-    rays = np.stack([(columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy, np.ones(len(rows))])
-    rays = rays.T @ camera.rotation
+    rays = camera_rays(camera)[mask]
     slope = rays @ plane.normal
     height = float(plane.heights(camera.centre))
     meets = slope * height < 0.0
