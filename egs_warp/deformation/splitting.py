@@ -13,7 +13,7 @@ from egs_warp.deformation.deformer import BendMeasure, Deformer
 from egs_warp.deformation.embedding import GaussianEmbedding, embed_gaussians
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.kernels.deformation.splitting import split_kernel
-from egs_warp.launching import launch_rows
+from egs_warp.launching import empty, launch_rows
 
 MIN_OPACITY = 2.0 / 255.0
 """A Gaussian that never exceeds this cannot be seen to be wrong."""
@@ -213,11 +213,11 @@ def _gather(
     count = len(sources)
     with wp.ScopedDevice(cloud.device):
         result = GaussianCloud(
-            means=wp.empty(count, dtype=wp.vec3),
-            rotations=wp.empty(count, dtype=wp.vec4),
-            log_scales=wp.empty(count, dtype=wp.vec3),
+            means=empty(count, wp.vec3, cloud.device),
+            rotations=empty(count, wp.vec4, cloud.device),
+            log_scales=empty(count, wp.vec3, cloud.device),
             opacity_logits=wp.array(opacity_logits, dtype=wp.float32),
-            sh=wp.empty((count, cloud.sh.shape[1]), dtype=wp.vec3),
+            sh=empty((count, cloud.sh.shape[1]), wp.vec3, cloud.device),
         )
         plan = [wp.array(sources, dtype=wp.int32), wp.array(axes, dtype=wp.int32), wp.array(offsets, dtype=wp.float32)]
     launch_rows(

@@ -221,7 +221,16 @@ def _check(hole: np.ndarray, known: np.ndarray) -> None:
         )
 
 
-def _trained(kept, new, window, hole, painted, thickness, options, progress) -> GaussianCloud:
+def _trained(
+    kept: GaussianCloud,
+    new: GaussianCloud,
+    window: PlaneWindow,
+    hole: np.ndarray,
+    painted: np.ndarray,
+    thickness: float,
+    options: InpaintOptions,
+    progress: Callable[[int, float], None] | None,
+) -> GaussianCloud:
     """``new`` after training against the inpainted picture, between what lies around the hole; degree 0."""
     try:
         from egs_warp.training.finetune import FinetuneOptions, GaussianTensors, Rates, TrainingView, finetune

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 from scipy import ndimage
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
@@ -100,7 +100,7 @@ def with_gloss(new: GaussianCloud, floor: GaussianCloud, window: PlaneWindow) ->
     if coefficients == 1:
         return new
     neighbours = min(_NEIGHBOURS, floor.count)
-    distance, index = cKDTree(floor.means.numpy()).query(new.means.numpy(), k=neighbours)
+    distance, index = KDTree(floor.means.numpy()).query(new.means.numpy(), k=neighbours)
     weight = 1.0 / np.maximum(np.reshape(distance, (new.count, neighbours)), window.texel)
     weight /= weight.sum(axis=1, keepdims=True)
     sh = np.zeros((new.count, coefficients, 3), np.float32)

@@ -140,14 +140,14 @@ def proposed_pivots(
         if state == SEPARATE:
             if c[i] <= zero:
                 along = w_t[i] - lam[i]
-                propose(y_force[i], i, np.argmin(along) if along.min() < -zero else STATIC)
+                propose(y_force[i], i, int(np.argmin(along)) if along.min() < -zero else STATIC)
         elif state == STATIC:
             # The rows of a static contact are redundant: only their sum along D means something.
             pull = y_slip[i] @ table
             size = float(np.linalg.norm(pull))
             if f_n[i] <= zero:
                 propose(max(y_normal[i], size), i, SEPARATE)
-                propose(size, i, np.argmin(table @ pull))
+                propose(size, i, int(np.argmin(table @ pull)))
             elif cone[i] <= zero:
                 k = int(np.argmax(f_t[i]))
                 along = float(table[k] @ pull)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg.blas import dger
+from scipy.linalg.blas import dger  # pyright: ignore[reportAttributeAccessIssue]  # compiled: no stub names it
 
 
 def lemke(matrix: np.ndarray, q: np.ndarray, *, pivot_limit: int = 2000) -> np.ndarray | None:

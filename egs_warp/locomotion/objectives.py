@@ -58,7 +58,7 @@ def lifted_contacts(contacts: ContactSet, objectives: Sequence[Objective | SpinO
 def node_velocities(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
     """Velocities (N, 3) of all nodes, each weighted by its share of the mass: a pose to move towards."""
     shares = np.sqrt(np.repeat(body.node_mass / body.mass, 3))
-    return Objective("pose", sparse.diags(shares).tocsr(), shares * target.ravel(), weight)
+    return Objective("pose", sparse.csr_matrix(sparse.diags(shares)), shares * target.ravel(), weight)
 
 
 @dataclass(frozen=True)

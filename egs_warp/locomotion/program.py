@@ -145,7 +145,13 @@ def _moment_rows(step: ImplicitStep, contacts: ContactSet, layout: ContactLayout
 
 
 def _quadratic_cost(
-    step, linear, contacts, objectives, layout, previous, scales: CostScales
+    step: ImplicitStep,
+    linear: LinearResponse,
+    contacts: ContactSet,
+    objectives: Sequence[Objective | SpinObjective],
+    layout: ContactLayout,
+    previous: np.ndarray,
+    scales: CostScales,
 ) -> tuple[np.ndarray, np.ndarray, float]:
     body, state = step.body, step.state
     moments = _moment_rows(step, contacts, layout)

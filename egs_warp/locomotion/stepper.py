@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy import sparse
 
 from egs_warp.contact.corrector import ContactStepResult, contact_step
 from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet, independent_contacts
@@ -207,7 +208,15 @@ class LocomotionStepper:
         return candidates[chosen]
 
     def _optimise(
-        self, step, before, columns, contacts: ContactSet, prediction: Prediction, memory, objectives, clock
+        self,
+        step: ImplicitStep,
+        before: MuscleTension,
+        columns: sparse.csc_matrix,
+        contacts: ContactSet,
+        prediction: Prediction,
+        memory: StepMemory,
+        objectives: Sequence[Objective | SpinObjective],
+        clock: _Clock,
     ) -> _Plan:
         body, settings = self.body, self.settings
         all_contacts = contacts.count
@@ -261,7 +270,9 @@ class LocomotionStepper:
             velocities = prediction.velocities
         return _Plan(activations, velocities, forces, found)
 
-    def _finish(self, step, state, plan: _Plan, result: ContactStepResult, clock):
+    def _finish(
+        self, step: ImplicitStep, state: BodyState, plan: _Plan, result: ContactStepResult, clock: _Clock
+    ) -> tuple[BodyState, StepMemory, StepReport]:
         end = step.end_positions(result.velocities)
         external = result.nodal_forces - self.settings.drag * self.body.node_mass[:, None] * result.velocities
         velocities, spin = conserve_angular_momentum(self.body, state, end, result.velocities, external, step.dt)

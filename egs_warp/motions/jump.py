@@ -244,7 +244,9 @@ class Jump:
         position = start + down + onset * elapsed + 0.5 * (take_off - onset) * elapsed**2 / plan.thrust_time
         return position, onset + (take_off - onset) * elapsed / plan.thrust_time
 
-    def _stand(self, state: BodyState, com_velocity, position, base, dt: float) -> list[Objective | SpinObjective]:
+    def _stand(
+        self, state: BodyState, com_velocity: np.ndarray, position: np.ndarray, base: np.ndarray, dt: float
+    ) -> list[Objective | SpinObjective]:
         pose = self.pose.over_base(position, base)
         spin = self.pose.turn_towards(state, pose) * 4.0 / self._time_unit
         if self.phase is JumpPhase.THRUST:
@@ -294,7 +296,9 @@ class Jump:
         velocity = self._balanced(seen, seen.velocity + dt * acceleration, dt)
         return self._stand(state, velocity, seen.com + dt * velocity, seen.base, dt)
 
-    def _write(self, state: BodyState, com_velocity, pose, spin, dt: float) -> list[Objective | SpinObjective]:
+    def _write(
+        self, state: BodyState, com_velocity: np.ndarray, pose: np.ndarray, spin: np.ndarray, dt: float
+    ) -> list[Objective | SpinObjective]:
         rate = (pose - self._pose) / dt
         if np.abs(rate).max() > 5.0 / self._time_unit:
             rate = np.zeros((3, 3))

@@ -240,7 +240,9 @@ class Walk:
             targets[index, 2] += gait.lifted(progress) - 0.02 * self.body.height * max(progress - 1.0, 0.0)
         return targets
 
-    def _foot_objective(self, index: int, local, before, after, elapsed: float, dt: float) -> Objective:
+    def _foot_objective(
+        self, index: int, local: np.ndarray, before: np.ndarray, after: np.ndarray, elapsed: float, dt: float
+    ) -> Objective:
         sole, part, control = self.feet[index].sole, self._parts[index], self.control
         if index not in self.swinging:
             return part_nodes(self.body, part, np.zeros((len(sole), 3)), control.support)

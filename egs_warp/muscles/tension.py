@@ -72,7 +72,7 @@ class TensionStiffness:
     def product(self, x: np.ndarray) -> np.ndarray:
         """(N, 3) K x for ``x`` (N, 3)."""
         d = self.rows @ x
-        along = (d * self.directions).sum(axis=1, keepdims=True)
+        along = np.sum(d * self.directions, axis=1, keepdims=True)
         return self.columns @ (self.rates[:, None] * (d - along * self.directions))
 
     def factors(self) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
@@ -219,7 +219,7 @@ def _wisps(scene: _Scene, chosen: np.ndarray, size: float) -> np.ndarray:
     colours = scene.cloud.sh.numpy()[:, 0].astype(np.float64) * SH_BAND_0
 
     def apart(others: np.ndarray) -> np.ndarray:
-        tree = cKDTree(scene.means[others])
+        tree = KDTree(scene.means[others])
         _, nearest = tree.query(scene.means[suspects], k=min(_NEIGHBOURS, len(others)))
         nearest = np.reshape(nearest, (len(suspects), -1))
         return np.linalg.norm(np.median(colours[others[nearest]], axis=1) - colours[suspects], axis=1)
