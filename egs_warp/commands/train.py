@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +16,7 @@ from egs_warp.commands.flags import Commands, check_device
 from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
+    from egs_warp.geometry.gaussians import GaussianCloud
     from egs_warp.pipelines.train_capture import TrainResult
 
 _SHEET_PHOTOS = 6
@@ -140,7 +142,7 @@ def _colour(text: str) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def _writer(out: Path):
+def _writer(out: Path) -> Callable[[Path, GaussianCloud], None]:
     """The function that writes a capture to ``out``; refused now rather than after training."""
     from egs_warp import io
 

@@ -74,7 +74,7 @@ class VideoWriter:
 
     def __init__(
         self, path: Path | str, width: int, height: int, *, frames_per_second: float = 60.0, quality: int = 16
-    ):
+    ) -> None:
         """``quality`` is x264's constant rate factor: 0 lossless, 16 hardly visible loss, 51 worst."""
         self._path = Path(path)
         self._size = (height, width)

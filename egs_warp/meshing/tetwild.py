@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import types
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import numpy as np
 from skimage import measure
@@ -57,7 +58,7 @@ def tetwild(field: SampledField, target_nodes: int) -> TetMesh | None:
         return None
 
 
-def _tetrahedralize():
+def _tetrahedralize() -> Callable[..., Any]:
     """pytetwild's function. Its 0.4.2 imports pyvista (and with it all of VTK) for an accessor that is not used here,
     though its metadata call pyvista optional: an empty module takes its place while it is imported."""
     try:
