@@ -247,7 +247,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         strips += pictures
     aims, why_null = judge(rows, quick=options.quick)
     print("\nmean over objects: PSNR, SSIM")
-    table = Table(method="<24", **{f"{motion}_{what}": ".4g" for motion in MOTIONS for what in ("dB", "SSIM")})
+    table = Table(
+        method="<24",
+        **{f"{motion}_{what}": form for motion in MOTIONS for what, form in (("dB", ".2f"), ("SSIM", ".4f"))},
+    )
     for method in CarryMethod:
         table.row(method.value, *(value for motion in MOTIONS for value in means(rows)[motion, method]))
     _, no_lpips = lpips_distance()
