@@ -5,20 +5,26 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from egs_warp.commands.flags import check_device
+from egs_warp.commands.flags import Commands, check_device
 from egs_warp.errors import UserError
+
+if TYPE_CHECKING:
+    from egs_warp.geometry.gaussians import GaussianCloud
+    from egs_warp.pipelines.train_capture import TrainResult
 
 _SHEET_PHOTOS = 6
 _DEFAULTS = {"cpu": (2000, 20_000, 360), "cuda": (7000, 200_000, 1600)}
 """Iterations, Gaussians, longer side in pixels: some ten minutes on two cores, about one on a GPU."""
 
 
-def add_parser(commands) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     train = commands.add_parser("train", help="make a capture from posed photos")
     train.add_argument("posed", help="COLMAP model, transforms.json or cameras.json, or a folder that holds one")
@@ -136,7 +142,7 @@ def _colour(text: str) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def _writer(out: Path):
+def _writer(out: Path) -> Callable[[Path, GaussianCloud], None]:
     """The function that writes a capture to ``out``; refused now rather than after training."""
     from egs_warp import io
 
@@ -150,7 +156,7 @@ def _writer(out: Path):
     raise UserError(f"--out {out}: give a name that ends in {', '.join(writers)}")
 
 
-def _report(chosen: argparse.Namespace, result, progress: _Progress, seconds: float) -> dict:
+def _report(chosen: argparse.Namespace, result: TrainResult, progress: _Progress, seconds: float) -> dict:
     from egs_warp.pipelines.report import versions
 
     photo = result.views[0].camera
@@ -179,7 +185,7 @@ def _report(chosen: argparse.Namespace, result, progress: _Progress, seconds: fl
     }
 
 
-def _write_sheet(path: Path, result) -> None:
+def _write_sheet(path: Path, result: TrainResult) -> None:
     """Photo beside render, of photos held out where there are any."""
     from egs_warp.io.video import contact_sheet, write_png
     from egs_warp.render import render

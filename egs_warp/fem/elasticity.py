@@ -111,7 +111,9 @@ class ElasticAssembly:
         self._entries = wp.zeros(pattern.nnz, dtype=real, device=self.device)
 
     def entries_of_node_pairs(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """(m, 9) indices into the upper matrix's entries of the 3x3 blocks of node pairs first <= second; -1 where absent."""
+        """(m, 9) indices into the upper matrix's entries of the 3x3 blocks of node pairs first <= second;
+        -1 where absent.
+        """
         keys = first.astype(np.int64) * len(self.mesh.nodes) + second
         return self._entry_from_block_host[np.searchsorted(self._block_keys, keys)]
 
@@ -152,7 +154,8 @@ class ElasticAssembly:
     def energy(self, positions: np.ndarray, damping: Damping | None = None) -> float:
         """Psi(positions), joules; infinite if an element is inverted.
 
-        With ``damping``, plus dt beta/2 sum V E':C:E', where E' = (F^T F - F0^T F0) / (2 dt) is the mean strain rate of the step.
+        With ``damping``, plus dt beta/2 sum V E':C:E', where E' = (F^T F - F0^T F0) / (2 dt) is the mean strain rate of
+        the step.
         """
         self._upload(self._positions, positions)
         wp.launch(

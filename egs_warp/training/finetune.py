@@ -190,7 +190,9 @@ def views_of_capture(
 
 
 def scene_extent(cameras: Sequence[Camera], cloud: GaussianCloud) -> float:
-    """Length that the step size of the means is measured by: 1.1 times the cameras' radius, or the cloud's if smaller."""
+    """Length that the step size of the means is measured by:
+    1.1 times the cameras' radius, or the cloud's if smaller.
+    """
     centres = np.array([camera.centre for camera in cameras])
     of_cameras = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     means = cloud.means.numpy()
@@ -200,7 +202,9 @@ def scene_extent(cameras: Sequence[Camera], cloud: GaussianCloud) -> float:
 
 
 def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Mean structural similarity of two pictures (H, W, 3) in 0 to 1: 11 x 11 Gaussian window, sigma 1.5, zero padding."""
+    """Mean structural similarity of two pictures (H, W, 3) in 0 to 1:
+    11 x 11 Gaussian window, sigma 1.5, zero padding.
+    """
     offsets = torch.arange(-5.0, 6.0, device=a.device)
     line = torch.exp(-(offsets**2) / (2 * 1.5**2))
     line = line / line.sum()

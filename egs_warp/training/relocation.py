@@ -53,7 +53,9 @@ class Population:
 
     @torch.no_grad()
     def evolve(self, step: int, steps: int, cap: int) -> None:
-        """Jitter the means; now and then move faint Gaussians onto opaque ones and grow, to reach ``cap`` at half time."""
+        """Jitter the means; now and then move faint Gaussians onto opaque ones and grow,
+        to reach ``cap`` at half time.
+        """
         self._jitter()
         # The last fifth of the steps settles what is there.
         if step % _EVERY != _EVERY - 1 or step > 0.8 * steps:
