@@ -50,7 +50,7 @@ def find_body_frame(cloud: GaussianCloud, plane: Plane) -> BodyFrame:
 
 
 def body_gaussians(cloud: GaussianCloud, frame: BodyFrame) -> GaussianCloud:
-    """The capture in ``frame``, without its colours, in an order that follows the body.
+    """The capture in ``frame``, of its colours the even part, in an order that follows the body.
 
     The same bits for any order of the capture's Gaussians and, unless a size lies within single precision's rounding of a step,
     for any unit that is a power of two.
@@ -64,7 +64,7 @@ def body_gaussians(cloud: GaussianCloud, frame: BodyFrame) -> GaussianCloud:
         turned,
         np.rint(_STEPS_PER_E * sizes) / _STEPS_PER_E,
         cloud.opacity_logits.numpy(),
-        np.zeros((cloud.count, 1, 3)),
+        cloud.sh.numpy()[:, :1],
         device=str(cloud.device),
     )
     return body.subset(canonical_order(body))

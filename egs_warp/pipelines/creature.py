@@ -29,6 +29,10 @@ SMALLEST_SAG = 0.004
 """A body is not made stiffer than this column's sag, whatever it bends."""
 STEEPEST_SLOPE = 45.0
 """Degrees: nothing stands on a steeper one."""
+FILMED_FROM = (0.35, -1.0, 0.22)
+"""From the body to the camera of a film: ahead, left and up."""
+_DETAIL_CELL = 0.06
+"""Body heights: eyes and noses differ from what is this near, fur and flat paint do not."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +43,8 @@ class Creature:
     """Of the body, in the capture."""
     cloud: GaussianCloud
     """The capture, in the order of its own."""
+    front: np.ndarray
+    """(3,) unit, along the ground: where it shows most detail."""
     cage: Cage
     stepper: LocomotionStepper
     """Body, muscles and contact."""
@@ -102,7 +108,8 @@ def make_creature(
         start = settle(stepper)
         if sag < SMALLEST_SAG or _stands(stepper, start):
             everything = (Solid((GROUND,)), *solids)
-            return Creature(frame, in_body_frame(cloud, frame), cage, stepper, start, everything)
+            front = _front(standing.gaussians, body.height)
+            return Creature(frame, in_body_frame(cloud, frame), front, cage, stepper, start, everything)
         sag *= 0.5
 
 
@@ -199,10 +206,33 @@ def first_place(creature: Creature, forward: np.ndarray | None = None, *, step: 
 
 
 def _forward(creature: Creature) -> np.ndarray:
-    """(3,) the long axis of the footprint: the direction in which the body is least likely to tip; of a round one, the body's x."""
+    """(3,) the long axis of the footprint: the direction in which the body is least likely to tip, with the body's front to the camera;
+    of a round one, its front."""
     nodes = creature.cage.mesh.nodes
     sole = nodes[nodes[:, 2] < 0.06 * creature.body.height, :2]
     flat = sole - sole.mean(axis=0)
     values, vectors = np.linalg.eigh(flat.T @ flat)
-    axis = vectors[:, 1] if values[1] > 1.2 * values[0] else np.array([1.0, 0.0])
-    return np.append(axis * np.sign(axis[np.argmax(np.abs(axis))]), 0.0)
+    if values[1] <= 1.2 * values[0]:
+        return creature.front
+    (x, y), (ahead, left, _) = vectors[:, 1], FILMED_FROM
+    seen = ahead * np.array([x, y]) + left * np.array([-y, x])
+    return np.array([x, y, 0.0]) * (1.0 if seen @ creature.front[:2] >= 0.0 else -1.0)
+
+
+def _front(gaussians: GaussianCloud, height: float) -> np.ndarray:
+    """(3,) unit, along the ground: where a body of ``height`` shows most detail, as faces do.
+
+    Detail is the distance of a Gaussian's colour from the mean of those about it, in cells of ``_DETAIL_CELL`` heights.
+    """
+    means, colours = gaussians.means.numpy().astype(np.float64), gaussians.sh.numpy()[:, 0].astype(np.float64)
+    masses = np.where(means[:, 2] > 0.0, gaussians.opacities(), 0.0)
+    _, cell = np.unique(np.floor(means / (_DETAIL_CELL * height)), axis=0, return_inverse=True)
+    cell = cell.ravel()
+    mass = np.maximum(np.bincount(cell, masses), 1e-300)
+    around = np.stack([np.bincount(cell, masses * colours[:, k]) / mass for k in range(3)], axis=1)
+    detail = masses * np.linalg.norm(colours - around[cell], axis=1)
+    detail -= masses * detail.sum() / max(float(masses.sum()), 1e-300)
+    radius = np.linalg.norm(means[:, :2], axis=1)
+    x, y = (detail / np.maximum(radius, 1e-12)) @ means[:, :2]
+    length = float(np.hypot(x, y))
+    return np.array([x / length, y / length, 0.0]) if length > 0.0 else np.array([1.0, 0.0, 0.0])

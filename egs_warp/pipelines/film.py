@@ -20,7 +20,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.video import VideoWriter, contact_sheet, write_png
 from egs_warp.locomotion.rollout import Simulation
 from egs_warp.motions.stance import Ground
-from egs_warp.pipelines.creature import Creature
+from egs_warp.pipelines.creature import FILMED_FROM, Creature
 from egs_warp.render.backdrop import Behind, CapturedScene, Floor
 from egs_warp.render.rasteriser import render
 
@@ -115,7 +115,7 @@ def view_of(simulation: Simulation, ground: Ground, size: int, view_from: np.nda
     low[2] = min(low[2], 0.0)
     middle = 0.5 * (low + high)
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-    direction = np.array([0.35, -1.0, 0.22]) if view_from is None else ground.axes @ np.asarray(view_from, float)
+    direction = np.array(FILMED_FROM) if view_from is None else ground.axes @ np.asarray(view_from, float)
     direction /= np.linalg.norm(direction)
     distance = float(np.linalg.norm(high - low))
     for _ in range(60):

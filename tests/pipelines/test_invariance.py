@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egs_warp.assets import pawn
+from egs_warp.assets import figurine, pawn
 from egs_warp.deformation.deformer import deform
 from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.geometry.body_frame import GROUND
@@ -16,10 +16,10 @@ from egs_warp.locomotion.trajectory import measure
 from egs_warp.motions.repertoire import longest, parts_of
 from egs_warp.motions.script import parse_script
 from egs_warp.motions.sequence import MotionSequence
-from egs_warp.pipelines.creature import Creature, first_place, make_creature
+from egs_warp.pipelines.creature import FILMED_FROM, Creature, first_place, make_creature
 from egs_warp.render.rasteriser import render
 from egs_warp.segmentation.base_plane import find_base_plane
-from tests.support.frames import Lying
+from tests.support.frames import TURN, Lying
 
 
 def jump(lying: Lying, *, frames: int | None = None, by_up: bool = False) -> tuple[Creature, Simulation]:
@@ -131,3 +131,14 @@ def test_jump_of_real_captures_goes_as_far(data_dir, name: str, up: tuple[int, i
     reached, again = (measure(jump(one, by_up=True)[1].trajectory) for one in (lying, lying.turned().scaled(0.37)))
     assert again.distance == pytest.approx(reached.distance, rel=0.01)
     assert again.height == pytest.approx(reached.height, rel=0.01)
+
+
+def test_front_is_where_the_face_is() -> None:
+    """The figurine looks along -y of its file; its camera stands before it, however the file lies."""
+    made = figurine(gaussian_count=6000)
+    turned = Lying(made.cloud, made.plane).turned()
+    creature = make_creature(turned.cloud, plane=turned.plane)
+    face = creature.frame.axes @ TURN @ [0.0, -1.0, 0.0]
+    assert creature.front @ face > 0.8
+    ground = first_place(creature).ground
+    assert (FILMED_FROM @ ground.axes) @ face > 0.3
