@@ -21,7 +21,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.atomic import writable_folder
 from egs_warp.io.video import contact_sheet, write_png
-from egs_warp.render import render
+from egs_warp.render import render_gaussians
 from egs_warp.render.autograd import render_torch
 from egs_warp.training.finetune import FinetuneOptions, Rates, finetune, psnr, views_of_capture
 
@@ -83,10 +83,12 @@ def main() -> None:
         "colours lost": grey,
         f"after {arguments.steps} steps": result.cloud,
     }
-    frames = [render(cloud, cameras[0]).colour_srgb8() for cloud in pictures.values()]
+    frames = [render_gaussians(cloud, cameras[0]).colour_srgb8() for cloud in pictures.values()]
     write_png(arguments.out / "finetune.png", contact_sheet(frames, 3, list(pictures)))
     for label, cloud in pictures.items():
-        quality = np.mean([psnr(np.clip(render(cloud, v.camera).colour.numpy(), 0, 1), v.image) for v in views])
+        quality = np.mean(
+            [psnr(np.clip(render_gaussians(cloud, v.camera).colour.numpy(), 0, 1), v.image) for v in views]
+        )
         print(f"{label:>18}: {quality:6.2f} dB")
     print(f"wrote finetune.png into {arguments.out}")
 

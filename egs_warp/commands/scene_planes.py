@@ -20,7 +20,7 @@ from egs_warp.io.cameras import write_cameras
 from egs_warp.io.planes import write_planes
 from egs_warp.io.video import write_png
 from egs_warp.pipelines.locate_plane import locate_plane
-from egs_warp.render.rasteriser import render
+from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.plane_fit import PlaneView, fit_plane
 from egs_warp.segmentation.plane_search import further_planes
 
@@ -59,7 +59,7 @@ def planes_of_scene(given: SceneInput, *, plane_mask: str | None, view: str | No
         views = [
             PlaneView(mask.camera, np.where(image.alpha.numpy() > 0.5, image.depth.numpy(), 0.0), mask.mask)
             for mask in masks
-            for image in [render(given.cloud, mask.camera)]
+            for image in [render_gaussians(given.cloud, mask.camera)]
         ]
         fit = fit_plane(views)
         points = np.concatenate(
@@ -86,5 +86,5 @@ def write_ring(folder: Path, cloud: GaussianCloud, plane: Plane, centre: np.ndar
     names = [f"ring{number:02d}.png" for number in range(len(cameras))]
     images = writable_folder(folder / "images")
     for name, camera in zip(names, cameras, strict=True):
-        write_png(images / name, render(cloud, camera).colour_srgb8())
+        write_png(images / name, render_gaussians(cloud, camera).colour_srgb8())
     write_cameras(folder / "cameras.json", cameras, names)

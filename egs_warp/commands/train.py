@@ -188,7 +188,7 @@ def _report(chosen: argparse.Namespace, result: TrainResult, progress: _Progress
 def _write_sheet(path: Path, result: TrainResult) -> None:
     """Photo beside render, of photos held out where there are any."""
     from egs_warp.io.video import contact_sheet, write_png
-    from egs_warp.render import render
+    from egs_warp.render import render_gaussians
 
     pairs = list(zip(result.views, result.scores, strict=True))
     judged = [pair for pair in pairs if pair[1].held_out] or pairs
@@ -200,7 +200,7 @@ def _write_sheet(path: Path, result: TrainResult) -> None:
             (f"photo {score.name}", np.rint(view.image * 255).astype(np.uint8)),
             (
                 f"{score.psnr:.1f} dB, SSIM {score.ssim:.3f}",
-                render(result.cloud, view.camera, background=result.background).colour_srgb8(),
+                render_gaussians(result.cloud, view.camera, background=result.background).colour_srgb8(),
             ),
         ):
             frame = np.full((*size, 3), 255, dtype=np.uint8)

@@ -20,7 +20,7 @@ from egs_warp.locomotion.rollout import Simulation
 from egs_warp.motions.stance import Ground
 from egs_warp.pipelines.creature import Creature
 from egs_warp.render.backdrop import Behind, CapturedScene, Floor
-from egs_warp.render.rasteriser import render
+from egs_warp.render.rasteriser import render_gaussians
 
 SHEET_FRAMES = 12
 SPLIT_KEY_FRAMES = 24
@@ -75,7 +75,7 @@ def draw_film(
             deformed = deformer.deform(trajectory.positions[step])
             marks.append(time.perf_counter())
             backdrop = behind.background(deformed.cloud, height=creature.body.height)
-            image = render(deformed.cloud, camera, background=backdrop).colour_srgb8()
+            image = render_gaussians(deformed.cloud, camera, background=backdrop).colour_srgb8()
             wp.synchronize_device(creature.cloud.device)
             marks.append(time.perf_counter())
             video.write(image)

@@ -286,10 +286,8 @@ def _voted(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> tuple[np.ndarra
 
 
 def masks_from_selection(cloud: GaussianCloud, selection: np.ndarray, cameras: Sequence[Camera]) -> list[MaskedView]:
-    """Masks of where the Gaussians ``selection`` (n,) bool make up more than half of what shows,
-    through ``cameras``.
-    """
-    from egs_warp.render.rasteriser import render
+    """Masks of where the Gaussians ``selection`` (n,) bool make up more than half of what shows, through ``cameras``."""
+    from egs_warp.render.rasteriser import render_gaussians
 
     sh = np.zeros((cloud.count, 1, 3), np.float32)
     sh[:, 0, :] = np.where(selection, 0.5, -0.5)[:, None] / 0.28209479177387814
@@ -303,7 +301,9 @@ def masks_from_selection(cloud: GaussianCloud, selection: np.ndarray, cameras: S
     )
     return [
         MaskedView(
-            camera, render(painted, camera, background=(0.0, 0.0, 0.0)).colour.numpy()[..., 0] > 0.5, f"view {k}"
+            camera,
+            render_gaussians(painted, camera, background=(0.0, 0.0, 0.0)).colour.numpy()[..., 0] > 0.5,
+            f"view {k}",
         )
         for k, camera in enumerate(cameras)
     ]

@@ -25,7 +25,7 @@ from egs_warp.io.cameras import write_cameras
 from egs_warp.io.planes import read_planes, read_planes_and_facts, write_planes
 from egs_warp.pipelines.pictures import picture_cameras, plane_picture
 from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene, viewing_direction
-from egs_warp.render import render
+from egs_warp.render import render_gaussians
 from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane, reach_across
 from egs_warp.segmentation.object_mask import ObjectSpec, masks_from_selection
 from tests.segmentation.test_object_mask import FLOOR, ball_on_floor
@@ -139,13 +139,13 @@ def test_photographs_beside_the_cameras_clear_the_plane(folder: Path) -> None:
     images = folder / "images"
     images.mkdir(exist_ok=True)
     for one in posed[:5]:
-        picture = render(cloud, one.camera, background=(0.0, 0.0, 0.0)).colour_srgb8()
+        picture = render_gaussians(cloud, one.camera, background=(0.0, 0.0, 0.0)).colour_srgb8()
         Image.fromarray(picture[:50] if one is posed[4] else picture).save(images / one.name)
     given = SceneInput(cloud, read_cameras(folder / "cameras.json"), None, None, None, ())
     photographs = photographs_in_colours_of(given.cloud, given.posed)
     assert len(photographs) == 4
     assert photographs[0].image.shape == (96, 96, 3)
-    expected = render(cloud, posed[0].camera, background=(0.0, 0.0, 0.0)).colour.numpy()
+    expected = render_gaussians(cloud, posed[0].camera, background=(0.0, 0.0, 0.0)).colour.numpy()
     np.testing.assert_allclose(photographs[0].image, np.clip(expected, 0.0, 1.0), atol=1.0 / 255)
     # Taken at a third of the exposure, in a warmer light, and with a stranger in front.
     expected = np.clip(expected, 0.0, 1.0)
