@@ -11,10 +11,10 @@ from egs_warp.assets import pawn
 from egs_warp.commands.flags import check_device
 from egs_warp.errors import one_line_errors
 from egs_warp.pipelines.animate import AnimateOptions, animate
-from egs_warp.pipelines.report import summary
+from egs_warp.pipelines.report import Report
 
 
-def main(arguments: list[str] | None = None) -> dict:
+def main(arguments: list[str] | None = None) -> Report:
     """Run the example; returns the report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/jump"))
@@ -27,7 +27,7 @@ def main(arguments: list[str] | None = None) -> dict:
     thing = pawn(device=chosen.device)
     options = AnimateOptions(distance=0.5, height=0.2, frames=chosen.frames, size=chosen.size)
     report = animate(thing.cloud, chosen.out, plane=thing.plane, options=options, source="pawn")
-    print(summary(report))
+    print(report.summary())
     print(f"wrote the video, sheet.png, report.json, trajectory.npz into {chosen.out}")
     return report
 

@@ -13,6 +13,7 @@ from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
     from egs_warp.pipelines.prepare_scene import PreparedScene
+    from egs_warp.pipelines.report import Report
 
 
 def add_parser(commands: Commands) -> None:
@@ -68,15 +69,13 @@ def _animate(chosen: argparse.Namespace) -> int:
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING
-    from egs_warp.pipelines.report import summary
-
     report, more = _animate_scene(chosen) if chosen.object is not None else _animate_capture(chosen)
-    print(summary(report))
+    print(report.summary())
     print(f"wrote the video, sheet.png, report.json, trajectory.npz{more} into {chosen.out}")
     return 0
 
 
-def _animate_capture(chosen: argparse.Namespace) -> tuple[dict, str]:
+def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
     """A capture that is the object alone; returns the report, and what was written besides."""
     from egs_warp.io import read_capture
     from egs_warp.pipelines.animate import animate
@@ -111,7 +110,7 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[dict, str]:
     return report, ""
 
 
-def _animate_scene(chosen: argparse.Namespace) -> tuple[dict, str]:
+def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
     """The object of a scene, cut out of it, over the rest of the scene."""
     from egs_warp.inpainting.inpainters import inpainter_by_name
     from egs_warp.io.atomic import writable_folder
@@ -181,15 +180,14 @@ def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
     """
     from egs_warp.contact.terrain import read_terrain
     from egs_warp.io.text import parse_json, read_text
-    from egs_warp.motions.repertoire import longest
-    from egs_warp.motions.script import parse_script
+    from egs_warp.motions.script import motion
     from egs_warp.pipelines.animate import AnimateOptions
 
     numbers = ("distance", "height", "heading_degrees", "frames", "size", "seed", "metres_per_unit", "friction")
     given = {name: getattr(chosen, name) for name in numbers if getattr(chosen, name) is not None}
     options = AnimateOptions(**given, shadow=not chosen.no_shadow)
     # The files of key frames are read, too.
-    longest(parse_script(chosen.motion, defaults=options.targets()))
+    motion(chosen.motion, **options.targets()).frames()
     if chosen.muscles is not None:
         parse_json(read_text(chosen.muscles), chosen.muscles)
     return {

@@ -17,7 +17,7 @@ from egs_warp.locomotion.rollout import FRAME_RATE, settle, steps_per_frame
 from egs_warp.locomotion.stepper import LocomotionSettings, LocomotionStepper
 from egs_warp.meshing.cage import Cage, build_cage
 from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import Ground
+from egs_warp.motions.stance import SOLE, Ground
 from egs_warp.muscles.files import read_muscles
 from egs_warp.muscles.muscle_set import MuscleSet, automatic_muscles
 from egs_warp.segmentation.base_plane import find_base_plane
@@ -164,7 +164,7 @@ def first_place(creature: Creature, forward: np.ndarray | None = None, *, step: 
 def _forward(creature: Creature) -> np.ndarray:
     """(3,) the long axis of the footprint: the direction in which the body is least likely to tip."""
     local = creature.cage.mesh.nodes
-    sole = local[creature.plane.heights(local) < 0.06 * creature.body.height]
+    sole = local[creature.plane.heights(local) < SOLE * creature.body.height]
     first, second = creature.plane.tangents()
     flat = np.stack([(sole - sole.mean(axis=0)) @ first, (sole - sole.mean(axis=0)) @ second], axis=1)
     values, vectors = np.linalg.eigh(flat.T @ flat)

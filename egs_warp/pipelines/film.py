@@ -19,6 +19,7 @@ from egs_warp.io.video import VideoWriter, contact_sheet, write_png
 from egs_warp.locomotion.rollout import Simulation
 from egs_warp.motions.stance import Ground
 from egs_warp.pipelines.creature import Creature
+from egs_warp.pipelines.performance import Performance
 from egs_warp.render.backdrop import Behind, CapturedScene, Floor
 from egs_warp.render.rasteriser import render_gaussians
 
@@ -37,9 +38,7 @@ class Film:
 
 
 def draw_film(
-    creature: Creature,
-    simulation: Simulation,
-    ground: Ground,
+    performance: Performance,
     folder: Path,
     *,
     name: str,
@@ -53,6 +52,7 @@ def draw_film(
 
     ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from``: see ``view_of``.
     """
+    creature, simulation, ground = performance.creature, performance.simulation, performance.place.ground
     trajectory, frames = simulation.trajectory, simulation.frames
     camera = view_of(simulation, ground, size, view_from)
     behind = _behind(creature, simulation, camera, background, shadow=shadow)
