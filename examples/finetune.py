@@ -15,12 +15,13 @@ import torch
 import warp as wp
 
 from egs_warp.assets import pawn
-from egs_warp.commands.flags import check_device
-from egs_warp.errors import UserError, one_line_errors
+from egs_warp.commands.flags import one_line_errors
+from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.atomic import writable_folder
 from egs_warp.io.video import contact_sheet, write_png
+from egs_warp.launching import use_device
 from egs_warp.render import render_gaussians
 from egs_warp.render.autograd import render_torch
 from egs_warp.training.finetune import FinetuneOptions, Rates, finetune, psnr, views_of_capture
@@ -66,7 +67,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
     wp.config.log_level = wp.LOG_WARNING
-    check_device(arguments.device)
+    use_device(arguments.device)
     if arguments.steps < 1 or not 16 <= arguments.size <= 4096:
         raise UserError("give --steps of at least 1 and a --size from 16 to 4096 pixels")
     writable_folder(arguments.out)

@@ -12,8 +12,8 @@ import warp as wp
 
 from egs_warp.assets import scene
 from egs_warp.assets.rooms import SQUARE
-from egs_warp.commands.flags import check_device
-from egs_warp.errors import one_line_errors
+from egs_warp.commands.flags import one_line_errors
+from egs_warp.launching import use_device
 from egs_warp.pipelines.animate import AnimateOptions, animate
 from egs_warp.pipelines.report import Report
 
@@ -28,7 +28,7 @@ def main(arguments: list[str] | None = None) -> Report:
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
-    check_device(chosen.device)
+    use_device(chosen.device)
     chess = scene("pawn", device=chosen.device)
     report = animate(
         chess.object,

@@ -8,8 +8,8 @@ from pathlib import Path
 import warp as wp
 
 from egs_warp.assets import pawn
-from egs_warp.commands.flags import check_device
-from egs_warp.errors import one_line_errors
+from egs_warp.commands.flags import one_line_errors
+from egs_warp.launching import use_device
 from egs_warp.pipelines.animate import AnimateOptions, animate
 from egs_warp.pipelines.report import Report
 
@@ -23,7 +23,7 @@ def main(arguments: list[str] | None = None) -> Report:
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)
     wp.config.log_level = wp.LOG_WARNING
-    check_device(chosen.device)
+    use_device(chosen.device)
     thing = pawn(device=chosen.device)
     options = AnimateOptions(distance=0.5, height=0.2, frames=chosen.frames, size=chosen.size)
     report = animate(thing.cloud, chosen.out, plane=thing.plane, options=options, source="pawn")

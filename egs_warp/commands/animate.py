@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from egs_warp.commands.flags import Commands, check_device, guessed_up, parse_direction, parse_up
+from egs_warp.commands.flags import guessed_up, parse_direction, parse_up
 from egs_warp.commands.scene_flags import SceneInput, add_object_flags, plane_of, read_scene, say
 from egs_warp.commands.segment import add_straddling_flag, clearing_of
 from egs_warp.errors import UserError
@@ -66,9 +66,6 @@ def add_parser(commands: Commands) -> None:
 
 
 def _animate(chosen: argparse.Namespace) -> int:
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_WARNING
     report, more = _animate_scene(chosen) if chosen.object is not None else _animate_capture(chosen)
     print(report.summary())
     print(f"wrote the video, sheet.png, report.json, trajectory.npz{more} into {chosen.out}")
@@ -78,13 +75,14 @@ def _animate(chosen: argparse.Namespace) -> int:
 def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
     """A capture that is the object alone; returns the report, and what was written besides."""
     from egs_warp.io import read_capture
+    from egs_warp.launching import use_device
     from egs_warp.pipelines.animate import animate
 
     for name in ("cameras", "view", "straddling", "inpainter", "no_inpaint"):
         if getattr(chosen, name) not in (None, False):
             raise UserError(f"--{name.replace('_', '-')}: needs --object, which says what to take out of a scene")
     asked = _asked(chosen)
-    check_device(chosen.device)
+    use_device(chosen.device)
     up = parse_up(chosen.up) if chosen.up is not None else None
     plane = plane_of(chosen.plane) if chosen.plane is not None else None
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
@@ -114,6 +112,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
     """The object of a scene, cut out of it, over the rest of the scene."""
     from egs_warp.inpainting.inpainters import inpainter_by_name
     from egs_warp.io.atomic import writable_folder
+    from egs_warp.launching import use_device
     from egs_warp.pipelines.animate import animate
     from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene, viewing_direction
     from egs_warp.training.photo_colours import photographs_in_colours_of
@@ -123,7 +122,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
     if chosen.inpainter is not None and chosen.no_inpaint:
         raise UserError("--inpainter: --no-inpaint leaves the floor as captured; leave one of them out")
     asked = _asked(chosen)
-    check_device(chosen.device)
+    use_device(chosen.device)
     inpainter = inpainter_by_name(chosen.inpainter or "patch", device=chosen.device)
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
     given = read_scene(chosen)

@@ -40,9 +40,6 @@ def clearing_of(chosen: argparse.Namespace) -> Clearing | None:
 
 
 def _segment(chosen: argparse.Namespace) -> int:
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_WARNING
     from egs_warp.errors import UserError
     from egs_warp.io.atomic import writable_folder
     from egs_warp.io.planes import read_planes_and_facts

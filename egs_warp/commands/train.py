@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from egs_warp.commands.flags import Commands, check_device
 from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
@@ -55,8 +54,10 @@ def _train(chosen: argparse.Namespace) -> int:
     write = _writer(chosen.out)
     import warp as wp
 
+    from egs_warp.launching import use_device
+
+    use_device(chosen.device)
     wp.config.log_level = wp.LOG_ERROR
-    check_device(chosen.device)
     try:
         from egs_warp.pipelines.train_capture import train
     except ImportError as error:

@@ -129,7 +129,8 @@ def _one_look(
     if not occupied.any():
         raise UserError(
             f"object: nothing opaque stands on the plane (of {cloud.count} Gaussians, {int(np.sum(means[:, 2] > 0))} "
-            f"are above it, most opaque {opacities.max():.2g}); check --plane and --up"
+            f"are above it, most opaque {opacities.max():.2g})",
+            check=("plane", "up"),
         )
     position = (means - low) / spacing
     node = np.rint(position).astype(int)

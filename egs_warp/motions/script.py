@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from egs_warp.errors import UserError
+from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.text import parse_json, read_text, whole_number
 from egs_warp.motions.repertoire import REPERTOIRE, MotionKind
 from egs_warp.motions.request import MotionRequest
@@ -66,10 +66,10 @@ def motion(text: str, **values: float | None) -> Script:
         requests = [_from_words(piece, given, f"motion {number}") for number, piece in enumerate(pieces, start=1)]
     count = sum(request.repeat for request in requests)
     if count > MOST_MOTIONS:
-        raise UserError(f"motion: {count} motions are asked for; at most {MOST_MOTIONS} are done in a row")
+        raise ArgumentError("motion", f"{count} motions are asked for; at most {MOST_MOTIONS} are done in a row")
     for name in given:
         if not any(name in request.asked for request in requests):
-            raise UserError(f"{name}: no motion of {text.strip()!r} takes it")
+            raise ArgumentError(name, f"no motion of {text.strip()!r} takes it")
     return Script(tuple(requests))
 
 

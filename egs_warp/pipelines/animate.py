@@ -9,7 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from egs_warp.contact.terrain import Solid
-from egs_warp.errors import UserError
+from egs_warp.errors import ArgumentError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import writable_folder
@@ -57,23 +57,24 @@ class AnimateOptions:
     def __post_init__(self) -> None:
         for name, value in (("distance", self.distance), ("height", self.height)):
             if value is not None and not (0.0 <= value <= LARGEST_TARGET):
-                raise UserError(f"--{name} {value}: give a number of body heights from 0 to {LARGEST_TARGET:g}")
+                raise ArgumentError(name, f"give a number of body heights from 0 to {LARGEST_TARGET:g}", value=value)
         if self.height == 0.0:
-            raise UserError("--height 0: a jump needs a height above 0 body heights")
+            raise ArgumentError("height", "a jump needs a height above 0 body heights", value=0)
         turn = self.heading_degrees
         if turn is not None and not abs(turn) <= LARGEST_TURN:
-            raise UserError(
-                f"--heading-degrees {turn}: give a number of degrees from -{LARGEST_TURN:g} to {LARGEST_TURN:g}"
-            )
+            span = f"from -{LARGEST_TURN:g} to {LARGEST_TURN:g}"
+            raise ArgumentError("heading_degrees", f"give a number of degrees {span}", value=turn)
         if self.frames is not None and self.frames < 1:
-            raise UserError(f"--frames {self.frames}: give a whole number of at least 1")
+            raise ArgumentError("frames", "give a whole number of at least 1", value=self.frames)
         if not 16 <= self.size <= LARGEST_SIZE:
-            raise UserError(f"--size {self.size}: give a number of pixels from 16 to {LARGEST_SIZE}")
+            raise ArgumentError("size", f"give a number of pixels from 16 to {LARGEST_SIZE}", value=self.size)
         if not 0.0 <= self.friction <= LARGEST_FRICTION:
-            raise UserError(f"--friction {self.friction}: give a Coulomb coefficient from 0 to {LARGEST_FRICTION:g}")
+            advice = f"give a Coulomb coefficient from 0 to {LARGEST_FRICTION:g}"
+            raise ArgumentError("friction", advice, value=self.friction)
         if self.metres_per_unit is not None and not 1e-9 <= self.metres_per_unit <= 1e9:
             # Single precision holds no lengths far beyond; ``make_body`` says which of these fit the body.
-            raise UserError(f"--metres-per-unit {self.metres_per_unit}: give a positive number, from 1e-9 to 1e9")
+            advice = "give a positive number, from 1e-9 to 1e9"
+            raise ArgumentError("metres_per_unit", advice, value=self.metres_per_unit)
 
     def targets(self) -> dict[str, float | None]:
         """By the names that a script gives them."""

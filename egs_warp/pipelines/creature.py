@@ -9,7 +9,7 @@ import numpy as np
 
 from egs_warp.contact.detection import ContactGeometry, contact_geometry
 from egs_warp.contact.terrain import Solid
-from egs_warp.errors import UserError
+from egs_warp.errors import ArgumentError
 from egs_warp.fem.body import DEFAULT_SAG, BodyState, SoftBody, make_body
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
@@ -81,7 +81,9 @@ def make_creature(
     """
     if plane is None:
         if up is None:
-            raise UserError("animate: neither up nor a plane is known; give --up or --plane")
+            raise ArgumentError(
+                "plane", "neither the ground nor which way is up is known; give one of them", check=("plane", "up")
+            )
         plane = find_base_plane(cloud, up)
     if gravity_up is not None:
         _check_slope(plane, gravity_up)
@@ -104,10 +106,11 @@ def make_creature(
 def _check_slope(plane: Plane, up: np.ndarray) -> None:
     slope = float(np.degrees(np.arccos(np.clip(plane.normal @ up / np.linalg.norm(up), -1.0, 1.0))))
     if slope > STEEPEST_SLOPE:
-        raise UserError(
-            f"--gravity-up {','.join(f'{x:g}' for x in up)}: that makes the ground a slope of {slope:.0f} degrees;"
-            f" give a direction at most {STEEPEST_SLOPE:g} degrees from the ground's normal"
-            f" {','.join(f'{x:.3g}' for x in plane.normal)}"
+        raise ArgumentError(
+            "gravity_up",
+            f"that makes the ground a slope of {slope:.0f} degrees; give a direction at most {STEEPEST_SLOPE:g} degrees"
+            f" from the ground's normal {','.join(f'{x:.3g}' for x in plane.normal)}",
+            value=",".join(f"{x:g}" for x in up),
         )
 
 
@@ -147,9 +150,8 @@ def first_place(creature: Creature, forward: np.ndarray | None = None, *, step: 
     if forward is None:
         forward = _forward(creature)
     if np.linalg.norm(np.cross(forward, up)) < 1e-3 * np.linalg.norm(forward):
-        raise UserError(
-            f"--forward {','.join(f'{x:g}' for x in forward)}: points up or down; give a way along the ground"
-        )
+        given = ",".join(f"{x:g}" for x in forward)
+        raise ArgumentError("forward", "points up or down; give a way along the ground", value=given)
     return Place(
         body,
         Ground.on(creature.plane, forward, body.centre_of_mass(start.positions), up=up),

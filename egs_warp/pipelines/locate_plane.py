@@ -68,7 +68,7 @@ def locate_plane(
         return LocatedPlane(plane, None, _middle(cloud, found), found.size, found, ())
     if up is None:
         up, reason = _up_of(cloud, cameras)
-        notes.append(f"up is taken to be {','.join(f'{x:.2f}' for x in up)} ({reason}); if not, give --up")
+        notes.append(f"up is taken to be {','.join(f'{x:.2f}' for x in up)} ({reason}); if not, say which way is up")
     coarse = _coarse_plane(cloud, spec, up)
     found = segment(cloud, coarse, spec)
     centre = _middle(cloud, found)
@@ -128,12 +128,13 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> Pla
     plane = plane_under(planes, lowest, tolerance=0.0, least_share=least_share)
     if plane is None and spec.masks and planes:
         raise UserError(
-            "object: most of the mask lies on the floor, not on an object that stands on it; mark the object, or check "
-            "--view and --up"
+            "object: most of the mask lies on the floor, not on an object that stands on it; mark the object",
+            check=("view", "up"),
         )
     if plane is None:
         raise UserError(
-            "plane: none in sight under the object: nothing flat and level lies below it; check --up, or give --plane"
+            "plane: none in sight under the object: nothing flat and level lies below it; give the plane",
+            check=("plane", "up"),
         )
     return plane
 

@@ -122,7 +122,7 @@ def take_apart(
     untouched = cloud.subset(found.object_mask)
     heights, reach = reach_across(untouched, located.plane, options.clearing_options.reach)
     if not found.background_mask.any():
-        raise UserError("object: it is the whole capture, so there is no background; leave --object out")
+        raise UserError("object: it is the whole capture, so there is no background; animate the capture itself")
     thing = clear_plane(
         untouched,
         located.plane,

@@ -228,9 +228,9 @@ def test_holes_that_cannot_be_filled(place: tuple[float, float], radius: float, 
 
 
 def test_bad_options_and_objects() -> None:
-    with pytest.raises(UserError, match=r"--steps -1: give a whole number of at least 0"):
+    with pytest.raises(UserError, match=r"steps -1: give a whole number of at least 0"):
         InpaintOptions(steps=-1)
-    with pytest.raises(UserError, match=r"--margin 2: give a number from 0 to 1"):
+    with pytest.raises(UserError, match=r"margin 2: give a number from 0 to 1"):
         InpaintOptions(margin=2)
     window = disc(PLANE, on_plane(0, 0), 0.1).window
     with pytest.raises(UserError, match="the hole is empty; give the object, a mask, or a place on the plane"):
