@@ -77,10 +77,10 @@ def _plane(text: str) -> tuple[Any, Any]:
     if not text.lower().endswith(".json"):
         return parse_plane(text), None
     from egs_warp.inpainting.holes import Hole
-    from egs_warp.io.planes import read_planes_and_facts
+    from egs_warp.io.planes import read_planes
 
-    plane, facts = read_planes_and_facts(text)[0]
-    return plane, Hole.from_facts(plane, facts["hole"]) if "hole" in facts else None
+    known = read_planes(text)[0]
+    return known.plane, Hole.of_outline(known.plane, known.hole) if known.hole is not None else None
 
 
 def _hole(chosen: argparse.Namespace, plane: Any, recorded: Any, background: Any) -> Any:

@@ -74,7 +74,7 @@ def add_scene_flags(parser: argparse.ArgumentParser) -> None:
 def plane_of(text: str) -> Plane:
     """The first plane of a file, or one of four numbers. Raises ``UserError`` otherwise."""
     if text.endswith(".json") or Path(text).is_file():
-        return read_planes(text)[0]
+        return read_planes(text)[0].plane
     return parse_plane(text)
 
 

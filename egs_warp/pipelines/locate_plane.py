@@ -12,6 +12,7 @@ from egs_warp.geometry.camera import Camera, shrunk
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
+from egs_warp.io.planes import KnownPlane
 from egs_warp.segmentation.base_plane import guess_up
 from egs_warp.segmentation.object_mask import ObjectSpec, Segmentation, segment, votes_of_masks
 from egs_warp.segmentation.plane_fit import PlaneFit
@@ -40,12 +41,15 @@ class LocatedPlane:
     segmentation: Segmentation
     notes: tuple[str, ...]
 
-    def facts(self) -> dict[str, object]:
-        """What ``plane.json`` says beside the plane itself."""
-        fit = self.fit
-        return {"centre": self.centre.tolist(), "size": self.size} | (
-            {} if fit is None else {"noise": fit.noise, "inlier_share": fit.inlier_share, "pixels": fit.pixel_count}
-        )
+    def known(self) -> KnownPlane:
+        """What ``plane.json`` says of it."""
+        found = KnownPlane(self.plane, centre=self.centre, size=self.size)
+        return found if self.fit is None else found.over(known_of_fit(self.fit))
+
+
+def known_of_fit(fit: PlaneFit) -> KnownPlane:
+    """What ``plane.json`` says of a fitted plane."""
+    return KnownPlane(fit.plane, noise=fit.noise, inlier_share=fit.inlier_share, pixels=fit.pixel_count)
 
 
 def locate_plane(

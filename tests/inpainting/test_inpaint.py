@@ -21,7 +21,7 @@ from egs_warp.inpainting.new_floor import rim_heights, with_gloss
 from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, mean_colours, rectify
 from egs_warp.inpainting.soap_film import soap_film
 from egs_warp.io import read_capture, write_ply
-from egs_warp.io.planes import write_planes
+from egs_warp.io.planes import KnownPlane, write_planes
 from egs_warp.render import render_gaussians
 from egs_warp.segmentation.plane_fit import plane_depth
 from egs_warp.segmentation.votes import MaskedView
@@ -245,7 +245,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """From files to a filled capture and a picture; the gap is closed."""
     truth, hole = floor(spacing=0.04), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
     write_ply(tmp_path / "background.ply", holed(truth, hole))
-    write_planes(tmp_path / "plane.json", [PLANE])
+    write_planes(tmp_path / "plane.json", [KnownPlane(PLANE)])
     x, y, z = on_plane(0.1, 0.05)
     files = [str(tmp_path / "background.ply"), "--plane", str(tmp_path / "plane.json"), "--out"]
     where = [f"--hole={x},{y},{z},{RADIUS}"]
