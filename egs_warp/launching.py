@@ -36,7 +36,8 @@ def available_threads() -> int:
 
 
 def use_device(device: str) -> None:
-    """Called first by programs: raises ``UserError`` where Warp sees no such device, and leaves Warp only its warnings."""
+    """Called first by programs: raises ``UserError`` where Warp sees no such device, and leaves Warp only its
+    warnings."""
     wp.config.log_level = wp.LOG_WARNING
     if device not in (devices := [str(known) for known in wp.get_devices()]):
         raise ArgumentError("device", f"this machine has {', '.join(devices)}", value=device)
@@ -134,9 +135,8 @@ def launch_again(kernel: Any, dim: int, *, inputs: Sequence[Any], outputs: Seque
 
 
 def _chunk_edges(row_count: int, threads: int, work: np.ndarray | None) -> list[int]:
-    """Where chunks begin and end, whose effort shrinks towards the last:
-    all threads then finish at about the same time.
-    """
+    """Where chunks begin and end, whose effort shrinks towards the last: all threads then finish at about the same
+    time."""
     least = 0.0 if work is not None else _MIN_ROWS_PER_CHUNK / max(row_count, 1)
     least = max(least, 1.0 / (_LAST_CHUNKS_PER_THREAD * threads))
     shares, taken = [], 0.0

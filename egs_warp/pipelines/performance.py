@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from egs_warp.geometry.camera import Camera
 from egs_warp.locomotion import rollout
 from egs_warp.locomotion.rollout import FRAME_RATE, Simulation
 from egs_warp.locomotion.trajectory import Trajectory
@@ -35,6 +36,35 @@ class Performance:
     def frames(self) -> np.ndarray:
         """(n, N, 3) metres: the nodes of the cage in each frame of a video at 60 Hz."""
         return self.trajectory.positions[self.simulation.frames]
+
+    def camera(self, size: int, view_from: np.ndarray | None = None) -> Camera:
+        """A fixed camera of ``size`` pixels both ways that holds the whole motion: in front of the motion's side, or in
+        the direction ``view_from`` (3,)."""
+        ground = self.place.ground
+        local = ground.local(self.trajectory.positions).reshape(-1, 3)
+        low, high = local.min(axis=0), local.max(axis=0)
+        low[2] = min(low[2], 0.0)
+        middle = 0.5 * (low + high)
+        corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+        direction = np.array([0.35, -1.0, 0.22]) if view_from is None else ground.axes @ np.asarray(view_from, float)
+        direction /= np.linalg.norm(direction)
+        distance = float(np.linalg.norm(high - low))
+        for _ in range(60):
+            camera = Camera.look_at(
+                ground.world(middle + distance * direction),
+                ground.world(middle),
+                ground.axes[2],
+                width=size,
+                height=size,
+                vertical_fov_degrees=30.0,
+                near=0.01 * distance,
+            )
+            seen = ground.world(corners) @ camera.rotation.T + camera.translation
+            reach = np.abs(seen[:, :2] / seen[:, 2:]).max() * camera.fx / (0.5 * size)
+            if seen[:, 2].min() > 0 and reach < 0.86:
+                break
+            distance *= 1.05
+        return camera
 
 
 def simulate(

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import egs_warp
 from egs_warp.io.atomic import atomic_write
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Audit, Reached
+from egs_warp.version import __version__
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -28,7 +28,7 @@ MECHANICS = ("warp-lang", "numpy", "scipy", "osqp", "qdldl", "pytetwild")
 def versions(names: Sequence[str] = MECHANICS) -> dict[str, str]:
     """Of the package, Python and the packages ``names``, which the numbers depend on."""
     return {
-        "egs-warp": egs_warp.__version__,
+        "egs-warp": __version__,
         "python": platform.python_version(),
         **{name: version(name) for name in names},
     }
