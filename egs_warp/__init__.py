@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from egs_warp.version import __version__
 
 if TYPE_CHECKING:
-    from egs_warp.assets.scene import Scene, scene
+    from egs_warp.assets.scene import BUILT_IN_SCENES, Scene, scene
     from egs_warp.commands.flags import one_line_errors
     from egs_warp.deformation.deformer import Deformer
     from egs_warp.deformation.embedding import embed_gaussians
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from egs_warp.training.finetune import FinetuneOptions, Rates, finetune, psnr, views_of_capture
 
 _HOMES: dict[str, tuple[str, ...]] = {
-    "assets.scene": ("Scene", "scene"),
+    "assets.scene": ("BUILT_IN_SCENES", "Scene", "scene"),
     "commands.flags": ("one_line_errors",),
     "deformation.deformer": ("Deformer",),
     "deformation.embedding": ("embed_gaussians",),
@@ -80,6 +80,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
 _MODULE_OF = {name: f"egs_warp.{module}" for module, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "BUILT_IN_SCENES",
     "AnimateOptions",
     "ArgumentError",
     "Box",
