@@ -31,8 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows = []
     for name in EXAMPLES:
         with tempfile.TemporaryDirectory() as folder:
-            flags = ["--out", folder, "--device", arguments.device, *(["--frames", "6"] if arguments.quick else [])]
-            report = example(name).main(flags).to_json()
+            asked = ["--out", folder, "--device", options.device, *(["--frames", "6"] if options.quick else [])]
+            told = example(name).main(asked).to_json()
             with np.load(Path(folder) / "trajectory.npz") as trajectory:
                 steps = len(trajectory["time"]) - 1
                 contacts = np.bincount(trajectory["contact_step"], minlength=steps)

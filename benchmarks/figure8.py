@@ -14,7 +14,6 @@ import numpy as np
 
 import mesh_scenes as scenes
 from egs_warp.deformation.peers import CarryMethod, carry
-from egs_warp.io.video import write_png
 from egs_warp.render import render_gaussians
 from egs_warp.training.finetune import psnr
 from harness import Table, flags, report

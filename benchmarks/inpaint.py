@@ -28,7 +28,7 @@ from egs_warp.inpainting.holes import Hole, disc, footprint
 from egs_warp.inpainting.inpaint import InpaintOptions, InpaintResult, inpaint
 from egs_warp.inpainting.picture import depth_colours
 from egs_warp.io import read_capture
-from egs_warp.io.video import contact_sheet, write_png
+from egs_warp.io.video import contact_sheet
 from egs_warp.render import render_gaussians
 from egs_warp.segmentation.plane_fit import plane_depth
 from egs_warp.training.finetune import FinetuneOptions, TrainingView, finetune, psnr

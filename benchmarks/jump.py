@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import resource
 import tempfile
-import time
+from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 from egs_warp.assets import pawn
 from egs_warp.pipelines.animate import AnimateOptions, animate
@@ -27,11 +27,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with tempfile.TemporaryDirectory() as folder:
         # The first run compiles the kernels.
         animate(scene.cloud, folder, plane=scene.plane, options=AnimateOptions(frames=1), quiet=True)
-        options = AnimateOptions(frames=frames, seed=arguments.seed)
-        start = time.perf_counter()
-        report = animate(scene.cloud, folder, plane=scene.plane, options=options, quiet=True)
-        seconds = time.perf_counter() - start
-    rows = [{"stage": stage, **asdict(time)} for stage, time in report.timing.items()]
+        asked = AnimateOptions(frames=frames, seed=options.seed)
+        told, milliseconds = timed(animate, scene.cloud, folder, plane=scene.plane, options=asked, quiet=True)
+    seconds = 1e-3 * milliseconds
+    rows = [{"stage": stage, **asdict(time)} for stage, time in told.timing.items()]
     gibibytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     table = Table(stage="<12", mean_ms=".1f", worst_ms=".1f")
     for row in rows:

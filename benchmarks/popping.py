@@ -28,6 +28,10 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.capture import read_capture
 from egs_warp.render import render_gaussians
+from harness import Row, Table, data_folder, flags, report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 POP = 1.3
 

@@ -192,9 +192,7 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
     with torch.no_grad():
         for count in sorted({1, threads}):
             torch.set_num_threads(count)
-            start = time.perf_counter()
-            twin = peers.composite_in_torch(projected, lists, camera)
-            twin_times[count] = (time.perf_counter() - start) * 1e3
+            twin, twin_times[count] = timed(peers.composite_in_torch, projected, lists, camera)
     picture = wp.to_torch(render_gaussians(cloud, camera, background=(0, 0, 0), threads=threads).colour)
     return {
         "kind": "cpu",

@@ -29,12 +29,10 @@ import warp as wp
 from egs_warp.assets import figurine, pawn, stool
 from egs_warp.errors import UserError
 from egs_warp.io import read_capture
-from egs_warp.locomotion.rollout import simulate
 from egs_warp.locomotion.trajectory import Trajectory, audit, measure
-from egs_warp.motions.repertoire import also_reached, longest, parts_of
-from egs_warp.motions.script import parse_script
-from egs_warp.motions.sequence import MotionSequence
-from egs_warp.pipelines.creature import first_place, make_creature
+from egs_warp.motions.script import motion
+from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.performance import simulate
 from harness import Row, Table, data_folder, flags, record, report, timed
 
 if TYPE_CHECKING:
@@ -88,13 +86,8 @@ def cases(quick: bool) -> list[Case]:
 def run(case: Case, *, device: str, seed: int, frames: int | None = None) -> Row:
     """Simulate one case, ``frames`` of it, and judge it; ``seed`` is of the built-in bodies' Gaussians."""
     wp.config.log_level = wp.LOG_WARNING
-    from egs_warp.assets import figurine, pawn, stool
-    from egs_warp.errors import UserError
-    from egs_warp.io import read_capture
-    from egs_warp.locomotion.trajectory import audit, measure
-    from egs_warp.motions.script import motion
-    from egs_warp.pipelines.creature import make_creature
-    from egs_warp.pipelines.performance import simulate
+    judged, milliseconds = timed(_run, case, device=device, seed=seed, frames=frames)
+    return {**asdict(case), **judged, "seconds": 1e-3 * milliseconds}
 
 
 def _run(case: Case, *, device: str, seed: int, frames: int | None) -> Row:
@@ -109,8 +102,7 @@ def _run(case: Case, *, device: str, seed: int, frames: int | None) -> Row:
         creature = make_creature(**subject, friction=case.friction, sag=case.sag)
         performance = simulate(creature, motion(case.motion), frames=frames, step=case.step)
     except (UserError, ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
-        seconds = time.perf_counter() - started
-        return {**asdict(case), "success": False, "reason": f"stopped: {error}", "seconds": seconds}
+        return {"success": False, "reason": f"stopped: {error}"}
     simulation, (done, *_) = performance.simulation, performance.sequence.done
     checked = asdict(audit(simulation.trajectory, newton_unconverged=sum(not r.converged for r in simulation.reports)))
     reached = asdict(measure(simulation.trajectory))
@@ -128,7 +120,6 @@ def _run(case: Case, *, device: str, seed: int, frames: int | None) -> Row:
         "audit": {name: float(value) for name, value in checked.items()},
         "young_modulus": float(creature.body.young_modulus),
         "notes": [note for done in performance.sequence.done for note in done.motion.notes()],
-        "seconds": time.perf_counter() - started,
     }
 
 

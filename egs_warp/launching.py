@@ -135,8 +135,9 @@ def launch_again(kernel: Any, dim: int, *, inputs: Sequence[Any], outputs: Seque
 
 
 def _chunk_edges(row_count: int, threads: int, work: np.ndarray | None) -> list[int]:
-    """Where chunks begin and end, whose effort shrinks towards the last: all threads then finish at about the same
-    time."""
+    """Where chunks begin and end, whose effort shrinks towards the last:
+    all threads then finish at about the same time.
+    """
     least = 0.0 if work is not None else _MIN_ROWS_PER_CHUNK / max(row_count, 1)
     least = max(least, 1.0 / (_LAST_CHUNKS_PER_THREAD * threads))
     shares, taken = [], 0.0

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from egs_warp.commands.flags import guessed_up, parse_direction, parse_up
+from egs_warp.commands.flags import Commands, guessed_up, parse_direction, parse_up
 from egs_warp.commands.scene_flags import SceneInput, add_object_flags, plane_of, read_scene, say
 from egs_warp.commands.segment import add_straddling_flag, clearing_of
 from egs_warp.errors import UserError

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -72,7 +74,7 @@ def parse_plane(text: str) -> Plane:
     return Plane.from_coefficients(nx, ny, nz, d)
 
 
-def guessed_up(capture) -> tuple[np.ndarray, str]:
+def guessed_up(capture: Capture) -> tuple[np.ndarray, str]:
     """(3,) up of a ``Capture`` whose file cannot tell, and what to say about it."""
     from egs_warp.segmentation.base_plane import guess_up
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from egs_warp.commands.flags import parse_plane
+from egs_warp.commands.flags import Commands, parse_plane
 from egs_warp.errors import UserError
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from egs_warp.commands.flags import Commands
 from egs_warp.errors import UserError
 
 if TYPE_CHECKING:

@@ -11,6 +11,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.kernels.inpainting.rectified import mean_colour_kernel
+from egs_warp.launching import empty
 from egs_warp.render import render_gaussians
 from egs_warp.segmentation.plane_search import near_plane
 

@@ -94,7 +94,8 @@ class KnownPlane:
             offset = float(entry["offset"])
         except (TypeError, KeyError, ValueError) as error:
             raise UserError(f"{path}: plane {number} needs normal [x, y, z] and offset; make it again") from error
-        plane = Plane.from_coefficients(*normal, offset)
+        nx, ny, nz = normal.tolist()
+        plane = Plane.from_coefficients(nx, ny, nz, offset)
         try:
             return cls(
                 plane,

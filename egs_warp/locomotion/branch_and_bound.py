@@ -50,7 +50,8 @@ class _Branch:
                 _Branch(_Decided.ARC, half, directions),
             ]
         if self.decided is _Decided.ARC and self.last - self.first > 1:
-            # Friction lies on one edge of the pyramid or on a face between two, so the halves share only the middle edge.
+            # Friction lies on one edge of the pyramid or on a face between two, so the halves share only the middle
+            # edge.
             middle = (self.first + self.last) // 2
             return [replace(self, last=middle), replace(self, first=middle)]
         if self.decided is _Decided.ARC:

@@ -36,8 +36,9 @@ LARGEST_FRICTION = 10.0
 
 @dataclass(frozen=True)
 class AnimateOptions:
-    """What a user may ask; lengths of targets are in body heights. Targets hold for motions that do not say their
-    own."""
+    """What a user may ask; lengths of targets are in body heights.
+    Targets hold for motions that do not say their own.
+    """
 
     distance: float | None = None
     height: float | None = None

@@ -49,7 +49,8 @@ def draw_film(
 ) -> Film:
     """Write ``name``.mp4 and sheet.png, ``size`` pixels both ways, into ``folder``.
 
-    ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from``: see ``Performance.camera``.
+    ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from``: see
+    ``Performance.camera``.
     """
     creature, simulation = performance.creature, performance.simulation
     trajectory, frames = simulation.trajectory, simulation.frames

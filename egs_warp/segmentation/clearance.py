@@ -18,7 +18,7 @@ from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.geometry.plane import Plane
 from egs_warp.kernels.deformation.splitting import split_kernel
 from egs_warp.kernels.segmentation.clearance import half_space_kernel, reach_kernel
-from egs_warp.launching import launch_rows
+from egs_warp.launching import empty, launch_rows
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.plane_fit import plane_depth
 

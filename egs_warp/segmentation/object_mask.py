@@ -289,7 +289,9 @@ def _voted(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> tuple[np.ndarra
 
 
 def masks_from_selection(cloud: GaussianCloud, selection: np.ndarray, cameras: Sequence[Camera]) -> list[MaskedView]:
-    """Masks of where the Gaussians ``selection`` (n,) bool make up more than half of what shows, through ``cameras``."""
+    """Masks of where the Gaussians ``selection`` (n,) bool make up more than half of what shows,
+    through ``cameras``.
+    """
     from egs_warp.render.rasteriser import render_gaussians
 
     sh = np.zeros((cloud.count, 1, 3), np.float32)

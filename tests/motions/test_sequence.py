@@ -172,7 +172,9 @@ def test_a_landing_frame_holds_the_landed_body(place: Place) -> None:
 
 @pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.0 * np.pi])
 def test_a_twist_asks_friction_for_the_spin_that_is_left(place: Place, turn: float) -> None:
-    """In the thrust: up x L = I (angle left) / (time in the air) with a reserve; its own turning is counted beyond half turns."""
+    """In the thrust: up x L = I (angle left) / (time in the air) with a reserve;
+    its own turning is counted beyond half turns.
+    """
     jump = twist(place, JumpTarget(0.0, 0.2), turn)
     jump.phase = JumpPhase.THRUST
     still = np.zeros_like(place.standing)
