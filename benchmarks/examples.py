@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name in EXAMPLES:
         with tempfile.TemporaryDirectory() as folder:
             asked = ["--out", folder, "--device", options.device, *(["--frames", "6"] if options.quick else [])]
-            told = example(name).main(asked)
+            told = example(name).main(asked).to_json()
             with np.load(Path(folder) / "trajectory.npz") as trajectory:
                 steps = len(trajectory["time"]) - 1
                 contacts = np.bincount(trajectory["contact_step"], minlength=steps)

@@ -14,7 +14,7 @@ import numpy as np
 
 import mesh_scenes as scenes
 from egs_warp.deformation.peers import CarryMethod, carry
-from egs_warp.render import render
+from egs_warp.render import render_gaussians
 from egs_warp.training.finetune import psnr
 from harness import Table, flags, report
 
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         strip = [truth[0][0]]
         for method in CarryMethod:
             (carried,) = carry(cloud, cage, [nodes], method=method, max_growth=options.growth)
-            images = [render(carried, camera) for camera in cameras]
+            images = [render_gaussians(carried, camera) for camera in cameras]
             pictures = [np.clip(image.colour.numpy(), 0.0, 1.0) for image in images]
             strip.append(pictures[0])
             rows.append(

@@ -29,7 +29,7 @@ from egs_warp.inpainting.inpaint import InpaintOptions, InpaintResult, inpaint
 from egs_warp.inpainting.picture import depth_colours
 from egs_warp.io import read_capture
 from egs_warp.io.video import contact_sheet
-from egs_warp.render import render
+from egs_warp.render import render_gaussians
 from egs_warp.segmentation.plane_fit import plane_depth
 from egs_warp.training.finetune import FinetuneOptions, TrainingView, finetune, psnr
 from harness import Row, Table, data_folder, flags, report, timed
@@ -121,7 +121,7 @@ def hole_pixels(result: InpaintResult, camera: Camera) -> np.ndarray:
 
 def picture(cloud: GaussianCloud, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Colour (H, W, 3) and depth (H, W)."""
-    image = render(cloud, camera)
+    image = render_gaussians(cloud, camera)
     return np.clip(image.colour.numpy(), 0.0, 1.0), image.depth.numpy()
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import resource
 import tempfile
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from egs_warp.assets import pawn
@@ -29,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         asked = AnimateOptions(frames=frames, seed=options.seed)
         told, milliseconds = timed(animate, scene.cloud, folder, plane=scene.plane, options=asked, quiet=True)
     seconds = 1e-3 * milliseconds
-    rows = [{"stage": stage, **values} for stage, values in told["timing"].items()]
+    rows = [{"stage": stage, **asdict(time)} for stage, time in told.timing.items()]
     gibibytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     table = Table(stage="<12", mean_ms=".1f", worst_ms=".1f")
     for row in rows:

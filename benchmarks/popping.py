@@ -27,7 +27,7 @@ from egs_warp.deformation.splitting import split_bent, split_for_motion
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.capture import read_capture
-from egs_warp.render import render
+from egs_warp.render import render_gaussians
 from harness import Row, Table, data_folder, flags, report
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def flow_to(camera: Camera, now: GaussianCloud, after: GaussianCloud) -> np.ndar
     colour = np.zeros((now.count, 1, 3))
     # Colours lie between 0 and 1: half is no motion.
     colour[:, 0, :2] = moved / (2.0 * reach) / SH_BAND_0
-    drawn = render(
+    drawn = render_gaussians(
         replace(now, sh=wp.array(colour, dtype=wp.vec3, device=now.device)), camera, background=(0.0, 0.0, 0.0)
     )
     alpha = np.maximum(drawn.alpha.numpy(), 1e-3)[..., None]
@@ -58,7 +58,7 @@ def flow_to(camera: Camera, now: GaussianCloud, after: GaussianCloud) -> np.ndar
 
 def differences(camera: Camera, clouds: list[GaussianCloud], flows: list[np.ndarray]) -> np.ndarray:
     """(F - 1,) root mean square of each frame less the next one moved back by ``flows``."""
-    pictures = [render(cloud, camera).colour.numpy() for cloud in clouds]
+    pictures = [render_gaussians(cloud, camera).colour.numpy() for cloud in clouds]
     rows, columns = np.mgrid[: camera.height, : camera.width].astype(float)
     result = []
     for picture, following, flow in zip(pictures[:-1], pictures[1:], flows, strict=True):

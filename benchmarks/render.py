@@ -21,7 +21,7 @@ import render_peers as peers
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.launching import available_threads
-from egs_warp.render import render
+from egs_warp.render import render_gaussians
 from egs_warp.render.compositing import Background, composite
 from egs_warp.render.projection import project, view_from_camera
 from egs_warp.render.tiles import build_tile_lists
@@ -137,7 +137,7 @@ def memory_row(*, seed: int) -> Row:
     camera = Camera.look_at(np.array([0.0, -1.0, -3.0]), np.zeros(3), np.array([0, -1.0, 0]), width=1920, height=1080)
     before = wp.get_mempool_used_mem_current(device)
     wp.set_mempool_release_threshold(device, 0)
-    picture = render(cloud, camera)
+    picture = render_gaussians(cloud, camera)
     peak = wp.get_mempool_used_mem_high(device) - before
     capture = sum(array.capacity for array in vars(cloud).values())
     return {
@@ -163,9 +163,9 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
     lists = build_tile_lists(projected, view, threads=threads)
     times = median_ms(
         {
-            "one_thread": lambda: render(cloud, camera, background=(0, 0, 0), threads=1),
-            "two_threads": lambda: render(cloud, camera, background=(0, 0, 0), threads=2),
-            "all_threads": lambda: render(cloud, camera, background=(0, 0, 0), threads=threads),
+            "one_thread": lambda: render_gaussians(cloud, camera, background=(0, 0, 0), threads=1),
+            "two_threads": lambda: render_gaussians(cloud, camera, background=(0, 0, 0), threads=2),
+            "all_threads": lambda: render_gaussians(cloud, camera, background=(0, 0, 0), threads=threads),
             "arithmetic_one_thread": lambda: arithmetic_by_threads(1, probe),
             "arithmetic_two_threads": lambda: arithmetic_by_threads(2, probe),
         },
@@ -193,7 +193,7 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
         for count in sorted({1, threads}):
             torch.set_num_threads(count)
             twin, twin_times[count] = timed(peers.composite_in_torch, projected, lists, camera)
-    picture = wp.to_torch(render(cloud, camera, background=(0, 0, 0), threads=threads).colour)
+    picture = wp.to_torch(render_gaussians(cloud, camera, background=(0, 0, 0), threads=threads).colour)
     return {
         "kind": "cpu",
         "peers": peers.cpu_peers(scene, camera),

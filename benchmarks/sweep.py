@@ -29,12 +29,10 @@ import warp as wp
 from egs_warp.assets import figurine, pawn, stool
 from egs_warp.errors import UserError
 from egs_warp.io import read_capture
-from egs_warp.locomotion.rollout import simulate
 from egs_warp.locomotion.trajectory import Trajectory, audit, measure
-from egs_warp.motions.repertoire import also_reached, longest, parts_of
-from egs_warp.motions.script import parse_script
-from egs_warp.motions.sequence import MotionSequence
-from egs_warp.pipelines.creature import first_place, make_creature
+from egs_warp.motions.script import motion
+from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.performance import simulate
 from harness import Row, Table, data_folder, flags, record, report, timed
 
 if TYPE_CHECKING:
@@ -102,25 +100,16 @@ def _run(case: Case, *, device: str, seed: int, frames: int | None) -> Row:
         subject = {"cloud": built_in.cloud, "plane": built_in.plane}
     try:
         creature = make_creature(**subject, friction=case.friction, sag=case.sag)
-        requests = parse_script(case.motion, defaults={})
-        place = first_place(creature, step=case.step)
-        sequence = MotionSequence(place, parts_of(requests, creature.body.height))
-        simulation = simulate(
-            creature.stepper,
-            creature.geometry,
-            creature.start,
-            sequence,
-            frames=frames or round(longest(requests) * min(1.0, 1 / (60 * case.step))),
-            step=case.step,
-            finished=lambda: sequence.finished,
-        )
+        performance = simulate(creature, motion(case.motion), frames=frames, step=case.step)
     except (UserError, ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
         return {"success": False, "reason": f"stopped: {error}"}
+    simulation, (done, *_) = performance.simulation, performance.sequence.done
     checked = asdict(audit(simulation.trajectory, newton_unconverged=sum(not r.converged for r in simulation.reports)))
     reached = asdict(measure(simulation.trajectory))
-    reached |= also_reached(sequence.done[0].motion, simulation.trajectory, 0, -1)
-    asked = {"distance": 0.0, "height": 0.2, **sequence.done[0].asked}
-    reason = judge(requests[0].name, asked, reached, checked)
+    if (also := done.motion.reached(simulation.trajectory, 0, -1)) is not None:
+        reached |= asdict(also)
+    asked = {"distance": 0.0, "height": 0.2, **done.asked}
+    reason = judge(done.name, asked, reached, checked)
     if reason and friction_spent(simulation.trajectory) > 0.5:
         reason += "; friction was spent for over half of the time on the ground"
     return {
@@ -130,7 +119,7 @@ def _run(case: Case, *, device: str, seed: int, frames: int | None) -> Row:
         "reached": {name: float(value) for name, value in reached.items()},
         "audit": {name: float(value) for name, value in checked.items()},
         "young_modulus": float(creature.body.young_modulus),
-        "notes": [note for done in sequence.done for note in done.motion.notes()],
+        "notes": [note for done in performance.sequence.done for note in done.motion.notes()],
     }
 
 

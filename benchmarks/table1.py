@@ -32,7 +32,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.meshing.cage import build_cage
-from egs_warp.render import render
+from egs_warp.render import render_gaussians
 from egs_warp.training.finetune import psnr, ssim
 from harness import Row, Table, flags, report, timed
 from perceptual import lpips_distance
@@ -117,7 +117,8 @@ def object_rows(mesh: scenes.PaintedMesh, options: argparse.Namespace) -> tuple[
     cameras = cameras_around(mesh.vertices)
     rest_truth = scenes.photograph(mesh, mesh.vertices, cameras, options.device)
     at_rest = [
-        psnr(np.clip(render(cloud, c).colour.numpy(), 0, 1), t) for c, (t, _) in zip(cameras, rest_truth, strict=True)
+        psnr(np.clip(render_gaussians(cloud, c).colour.numpy(), 0, 1), t)
+        for c, (t, _) in zip(cameras, rest_truth, strict=True)
     ]
     print(
         f"  cage {len(cage.nodes)} nodes, {100 * held:.2f} % of the vertices inside; unseen views at rest "
@@ -146,7 +147,7 @@ def object_rows(mesh: scenes.PaintedMesh, options: argparse.Namespace) -> tuple[
             )
             scores = []
             for index, (camera, (target, coverage)) in enumerate(zip(cameras, truth, strict=True)):
-                image = render(carried, camera)
+                image = render_gaussians(carried, camera)
                 picture = np.clip(image.colour.numpy(), 0.0, 1.0)
                 similarity = float(ssim(torch.as_tensor(picture).float(), torch.as_tensor(target).float()))
                 perceptual = distance(picture, target) if distance else np.nan

@@ -24,7 +24,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io import read_capture
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane
-from egs_warp.render import render
+from egs_warp.render import render_gaussians
 from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane
 from egs_warp.segmentation.object_mask import ObjectSpec, masks_from_selection
 from egs_warp.segmentation.votes import blending_votes
@@ -73,7 +73,7 @@ def cameras_in(plane: Plane, located: LocatedPlane, side: int) -> list[Camera]:
 
 def picture(cloud: GaussianCloud, camera: Camera) -> np.ndarray:
     """(H, W, 3) float32, 0 to 1, on black."""
-    return np.clip(render(cloud, camera, background=BLACK).colour.numpy(), 0.0, 1.0)
+    return np.clip(render_gaussians(cloud, camera, background=BLACK).colour.numpy(), 0.0, 1.0)
 
 
 def rows_of(name: str, device: str, side: int, seed: int, table: Table) -> tuple[list[Row], np.ndarray]:

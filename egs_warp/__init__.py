@@ -1,3 +1,147 @@
-"""egs_warp: still objects in 3D Gaussian Splatting captures come to life (EnliveningGS, CVPR 2025) in Warp kernels."""
+"""egs_warp: still objects in 3D Gaussian Splatting captures come to life (EnliveningGS, CVPR 2025) in Warp kernels.
 
-__version__ = "0.1.0"
+``import egs_warp as egs`` gives all of the names below, each imported when it is first used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from egs_warp.version import __version__
+
+if TYPE_CHECKING:
+    from egs_warp.assets.scene import BUILT_IN_SCENES, Scene, scene
+    from egs_warp.commands.flags import one_line_errors
+    from egs_warp.deformation.deformer import Deformer
+    from egs_warp.deformation.embedding import embed_gaussians
+    from egs_warp.errors import ArgumentError, UserError
+    from egs_warp.geometry.camera import Camera
+    from egs_warp.geometry.gaussians import GaussianCloud, joined
+    from egs_warp.geometry.plane import Plane
+    from egs_warp.geometry.tetmesh import TetMesh
+    from egs_warp.inpainting.holes import footprint
+    from egs_warp.inpainting.inpaint import InpaintOptions, inpaint
+    from egs_warp.io.atomic import writable_folder
+    from egs_warp.io.cameras import read_cameras
+    from egs_warp.io.capture import read_capture
+    from egs_warp.io.ply import write_ply
+    from egs_warp.io.video import VideoWriter, contact_sheet, write_png
+    from egs_warp.launching import use_device
+    from egs_warp.locomotion.stepper import LocomotionSettings
+    from egs_warp.locomotion.strategies import Strategy
+    from egs_warp.locomotion.trajectory import Trajectory
+    from egs_warp.motions.script import Script, motion
+    from egs_warp.pipelines.animate import AnimateOptions, animate
+    from egs_warp.pipelines.creature import Creature, make_creature
+    from egs_warp.pipelines.performance import Performance, simulate
+    from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene
+    from egs_warp.pipelines.report import Report
+    from egs_warp.pipelines.train_capture import TrainResult, train
+    from egs_warp.render.autograd import render_torch
+    from egs_warp.render.rasteriser import render_gaussians
+    from egs_warp.segmentation.object_mask import Box, ObjectSpec
+    from egs_warp.training.finetune import FinetuneOptions, Rates, finetune, psnr, views_of_capture
+
+_HOMES: dict[str, tuple[str, ...]] = {
+    "assets.scene": ("BUILT_IN_SCENES", "Scene", "scene"),
+    "commands.flags": ("one_line_errors",),
+    "deformation.deformer": ("Deformer",),
+    "deformation.embedding": ("embed_gaussians",),
+    "errors": ("ArgumentError", "UserError"),
+    "geometry.camera": ("Camera",),
+    "geometry.gaussians": ("GaussianCloud", "joined"),
+    "geometry.plane": ("Plane",),
+    "geometry.tetmesh": ("TetMesh",),
+    "inpainting.holes": ("footprint",),
+    "inpainting.inpaint": ("InpaintOptions", "inpaint"),
+    "io.atomic": ("writable_folder",),
+    "io.cameras": ("read_cameras",),
+    "io.capture": ("read_capture",),
+    "io.ply": ("write_ply",),
+    "io.video": ("VideoWriter", "contact_sheet", "write_png"),
+    "launching": ("use_device",),
+    "locomotion.stepper": ("LocomotionSettings",),
+    "locomotion.strategies": ("Strategy",),
+    "locomotion.trajectory": ("Trajectory",),
+    "motions.script": ("Script", "motion"),
+    "pipelines.animate": ("AnimateOptions", "animate"),
+    "pipelines.creature": ("Creature", "make_creature"),
+    "pipelines.performance": ("Performance", "simulate"),
+    "pipelines.prepare_scene": ("PreparedScene", "SceneOptions", "prepare_scene"),
+    "pipelines.report": ("Report",),
+    "pipelines.train_capture": ("TrainResult", "train"),
+    "render.autograd": ("render_torch",),
+    "render.rasteriser": ("render_gaussians",),
+    "segmentation.object_mask": ("Box", "ObjectSpec"),
+    "training.finetune": ("FinetuneOptions", "Rates", "finetune", "psnr", "views_of_capture"),
+}
+"""Where each public name lives; the imports above say the same to type checkers."""
+_MODULE_OF = {name: f"egs_warp.{module}" for module, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "BUILT_IN_SCENES",
+    "AnimateOptions",
+    "ArgumentError",
+    "Box",
+    "Camera",
+    "Creature",
+    "Deformer",
+    "FinetuneOptions",
+    "GaussianCloud",
+    "InpaintOptions",
+    "LocomotionSettings",
+    "ObjectSpec",
+    "Performance",
+    "Plane",
+    "PreparedScene",
+    "Rates",
+    "Report",
+    "Scene",
+    "SceneOptions",
+    "Script",
+    "Strategy",
+    "TetMesh",
+    "TrainResult",
+    "Trajectory",
+    "UserError",
+    "VideoWriter",
+    "__version__",
+    "animate",
+    "contact_sheet",
+    "embed_gaussians",
+    "finetune",
+    "footprint",
+    "inpaint",
+    "joined",
+    "make_creature",
+    "motion",
+    "one_line_errors",
+    "prepare_scene",
+    "psnr",
+    "read_cameras",
+    "read_capture",
+    "render_gaussians",
+    "render_torch",
+    "scene",
+    "simulate",
+    "train",
+    "use_device",
+    "views_of_capture",
+    "writable_folder",
+    "write_ply",
+    "write_png",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """The public ``name``, imported now (PEP 562)."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'egs_warp' has no attribute {name!r}")
+    value = getattr(import_module(_MODULE_OF[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from egs_warp.commands import COMMANDS
+from egs_warp.commands.flags import flag_of
 from egs_warp.errors import UserError
 
 
@@ -20,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return chosen.run(chosen)
     except UserError as error:
-        print(f"egs-warp: {error}", file=sys.stderr)
+        print(f"egs-warp: {error.told(flag_of)}", file=sys.stderr)
         return 2
 
 

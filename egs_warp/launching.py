@@ -17,6 +17,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import warp as wp
 
+from egs_warp.errors import ArgumentError
+
 Shape: TypeAlias = int | tuple[int, ...]
 Device: TypeAlias = wp.Device | str | None
 """A device or its name; None is Warp's current one."""
@@ -31,6 +33,14 @@ _LAST_CHUNKS_PER_THREAD = 24
 def available_threads() -> int:
     """Number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+
+
+def use_device(device: str) -> None:
+    """Called first by programs: raises ``UserError`` where Warp sees no such device, and leaves Warp only its
+    warnings."""
+    wp.config.log_level = wp.LOG_WARNING
+    if device not in (devices := [str(known) for known in wp.get_devices()]):
+        raise ArgumentError("device", f"this machine has {', '.join(devices)}", value=device)
 
 
 def launch_rows(

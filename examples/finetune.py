@@ -14,19 +14,10 @@ import numpy as np
 import torch
 import warp as wp
 
-from egs_warp.assets import pawn
-from egs_warp.commands.flags import check_device
-from egs_warp.errors import UserError, one_line_errors
-from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.io.atomic import writable_folder
-from egs_warp.io.video import contact_sheet, write_png
-from egs_warp.render import render
-from egs_warp.render.autograd import render_torch
-from egs_warp.training.finetune import FinetuneOptions, Rates, finetune, psnr, views_of_capture
+import egs_warp as egs
 
 
-def ring_of_cameras(cloud: GaussianCloud, up: np.ndarray, *, count: int, size: int) -> list[Camera]:
+def ring_of_cameras(cloud: egs.GaussianCloud, up: np.ndarray, *, count: int, size: int) -> list[egs.Camera]:
     """Cameras around the object, a little above its middle."""
     means = cloud.means.numpy().astype(float)
     low, high = np.percentile(means, [1, 99], axis=0)
@@ -36,7 +27,7 @@ def ring_of_cameras(cloud: GaussianCloud, up: np.ndarray, *, count: int, size: i
     front = np.cross(up, side)
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
     return [
-        Camera.look_at(
+        egs.Camera.look_at(
             middle + 3.2 * radius * (np.cos(a) * side + np.sin(a) * front + 0.35 * up),
             middle,
             up,
@@ -47,12 +38,12 @@ def ring_of_cameras(cloud: GaussianCloud, up: np.ndarray, *, count: int, size: i
     ]
 
 
-def brightness_gradient(cloud: GaussianCloud, camera: Camera) -> torch.Tensor:
+def brightness_gradient(cloud: egs.GaussianCloud, camera: egs.Camera) -> torch.Tensor:
     """(n, 3): by how much the picture gets brighter as each Gaussian moves: autograd through the renderer."""
     means = torch.tensor(cloud.means.numpy(), requires_grad=True)
     rest = [torch.tensor(getattr(cloud, name).numpy()) for name in ("rotations", "log_scales", "opacity_logits", "sh")]
     rotations, log_scales, opacity_logits, sh = rest
-    render_torch(means, rotations, log_scales, opacity_logits, sh, camera).colour.mean().backward()
+    egs.render_torch(means, rotations, log_scales, opacity_logits, sh, camera).colour.mean().backward()
     assert means.grad is not None
     return means.grad
 
@@ -65,32 +56,35 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=256)
     parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
-    wp.config.log_level = wp.LOG_WARNING
-    check_device(arguments.device)
+    egs.use_device(arguments.device)
     if arguments.steps < 1 or not 16 <= arguments.size <= 4096:
-        raise UserError("give --steps of at least 1 and a --size from 16 to 4096 pixels")
-    writable_folder(arguments.out)
+        raise egs.UserError("give --steps of at least 1 and a --size from 16 to 4096 pixels")
+    egs.writable_folder(arguments.out)
 
-    scene = pawn(device=arguments.device)
-    cameras = ring_of_cameras(scene.cloud, scene.plane.normal, count=8, size=arguments.size)
-    views = views_of_capture(scene.cloud, cameras)
-    grey = replace(scene.cloud, sh=wp.zeros_like(scene.cloud.sh))
+    built_in = egs.scene("pawn", device=arguments.device)
+    cameras = ring_of_cameras(built_in.object, built_in.plane.normal, count=8, size=arguments.size)
+    views = egs.views_of_capture(built_in.object, cameras)
+    grey = replace(built_in.object, sh=wp.zeros_like(built_in.object.sh))
     print(f"largest brightness gradient of a mean: {float(brightness_gradient(grey, cameras[0]).abs().max()):.2e}")
-    result = finetune(grey, views, options=FinetuneOptions(iterations=arguments.steps, rates=Rates(sh_band_0=2e-2)))
+    result = egs.finetune(
+        grey, views, options=egs.FinetuneOptions(iterations=arguments.steps, rates=egs.Rates(sh_band_0=2e-2))
+    )
 
     pictures = {
-        "as it was": scene.cloud,
+        "as it was": built_in.object,
         "colours lost": grey,
         f"after {arguments.steps} steps": result.cloud,
     }
-    frames = [render(cloud, cameras[0]).colour_srgb8() for cloud in pictures.values()]
-    write_png(arguments.out / "finetune.png", contact_sheet(frames, 3, list(pictures)))
+    frames = [egs.render_gaussians(cloud, cameras[0]).colour_srgb8() for cloud in pictures.values()]
+    egs.write_png(arguments.out / "finetune.png", egs.contact_sheet(frames, 3, list(pictures)))
     for label, cloud in pictures.items():
-        quality = np.mean([psnr(np.clip(render(cloud, v.camera).colour.numpy(), 0, 1), v.image) for v in views])
+        quality = np.mean(
+            [egs.psnr(np.clip(egs.render_gaussians(cloud, v.camera).colour.numpy(), 0, 1), v.image) for v in views]
+        )
         print(f"{label:>18}: {quality:6.2f} dB")
     print(f"wrote finetune.png into {arguments.out}")
 
 
 if __name__ == "__main__":
-    with one_line_errors("finetune.py"):
+    with egs.one_line_errors("finetune.py"):
         main()

@@ -8,17 +8,11 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-import warp as wp
 
-from egs_warp.assets import scene
-from egs_warp.assets.rooms import SQUARE
-from egs_warp.commands.flags import check_device
-from egs_warp.errors import one_line_errors
-from egs_warp.pipelines.animate import AnimateOptions, animate
-from egs_warp.pipelines.report import summary
+import egs_warp as egs
 
 
-def main(arguments: list[str] | None = None) -> dict:
+def main(arguments: list[str] | None = None) -> egs.Report:
     """Run the example; returns the report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/hop"))
@@ -27,24 +21,24 @@ def main(arguments: list[str] | None = None) -> dict:
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)
-    wp.config.log_level = wp.LOG_WARNING
-    check_device(chosen.device)
-    chess = scene("pawn", device=chosen.device)
-    report = animate(
-        chess.object,
+    egs.use_device(chosen.device)
+    built_in = egs.scene("pawn", device=chosen.device)
+    options = egs.AnimateOptions(frames=chosen.frames, size=chosen.size)
+    report = egs.animate(
+        built_in.object,
         chosen.out,
         motion=f"hop x{chosen.hops}",
-        plane=chess.plane,
-        background=chess.background,
+        plane=built_in.plane,
+        background=built_in.background,
         forward=np.array([1.0, 0.0, 0.0]),
-        options=AnimateOptions(distance=SQUARE, frames=chosen.frames, size=chosen.size),
+        options=options,
         source="pawn",
     )
-    print(summary(report))
+    print(report.summary())
     print(f"wrote the video, sheet.png, report.json, trajectory.npz into {chosen.out}")
     return report
 
 
 if __name__ == "__main__":
-    with one_line_errors("hop.py"):
+    with egs.one_line_errors("hop.py"):
         main()

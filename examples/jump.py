@@ -5,16 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import warp as wp
-
-from egs_warp.assets import pawn
-from egs_warp.commands.flags import check_device
-from egs_warp.errors import one_line_errors
-from egs_warp.pipelines.animate import AnimateOptions, animate
-from egs_warp.pipelines.report import summary
+import egs_warp as egs
 
 
-def main(arguments: list[str] | None = None) -> dict:
+def main(arguments: list[str] | None = None) -> egs.Report:
     """Run the example; returns the report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/jump"))
@@ -22,16 +16,21 @@ def main(arguments: list[str] | None = None) -> dict:
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--device", default="cpu")
     chosen = parser.parse_args(arguments)
-    wp.config.log_level = wp.LOG_WARNING
-    check_device(chosen.device)
-    thing = pawn(device=chosen.device)
-    options = AnimateOptions(distance=0.5, height=0.2, frames=chosen.frames, size=chosen.size)
-    report = animate(thing.cloud, chosen.out, plane=thing.plane, options=options, source="pawn")
-    print(summary(report))
+    egs.use_device(chosen.device)
+    built_in = egs.scene("pawn", device=chosen.device)
+    options = egs.AnimateOptions(distance=0.5, height=0.2, frames=chosen.frames, size=chosen.size)
+    report = egs.animate(
+        built_in.object,
+        chosen.out,
+        plane=built_in.plane,
+        options=options,
+        source="pawn",
+    )
+    print(report.summary())
     print(f"wrote the video, sheet.png, report.json, trajectory.npz into {chosen.out}")
     return report
 
 
 if __name__ == "__main__":
-    with one_line_errors("jump.py"):
+    with egs.one_line_errors("jump.py"):
         main()

@@ -35,7 +35,7 @@ def example(name: str) -> ModuleType:
     ],
 )
 def test_example_writes_its_files(tmp_path: Path, name: str, asked: dict[str, float]) -> None:
-    report = example(name).main(["--out", str(tmp_path), "--frames", "3", "--size", "64"])
+    report = example(name).main(["--out", str(tmp_path), "--frames", "3", "--size", "64"]).to_json()
     assert json.loads((tmp_path / "report.json").read_text()) == json.loads(json.dumps(report))
     (entry,) = report["motion"]
     assert entry["name"] == name and entry["asked"] == asked
@@ -49,10 +49,10 @@ def test_example_writes_its_files(tmp_path: Path, name: str, asked: dict[str, fl
 @pytest.mark.parametrize(
     ("name", "flags", "message"),
     [
-        ("walk", ["--steps", "0"], "walk.py: --motion, motion 1 ('walk 0 0.1'): steps 0: give a whole number of steps"),
+        ("walk", ["--steps", "0"], "walk.py: motion 1 ('walk 0 0.1'): steps 0: give a whole number of steps"),
         ("jump", ["--size", "0"], "jump.py: --size 0: give a number of pixels from 16 to 4096"),
         ("twist", ["--device", "tpu"], "twist.py: --device tpu: this machine has cpu"),
-        ("hop", ["--hops", "0"], "hop.py: --motion, motion 1 ('hop x0'): repeat 0; give a whole number"),
+        ("hop", ["--hops", "0"], "hop.py: motion 1 ('hop x0'): repeat 0; give a whole number"),
         ("finetune", ["--steps", "0"], "finetune.py: give --steps of at least 1"),
     ],
 )

@@ -6,13 +6,14 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from egs_warp.commands.flags import Commands, check_device, guessed_up, parse_direction, parse_up
+from egs_warp.commands.flags import Commands, guessed_up, parse_direction, parse_up
 from egs_warp.commands.scene_flags import SceneInput, add_object_flags, plane_of, read_scene, say
 from egs_warp.commands.segment import add_straddling_flag, clearing_of
 from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
     from egs_warp.pipelines.prepare_scene import PreparedScene
+    from egs_warp.pipelines.report import Report
 
 
 def add_parser(commands: Commands) -> None:
@@ -65,27 +66,23 @@ def add_parser(commands: Commands) -> None:
 
 
 def _animate(chosen: argparse.Namespace) -> int:
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_WARNING
-    from egs_warp.pipelines.report import summary
-
     report, more = _animate_scene(chosen) if chosen.object is not None else _animate_capture(chosen)
-    print(summary(report))
+    print(report.summary())
     print(f"wrote the video, sheet.png, report.json, trajectory.npz{more} into {chosen.out}")
     return 0
 
 
-def _animate_capture(chosen: argparse.Namespace) -> tuple[dict, str]:
+def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
     """A capture that is the object alone; returns the report, and what was written besides."""
     from egs_warp.io import read_capture
+    from egs_warp.launching import use_device
     from egs_warp.pipelines.animate import animate
 
     for name in ("cameras", "view", "straddling", "inpainter", "no_inpaint"):
         if getattr(chosen, name) not in (None, False):
             raise UserError(f"--{name.replace('_', '-')}: needs --object, which says what to take out of a scene")
     asked = _asked(chosen)
-    check_device(chosen.device)
+    use_device(chosen.device)
     up = parse_up(chosen.up) if chosen.up is not None else None
     plane = plane_of(chosen.plane) if chosen.plane is not None else None
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
@@ -111,10 +108,11 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[dict, str]:
     return report, ""
 
 
-def _animate_scene(chosen: argparse.Namespace) -> tuple[dict, str]:
+def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
     """The object of a scene, cut out of it, over the rest of the scene."""
     from egs_warp.inpainting.inpainters import inpainter_by_name
     from egs_warp.io.atomic import writable_folder
+    from egs_warp.launching import use_device
     from egs_warp.pipelines.animate import animate
     from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene, viewing_direction
     from egs_warp.training.photo_colours import photographs_in_colours_of
@@ -124,7 +122,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[dict, str]:
     if chosen.inpainter is not None and chosen.no_inpaint:
         raise UserError("--inpainter: --no-inpaint leaves the floor as captured; leave one of them out")
     asked = _asked(chosen)
-    check_device(chosen.device)
+    use_device(chosen.device)
     inpainter = inpainter_by_name(chosen.inpainter or "patch", device=chosen.device)
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
     given = read_scene(chosen)
@@ -181,15 +179,14 @@ def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
     """
     from egs_warp.contact.terrain import read_terrain
     from egs_warp.io.text import parse_json, read_text
-    from egs_warp.motions.repertoire import longest
-    from egs_warp.motions.script import parse_script
+    from egs_warp.motions.script import motion
     from egs_warp.pipelines.animate import AnimateOptions
 
     numbers = ("distance", "height", "heading_degrees", "frames", "size", "seed", "metres_per_unit", "friction")
     given = {name: getattr(chosen, name) for name in numbers if getattr(chosen, name) is not None}
     options = AnimateOptions(**given, shadow=not chosen.no_shadow)
     # The files of key frames are read, too.
-    longest(parse_script(chosen.motion, defaults=options.targets()))
+    motion(chosen.motion, **options.targets()).frames()
     if chosen.muscles is not None:
         parse_json(read_text(chosen.muscles), chosen.muscles)
     return {

@@ -1,8 +1,11 @@
-"""Reading of flags that several commands share."""
+"""Flags that several commands share: how they are read, and which argument of the library each one gives."""
 
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -17,6 +20,23 @@ Commands: TypeAlias = "argparse._SubParsersAction[Any]"
 """What a command adds its parser to."""
 
 _AXES = {"x": 0, "y": 1, "z": 2}
+_FLAGS = {"muscles_file": "--muscles", "solids": "--terrain"}
+"""Of arguments whose flags are called otherwise."""
+
+
+def flag_of(argument: str) -> str:
+    """The flag that gives ``argument`` of a function of the library."""
+    return _FLAGS.get(argument, f"--{argument.replace('_', '-')}")
+
+
+@contextmanager
+def one_line_errors(program: str) -> Iterator[None]:
+    """Bad input within prints one line, which names flags, and ends the ``program`` with status 2."""
+    try:
+        yield
+    except UserError as error:
+        print(f"{program}: {error.told(flag_of)}", file=sys.stderr)
+        raise SystemExit(2) from None
 
 
 def parse_up(text: str) -> np.ndarray:
@@ -52,14 +72,6 @@ def parse_plane(text: str) -> Plane:
     except ValueError as error:
         raise UserError(f"--plane {text}: give four numbers nx,ny,nz,d") from error
     return Plane.from_coefficients(nx, ny, nz, d)
-
-
-def check_device(name: str) -> None:
-    """Raises ``UserError`` where Warp sees no such device."""
-    import warp as wp
-
-    if name not in (devices := [str(device) for device in wp.get_devices()]):
-        raise UserError(f"--device {name}: this machine has {', '.join(devices)}")
 
 
 def guessed_up(capture: Capture) -> tuple[np.ndarray, str]:

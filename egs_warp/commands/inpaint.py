@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from egs_warp.commands.flags import Commands, check_device, parse_plane
+from egs_warp.commands.flags import Commands, parse_plane
 from egs_warp.errors import UserError
 
 
@@ -35,14 +35,12 @@ def add_parser(commands: Commands) -> None:
 
 
 def _inpaint(chosen: argparse.Namespace) -> int:
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_WARNING
     from egs_warp.inpainting.inpaint import InpaintOptions, inpaint
     from egs_warp.inpainting.inpainters import inpainter_by_name
     from egs_warp.inpainting.picture import before_and_after
     from egs_warp.io import read_capture, write_ply
     from egs_warp.io.video import write_png
+    from egs_warp.launching import use_device
 
     given = {"steps": chosen.steps, "margin": chosen.margin, "seed": chosen.seed}
     options = InpaintOptions(**{name: value for name, value in given.items() if value is not None})
@@ -61,7 +59,7 @@ def _inpaint(chosen: argparse.Namespace) -> int:
             "inpaint: say where the hole is by one of --object, --mask with --cameras, or --hole,"
             " or give the plane.json that segment wrote by --plane"
         )
-    check_device(chosen.device)
+    use_device(chosen.device)
     inpainter = inpainter_by_name(chosen.inpainter, seed=chosen.seed, device=chosen.device)
     background = read_capture(chosen.background, device=chosen.device)
     hole = _hole(chosen, plane, recorded, background.cloud)
@@ -79,10 +77,10 @@ def _plane(text: str) -> tuple[Any, Any]:
     if not text.lower().endswith(".json"):
         return parse_plane(text), None
     from egs_warp.inpainting.holes import Hole
-    from egs_warp.io.planes import read_planes_and_facts
+    from egs_warp.io.planes import read_planes
 
-    plane, facts = read_planes_and_facts(text)[0]
-    return plane, Hole.from_facts(plane, facts["hole"]) if "hole" in facts else None
+    known = read_planes(text)[0]
+    return known.plane, Hole.of_outline(known.plane, known.hole) if known.hole is not None else None
 
 
 def _hole(chosen: argparse.Namespace, plane: Any, recorded: Any, background: Any) -> Any:

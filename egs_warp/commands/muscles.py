@@ -27,15 +27,14 @@ def add_parser(commands: Commands) -> None:
 
 
 def _muscles(chosen: argparse.Namespace) -> int:
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_WARNING
     from egs_warp.fem.body import make_body
     from egs_warp.geometry.body_frame import GROUND
     from egs_warp.io import read_capture
+    from egs_warp.launching import use_device
     from egs_warp.muscles.plot import check_picture_name, plot_muscles
     from egs_warp.pipelines.creature import body_muscles, stand
 
+    use_device("cpu")
     check_picture_name(chosen.plot)
     up = parse_up(chosen.up) if chosen.up else None
     plane = plane_of(chosen.plane) if chosen.plane else None

@@ -11,7 +11,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera, camera_rays, shrunk
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.cameras import PosedImage
-from egs_warp.render.rasteriser import render
+from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.object_mask import Box, ObjectSpec
 from egs_warp.segmentation.votes import MaskedView
 
@@ -55,7 +55,7 @@ def point_at(cloud: GaussianCloud, camera: Camera, u: float, v: float) -> np.nda
         raise UserError(f"--object {u:g},{v:g}: outside of the view's {camera.width} x {camera.height} pixels")
     small = shrunk(camera, MAX_MASK_SIDE)
     column, row = int(u * small.width / camera.width), int(v * small.height / camera.height)
-    image = render(cloud, small)
+    image = render_gaussians(cloud, small)
     if image.alpha.numpy()[row, column] < 0.5:
         raise UserError(f"--object {u:g},{v:g}: the capture shows nothing there; click on the object")
     return small.centre + float(image.depth.numpy()[row, column]) * camera_rays(small)[row, column]

@@ -20,9 +20,6 @@ def add_parser(commands: Commands) -> None:
 
 
 def _plane(chosen: argparse.Namespace) -> int:
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_WARNING
     from egs_warp.commands.scene_planes import planes_of_scene, write_ring
     from egs_warp.errors import UserError
     from egs_warp.io.atomic import writable_folder

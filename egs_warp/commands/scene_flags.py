@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from egs_warp.commands.flags import check_device, parse_plane, parse_up
+from egs_warp.commands.flags import parse_plane, parse_up
 from egs_warp.commands.object_flag import read_object
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
@@ -19,6 +19,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.io.cameras import PosedImage, read_cameras
 from egs_warp.io.capture import read_capture
 from egs_warp.io.planes import read_planes
+from egs_warp.launching import use_device
 from egs_warp.segmentation.object_mask import ObjectSpec
 
 
@@ -73,13 +74,13 @@ def add_scene_flags(parser: argparse.ArgumentParser) -> None:
 def plane_of(text: str) -> Plane:
     """The first plane of a file, or one of four numbers. Raises ``UserError`` otherwise."""
     if text.endswith(".json") or Path(text).is_file():
-        return read_planes(text)[0]
+        return read_planes(text)[0].plane
     return parse_plane(text)
 
 
 def read_scene(chosen: argparse.Namespace) -> SceneInput:
     """Read what the flags name. Raises ``UserError`` with one line for whatever is wrong."""
-    check_device(chosen.device)
+    use_device(chosen.device)
     up = parse_up(chosen.up) if chosen.up is not None else None
     plane = plane_of(chosen.plane) if chosen.plane is not None else None
     capture = read_capture(chosen.capture, device=chosen.device)

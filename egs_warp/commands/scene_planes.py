@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,10 +16,10 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import writable_folder
 from egs_warp.io.cameras import write_cameras
-from egs_warp.io.planes import write_planes
+from egs_warp.io.planes import KnownPlane, write_planes
 from egs_warp.io.video import write_png
-from egs_warp.pipelines.locate_plane import locate_plane
-from egs_warp.render.rasteriser import render
+from egs_warp.pipelines.locate_plane import known_of_fit, locate_plane
+from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.plane_fit import PlaneView, fit_plane
 from egs_warp.segmentation.plane_search import further_planes
 
@@ -29,17 +28,21 @@ from egs_warp.segmentation.plane_search import further_planes
 class ScenePlanes:
     """What was found; scene units."""
 
-    planes: list[Plane]
+    known: list[KnownPlane]
     """The one that was asked for, then others."""
-    facts: list[Mapping[str, object]]
     centre: np.ndarray
     """(3,) of the object, or of what the masks show."""
     size: float
     notes: tuple[str, ...]
 
+    @property
+    def planes(self) -> list[Plane]:
+        """The planes alone."""
+        return [one.plane for one in self.known]
+
     def write(self, path: Path) -> None:
         """``plane.json``."""
-        write_planes(path, self.planes, facts=self.facts)
+        write_planes(path, self.known)
 
 
 def planes_of_scene(given: SceneInput, *, plane_mask: str | None, view: str | None, count: int) -> ScenePlanes:
@@ -50,8 +53,7 @@ def planes_of_scene(given: SceneInput, *, plane_mask: str | None, view: str | No
     if plane_mask is None:
         assert given.spec is not None
         located = locate_plane(given.cloud, given.spec, cameras=given.cameras, up=given.up, plane=given.plane)
-        plane, centre, size, notes = located.plane, located.centre, located.size, located.notes
-        facts: dict[str, object] = located.facts()
+        first, centre, size, notes = located.known(), located.centre, located.size, located.notes
     else:
         masks = read_object(plane_mask, given.cloud, given.posed, view=view).masks
         if not masks:
@@ -59,7 +61,7 @@ def planes_of_scene(given: SceneInput, *, plane_mask: str | None, view: str | No
         views = [
             PlaneView(mask.camera, np.where(image.alpha.numpy() > 0.5, image.depth.numpy(), 0.0), mask.mask)
             for mask in masks
-            for image in [render(given.cloud, mask.camera)]
+            for image in [render_gaussians(given.cloud, mask.camera)]
         ]
         fit = fit_plane(views)
         points = np.concatenate(
@@ -69,15 +71,14 @@ def planes_of_scene(given: SceneInput, *, plane_mask: str | None, view: str | No
                 for held in [one.mask & (one.depth > 0.0)]
             ]
         )
-        plane, centre = fit.plane, np.median(points, axis=0)
+        first, centre = known_of_fit(fit), np.median(points, axis=0)
         size = 2.0 * float(np.median(np.linalg.norm(points - centre, axis=1)))
         notes = ()
-        facts = {"noise": fit.noise, "inlier_share": fit.inlier_share, "pixels": fit.pixel_count}
-    others = further_planes(given.cloud, plane, size, count - 1) if count > 1 else []
-    planes = [plane, *(one.plane for one in others)]
-    if len(planes) < count:
-        notes = (*notes, f"{len(planes)} of {count} planes found")
-    return ScenePlanes(planes, [facts, *({"support": one.support} for one in others)], centre, size, notes)
+    others = further_planes(given.cloud, first.plane, size, count - 1) if count > 1 else []
+    known = [first, *(KnownPlane(one.plane, support=one.support) for one in others)]
+    if len(known) < count:
+        notes = (*notes, f"{len(known)} of {count} planes found")
+    return ScenePlanes(known, centre, size, notes)
 
 
 def write_ring(folder: Path, cloud: GaussianCloud, plane: Plane, centre: np.ndarray, size: float) -> None:
@@ -86,5 +87,5 @@ def write_ring(folder: Path, cloud: GaussianCloud, plane: Plane, centre: np.ndar
     names = [f"ring{number:02d}.png" for number in range(len(cameras))]
     images = writable_folder(folder / "images")
     for name, camera in zip(names, cameras, strict=True):
-        write_png(images / name, render(cloud, camera).colour_srgb8())
+        write_png(images / name, render_gaussians(cloud, camera).colour_srgb8())
     write_cameras(folder / "cameras.json", cameras, names)

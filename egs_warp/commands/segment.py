@@ -40,12 +40,9 @@ def clearing_of(chosen: argparse.Namespace) -> Clearing | None:
 
 
 def _segment(chosen: argparse.Namespace) -> int:
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_WARNING
     from egs_warp.errors import UserError
     from egs_warp.io.atomic import writable_folder
-    from egs_warp.io.planes import read_planes_and_facts
+    from egs_warp.io.planes import read_planes
     from egs_warp.io.video import write_png
     from egs_warp.pipelines.pictures import picture_cameras, segmentation_picture
     from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene
@@ -54,7 +51,7 @@ def _segment(chosen: argparse.Namespace) -> int:
     if not chosen.object:
         raise UserError("segment: give --object: a mask, a point, a box or a pixel")
     given = read_scene(chosen)
-    known = read_planes_and_facts(chosen.plane) if chosen.plane and Path(chosen.plane).is_file() else []
+    known = read_planes(chosen.plane) if chosen.plane and Path(chosen.plane).is_file() else []
     folder = writable_folder(chosen.out)
     scene = prepare_scene(
         given.cloud,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from egs_warp.commands.flags import Commands, check_device
+from egs_warp.commands.flags import Commands
 from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
@@ -55,8 +55,10 @@ def _train(chosen: argparse.Namespace) -> int:
     write = _writer(chosen.out)
     import warp as wp
 
+    from egs_warp.launching import use_device
+
+    use_device(chosen.device)
     wp.config.log_level = wp.LOG_ERROR
-    check_device(chosen.device)
     try:
         from egs_warp.pipelines.train_capture import train
     except ImportError as error:
@@ -188,7 +190,7 @@ def _report(chosen: argparse.Namespace, result: TrainResult, progress: _Progress
 def _write_sheet(path: Path, result: TrainResult) -> None:
     """Photo beside render, of photos held out where there are any."""
     from egs_warp.io.video import contact_sheet, write_png
-    from egs_warp.render import render
+    from egs_warp.render import render_gaussians
 
     pairs = list(zip(result.views, result.scores, strict=True))
     judged = [pair for pair in pairs if pair[1].held_out] or pairs
@@ -200,7 +202,7 @@ def _write_sheet(path: Path, result: TrainResult) -> None:
             (f"photo {score.name}", np.rint(view.image * 255).astype(np.uint8)),
             (
                 f"{score.psnr:.1f} dB, SSIM {score.ssim:.3f}",
-                render(result.cloud, view.camera, background=result.background).colour_srgb8(),
+                render_gaussians(result.cloud, view.camera, background=result.background).colour_srgb8(),
             ),
         ):
             frame = np.full((*size, 3), 255, dtype=np.uint8)

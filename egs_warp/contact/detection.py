@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from egs_warp.contact.terrain import Solid
 from egs_warp.deformation.embedding import embed_points
-from egs_warp.errors import UserError
+from egs_warp.errors import ArgumentError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
@@ -114,9 +114,10 @@ def contact_geometry(
     for number, solid in enumerate(solids, start=1):
         above &= np.any([face.heights(means) >= 0.0 for face in solid.faces], axis=0)
         if np.count_nonzero(above) < least:
-            raise UserError(
-                f"--terrain, solid {number}: the body is inside it; inside is where n.x + d < 0 for every face"
-                " [nx, ny, nz, d]: turn the signs of a face, or move the solid"
+            raise ArgumentError(
+                "solids",
+                f"the body is inside number {number}; inside is where n.x + d < 0 for every face [nx, ny, nz, d]:"
+                " turn the signs of a face, or move the solid",
             )
     opacities = cloud.opacities()
     points = [means[above]]

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse as sparse
 import scipy.sparse.linalg as sparse_linalg
 
-from egs_warp.errors import UserError
+from egs_warp.errors import ArgumentError
 from egs_warp.fem.elasticity import ElasticAssembly, Material
 from egs_warp.geometry.frames import best_turn
 from egs_warp.geometry.plane import Plane
@@ -121,9 +121,10 @@ def make_body(
     heights = plane.heights(mesh.nodes)
     height = float(heights.max() - heights.min())
     if not SMALLEST_HEIGHT <= height <= LARGEST_HEIGHT:
-        raise UserError(
-            f"--metres-per-unit: the body is {height:.3g} m high; choose it so that this is from {SMALLEST_HEIGHT:g}"
-            f" to {LARGEST_HEIGHT:g} m"
+        raise ArgumentError(
+            "metres_per_unit",
+            f"the body is {height:.3g} m high; choose it so that this is from {SMALLEST_HEIGHT:g} to"
+            f" {LARGEST_HEIGHT:g} m",
         )
     young = density * GRAVITY * height / sag
     node_mass = mesh.lumped_masses(density)

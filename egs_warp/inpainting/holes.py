@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -16,6 +15,7 @@ from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.rectified import PlaneWindow, rectify
+from egs_warp.io.planes import HoleOutline
 from egs_warp.segmentation.connectivity import enclosed
 from egs_warp.segmentation.object_mask import CELLS, Segmentation
 from egs_warp.segmentation.votes import MaskedView, check_size
@@ -63,30 +63,24 @@ class Hole:
         side = max(np.ptp(rows), np.ptp(columns)) + 1
         return self.window.points(middle)[0], float(side) * self.window.texel
 
-    def facts(self) -> dict[str, Any]:
-        """What ``plane.json`` says of it: its outlines, in columns and rows of the window,
-        whose middle is ``centre``.
-        """
+    def outline(self) -> HoleOutline:
+        """What ``plane.json`` says of it."""
         outlines, _ = cv2.findContours(self.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-        return {
-            "centre": self.window.centre.tolist(),
-            "texel": self.window.texel,
-            "texels": list(self.mask.shape),
-            "outlines": [outline[:, 0].tolist() for outline in outlines],
-        }
+        rows, columns = self.mask.shape
+        corners = tuple(outline[:, 0] for outline in outlines)
+        return HoleOutline(self.window.centre, self.window.texel, (rows, columns), corners)
 
     @classmethod
-    def from_facts(cls, plane: Plane, facts: dict[str, Any]) -> Hole:
-        """The hole in ``plane`` that ``facts`` tells of. Raises ``UserError`` where something is amiss in them."""
+    def of_outline(cls, plane: Plane, outline: HoleOutline) -> Hole:
+        """The hole in ``plane`` that ``outline`` tells of. Raises ``UserError`` for one that cannot be drawn."""
+        rows, columns = outline.texels
         try:
-            rows, columns = (int(count) for count in facts["texels"])
-            centre = np.array(facts["centre"], dtype=float).reshape(3)
             mask = np.zeros((rows, columns), np.uint8)
-            for outline in facts["outlines"]:
-                cv2.fillPoly(mask, [np.array(outline, np.int32).reshape(-1, 2)], (1,))
-            return cls(PlaneWindow(plane, centre, float(facts["texel"]), rows, columns), mask > 0)
-        except (TypeError, KeyError, ValueError, cv2.error) as error:
+            for corners in outline.outlines:
+                cv2.fillPoly(mask, [corners], (1,))
+        except (ValueError, cv2.error) as error:
             raise UserError("plane.json: its hole is damaged; make it again with egs-warp segment") from error
+        return cls(PlaneWindow(plane, outline.centre, outline.texel, rows, columns), mask > 0)
 
     def drawn_on(self, window: PlaneWindow) -> np.ndarray:
         """(rows, columns) bool: the hole on another window of the same plane."""

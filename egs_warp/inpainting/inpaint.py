@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 from scipy import ndimage
 
-from egs_warp.errors import UserError
+from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.bitmaps import connected_parts, depth_inside, distance_to
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud, joined
 from egs_warp.inpainting.holes import Hole
@@ -72,9 +72,9 @@ class InpaintOptions:
 
     def __post_init__(self) -> None:
         if self.steps < 0:
-            raise UserError(f"--steps {self.steps}: give a whole number of at least 0")
+            raise ArgumentError("steps", "give a whole number of at least 0", value=self.steps)
         if not 0.0 <= self.margin <= 1.0:
-            raise UserError(f"--margin {self.margin}: give a number from 0 to 1, of the hole's side")
+            raise ArgumentError("margin", "give a number from 0 to 1, of the hole's side", value=self.margin)
 
 
 @dataclass(frozen=True)
@@ -235,7 +235,8 @@ def _trained(
     try:
         from egs_warp.training.finetune import FinetuneOptions, GaussianTensors, Rates, TrainingView, finetune
     except ImportError as error:
-        raise UserError("inpaint: training needs PyTorch; install egs-warp[torch] or give --steps 0") from error
+        advice = "training needs PyTorch; install egs-warp[torch] or give 0"
+        raise ArgumentError("steps", advice, value=options.steps) from error
 
     crop, box = _crop(window, hole)
     nearby = near_plane(kept, window.plane, thickness) & (

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from egs_warp.errors import UserError
+from egs_warp.errors import ArgumentError, UserError
 from egs_warp.inpainting.patch_synthesis import PatchSynthesis
 
 _PAD = 8
@@ -120,7 +120,7 @@ def inpainter_by_name(name: str, *, seed: int = 0, device: str = "cpu") -> Inpai
         # A wrong file is told now, not after the minutes that come before the filling.
         network._load()
         return network
-    raise UserError(f"--inpainter {name}: give patch, telea, ns or a TorchScript file (.pt)")
+    raise ArgumentError("inpainter", "give patch, telea, ns or a TorchScript file (.pt)", value=name)
 
 
 def _pasted(image: np.ndarray, hole: np.ndarray, filled: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 from egs_warp.geometry.camera import Camera
 from egs_warp.inpainting.inpaint import InpaintResult
 from egs_warp.io.video import contact_sheet
-from egs_warp.render import render
+from egs_warp.render import render_gaussians
 
 _DISTANCE = 3.2
 """Of the cameras from the hole, in sides of the hole."""
@@ -20,7 +20,7 @@ def before_and_after(result: InpaintResult, *, size: int = 384) -> np.ndarray:
     kept = result.cloud.subset(~result.is_new)
     tiles, labels = [], []
     for number, camera in enumerate(_cameras(result, size)):
-        before, after = render(kept, camera), render(result.cloud, camera)
+        before, after = render_gaussians(kept, camera), render_gaussians(result.cloud, camera)
         tiles += [before.colour_srgb8(), after.colour_srgb8(), depth_colours(after.depth.numpy())]
         labels += [f"before {number + 1}", f"after {number + 1}", f"depth {number + 1}"]
         face_on = result.before.colour if number == 0 else result.painted

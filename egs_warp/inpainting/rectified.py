@@ -12,7 +12,7 @@ from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.kernels.inpainting.rectified import mean_colour_kernel
 from egs_warp.launching import empty
-from egs_warp.render import render
+from egs_warp.render import render_gaussians
 from egs_warp.segmentation.plane_search import near_plane
 
 _SEEN_FROM = 40.0
@@ -133,7 +133,7 @@ def rectify(cloud: GaussianCloud, window: PlaneWindow, *, thickness: float) -> R
     if not chosen.any():
         nothing = np.zeros(shape, np.float32)
         return RectifiedImage(np.zeros((*shape, 3), np.float32), nothing, nothing)
-    image = render(matte(cloud.subset(chosen), window.plane), window.camera(), background=(0.0, 0.0, 0.0))
+    image = render_gaussians(matte(cloud.subset(chosen), window.plane), window.camera(), background=(0.0, 0.0, 0.0))
     alpha = image.alpha.numpy()
     seen = alpha > 1e-3
     colour = np.where(seen[..., None], image.colour.numpy() / np.maximum(alpha, 1e-3)[..., None], 0.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -15,28 +16,117 @@ from egs_warp.io.atomic import atomic_write
 from egs_warp.io.text import whole_number
 
 
-def write_planes(path: Path | str, planes: Sequence[Plane], *, facts: Sequence[Mapping[str, object]] = ()) -> None:
-    """Write ``planes`` (capture's units), the first being the one that the object rests on.
+@dataclass(frozen=True)
+class HoleOutline:
+    """A hole in a plane: its outlines, in columns and rows of a window on the plane."""
 
-    ``facts`` are further entries of each, such as how well it fits.
-    """
-    entries = [
-        {"normal": plane.normal.tolist(), "offset": plane.offset, **(facts[k] if k < len(facts) else {})}
-        for k, plane in enumerate(planes)
-    ]
+    centre: np.ndarray
+    """(3,) middle of the window, scene units."""
+    texel: float
+    """Scene units."""
+    texels: tuple[int, int]
+    """Rows and columns of the window."""
+    outlines: tuple[np.ndarray, ...]
+    """Each (k, 2) int."""
+
+    def to_json(self) -> dict[str, Any]:
+        """The entry ``hole`` of a plane."""
+        return {
+            "centre": self.centre.tolist(),
+            "texel": self.texel,
+            "texels": list(self.texels),
+            "outlines": [outline.tolist() for outline in self.outlines],
+        }
+
+    @classmethod
+    def from_json(cls, entry: Any, path: Path) -> HoleOutline:
+        """What ``to_json`` gave. Raises ``UserError`` where something is amiss."""
+        try:
+            rows, columns = (int(count) for count in entry["texels"])
+            outlines = tuple(np.array(outline, np.int32).reshape(-1, 2) for outline in entry["outlines"])
+            centre = np.array(entry["centre"], dtype=float).reshape(3)
+            return cls(centre, float(entry["texel"]), (rows, columns), outlines)
+        except (TypeError, KeyError, ValueError, OverflowError) as error:
+            raise UserError(f"{path}: its hole is damaged; make it again with egs-warp segment") from error
+
+
+@dataclass(frozen=True)
+class KnownPlane:
+    """A plane and what was found out about it, as far as it is known; scene units."""
+
+    plane: Plane
+    centre: np.ndarray | None = None
+    """(3,) middle of the object that stands on it."""
+    size: float | None = None
+    """Of that object: diagonal of its bounding box."""
+    noise: float | None = None
+    """Of the depth that the plane was fitted to, relative."""
+    inlier_share: float | None = None
+    pixels: int | None = None
+    """That it was fitted to."""
+    support: float | None = None
+    """Share of the visible surface that lies on it."""
+    hole: HoleOutline | None = None
+    """Where the object has left it open."""
+    others: Mapping[str, Any] = field(default_factory=dict)
+    """Further entries of the file, which go along as they are."""
+
+    def over(self, known: KnownPlane) -> KnownPlane:
+        """This plane; what is not found out about it is as ``known`` before."""
+        facts = {name: value for name in _FACTS if (value := getattr(self, name)) is not None}
+        earlier = {name: getattr(known, name) for name in _FACTS}
+        return KnownPlane(self.plane, **(earlier | facts), others={**known.others, **self.others})
+
+    def to_json(self) -> dict[str, Any]:
+        """An entry of ``planes``."""
+        facts = {name: value for name in _FACTS if (value := getattr(self, name)) is not None}
+        if self.centre is not None:
+            facts["centre"] = self.centre.tolist()
+        if self.hole is not None:
+            facts["hole"] = self.hole.to_json()
+        return {"normal": self.plane.normal.tolist(), "offset": self.plane.offset, **facts, **self.others}
+
+    @classmethod
+    def from_json(cls, entry: Any, path: Path, number: int) -> KnownPlane:
+        """What ``to_json`` gave. Raises ``UserError`` where something is amiss."""
+        try:
+            normal = np.array(entry["normal"], dtype=float).reshape(3)
+            offset = float(entry["offset"])
+        except (TypeError, KeyError, ValueError) as error:
+            raise UserError(f"{path}: plane {number} needs normal [x, y, z] and offset; make it again") from error
+        nx, ny, nz = normal.tolist()
+        plane = Plane.from_coefficients(nx, ny, nz, offset)
+        try:
+            return cls(
+                plane,
+                centre=np.array(entry["centre"], dtype=float).reshape(3) if "centre" in entry else None,
+                **{name: float(entry[name]) for name in _NUMBERS if name in entry},
+                pixels=int(entry["pixels"]) if "pixels" in entry else None,
+                hole=HoleOutline.from_json(entry["hole"], path) if "hole" in entry else None,
+                others={name: value for name, value in entry.items() if name not in ("normal", "offset", *_FACTS)},
+            )
+        except (TypeError, ValueError, OverflowError) as error:
+            if isinstance(error, UserError):
+                raise
+            raise UserError(f"{path}: the facts of plane {number} are damaged; make it again") from error
+
+
+_NUMBERS = ("size", "noise", "inlier_share", "support")
+_FACTS = tuple(one.name for one in fields(KnownPlane) if one.name not in ("plane", "others"))
+
+
+def write_planes(path: Path | str, planes: Sequence[KnownPlane]) -> None:
+    """Write ``planes`` (capture's units), the first being the one that the object rests on."""
+    entries = [known.to_json() for known in planes]
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps({"planes": entries}, indent=1))
 
 
-def read_planes(path: Path | str) -> list[Plane]:
+def read_planes(path: Path | str) -> list[KnownPlane]:
     """The planes of a ``plane.json``. Raises ``UserError`` for anything else."""
-    return [plane for plane, _ in read_planes_and_facts(path)]
-
-
-def read_planes_and_facts(path: Path | str) -> list[tuple[Plane, dict[str, Any]]]:
-    """The planes of a ``plane.json``, each with its further entries. Raises ``UserError`` for anything else."""
+    path = Path(path)
     try:
-        tree = json.loads(Path(path).read_bytes(), parse_int=whole_number)
+        tree = json.loads(path.read_bytes(), parse_int=whole_number)
     except FileNotFoundError as error:
         raise UserError(f"{path}: no such file; make it with egs-warp plane, or give nx,ny,nz,d") from error
     except (OSError, ValueError, RecursionError) as error:
@@ -44,14 +134,4 @@ def read_planes_and_facts(path: Path | str) -> list[tuple[Plane, dict[str, Any]]
     entries = tree.get("planes") if isinstance(tree, dict) else None
     if not isinstance(entries, list) or not entries:
         raise UserError(f"{path}: it has no planes; make it with egs-warp plane")
-    read = []
-    for number, entry in enumerate(entries):
-        try:
-            normal = np.array(entry["normal"], dtype=float).reshape(3)
-            offset = float(entry["offset"])
-        except (TypeError, KeyError, ValueError) as error:
-            raise UserError(f"{path}: plane {number} needs normal [x, y, z] and offset; make it again") from error
-        facts = {name: value for name, value in entry.items() if name not in ("normal", "offset")}
-        nx, ny, nz = normal.tolist()
-        read.append((Plane.from_coefficients(nx, ny, nz, offset), facts))
-    return read
+    return [KnownPlane.from_json(entry, path, number) for number, entry in enumerate(entries)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 from dataclasses import dataclass, replace
+from enum import Enum
 from itertools import count as counter
 
 import numpy as np
@@ -13,36 +14,51 @@ from egs_warp.locomotion.program import ContactProgram
 from egs_warp.locomotion.solvers import QpSolution, QpSolver, quadratic_program
 
 
+class _Decided(Enum):
+    """How much is decided about a contact."""
+
+    NOTHING = "nothing"
+    SEPARATE = "separate"
+    STATIC = "static"
+    ARC = "arc"
+    """It slides, along directions still to be told apart."""
+    SLIDE = "slide"
+    """It slides along the given directions."""
+
+
+_LEAVES = (_Decided.SEPARATE, _Decided.STATIC, _Decided.SLIDE)
+
+
 @dataclass(frozen=True)
 class _Branch:
     """What is decided about one contact; a contact that slides does so along directions ``first`` to ``last`` of the
     ring.
     """
 
-    kind: str = "open"
+    decided: _Decided = _Decided.NOTHING
     first: int = 0
     last: int = 0
 
     def children(self, directions: int) -> list[_Branch]:
         """Branches that together hold every state of this one."""
-        if self.kind == "open":
+        if self.decided is _Decided.NOTHING:
             half = directions // 2
             return [
-                _Branch("separate"),
-                _Branch("static"),
-                _Branch("arc", 0, half),
-                _Branch("arc", half, directions),
+                _Branch(_Decided.SEPARATE),
+                _Branch(_Decided.STATIC),
+                _Branch(_Decided.ARC, 0, half),
+                _Branch(_Decided.ARC, half, directions),
             ]
-        if self.kind == "arc" and self.last - self.first > 1:
+        if self.decided is _Decided.ARC and self.last - self.first > 1:
             # Friction lies on one edge of the pyramid or on a face between two, so the halves share only the middle
             # edge.
             middle = (self.first + self.last) // 2
             return [replace(self, last=middle), replace(self, first=middle)]
-        if self.kind == "arc":
+        if self.decided is _Decided.ARC:
             return [
-                _Branch("slide", self.first, self.first),
-                _Branch("slide", self.last, self.last),
-                _Branch("slide", self.first, self.last),
+                _Branch(_Decided.SLIDE, self.first, self.first),
+                _Branch(_Decided.SLIDE, self.last, self.last),
+                _Branch(_Decided.SLIDE, self.first, self.last),
             ]
         return []
 
@@ -140,14 +156,14 @@ def _bounds(program: ContactProgram, branches: tuple[_Branch, ...]) -> tuple[np.
     friction = upper[layout.tangent].reshape(n, nd)
     slip = upper[layout.paired(layout.tangent)].reshape(n, nd)
     for i, branch in enumerate(branches):
-        if branch.kind == "open":
+        if branch.decided is _Decided.NOTHING:
             continue
-        if branch.kind == "separate":
+        if branch.decided is _Decided.SEPARATE:
             upper[layout.normal][i] = 0.0
             friction[i] = 0.0
             continue
         upper[layout.paired(layout.normal)][i] = 0.0
-        if branch.kind == "static":
+        if branch.decided is _Decided.STATIC:
             upper[layout.slip][i] = 0.0
             slip[i] = 0.0
             continue
@@ -155,7 +171,7 @@ def _bounds(program: ContactProgram, branches: tuple[_Branch, ...]) -> tuple[np.
         allowed = np.arange(branch.first, branch.last + 1) % nd
         friction[i] = 0.0
         friction[i, allowed] = np.inf
-        if branch.kind == "slide":
+        if branch.decided is _Decided.SLIDE:
             slip[i, allowed] = 0.0
     return lower, upper
 
@@ -167,6 +183,6 @@ def _most_violated(program: ContactProgram, branches: tuple[_Branch, ...], y: np
     gaps = np.minimum(x, w)
     worst = np.maximum(gaps[:n], gaps[n + n * nd :])
     worst = np.maximum(worst, gaps[n : n + n * nd].reshape(n, nd).max(axis=1))
-    worst[[branch.kind in ("separate", "static", "slide") for branch in branches]] = 0.0
+    worst[[branch.decided in _LEAVES for branch in branches]] = 0.0
     pick = int(np.argmax(worst))
     return pick if worst[pick] > 1e-7 else None

@@ -160,7 +160,8 @@ def _refuse_flat(solid: LatticeSolid) -> None:
     if thickest < 2.0 or size.min() < 4:
         raise UserError(
             "object: it is flat (no part is thicker than 1/20 of its longest side), so it has no volume to move; "
-            "choose another object, or check --plane and --up"
+            "choose another object",
+            check=("plane", "up"),
         )
 
 

@@ -124,7 +124,8 @@ def _one_look(
     if not occupied.any():
         raise UserError(
             f"object: nothing opaque stands on the plane (of {cloud.count} Gaussians, {int(np.sum(means[:, 2] > 0))} "
-            f"are above it, most opaque {opacities.max():.2g}); check --plane and --up"
+            f"are above it, most opaque {opacities.max():.2g})",
+            check=("plane", "up"),
         )
     node = np.rint(means / spacing).astype(int) - corner
     in_lattice = np.all((node >= 0) & (node < counts), axis=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -23,20 +24,37 @@ from egs_warp.locomotion.objectives import (
     part_velocity,
 )
 from egs_warp.locomotion.stepper import StepReport
+from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.feet import find_feet
 from egs_warp.motions.keyframes import Channel, Key, Quantity, channels
-from egs_warp.motions.leap import CALM
 from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import PoseFamily, Weights
+from egs_warp.motions.stance import Calm, PoseFamily, Weights
 
 MISSED = 0.1
 """Of the largest value of its channel: a key missed by more is noted."""
 AHEAD = np.radians(15.0)
 """A foot that is less than this to the right of straight ahead counts as straight ahead."""
-CALM_TIME = 0.3
-"""Of sqrt(H / g): for how long the body is slow, after the last key, before it is at rest; as after a jump."""
 LONGEST_HOLD = 9.0
-"""Of sqrt(H / g): at most for how long that is waited for."""
+"""Of sqrt(H / g): at most for how long, after the last key, the body is waited for to be calm."""
+
+
+@dataclass(frozen=True)
+class FollowPlan:
+    """Key frames asked for, and how they are kept so far."""
+
+    keys: float
+    duration: float
+    """Seconds."""
+    worst_miss: float
+    """In the unit of its quantity."""
+
+
+@dataclass(frozen=True)
+class FollowReached:
+    """How near a trajectory came to its key frames."""
+
+    worst_miss: float
+    """In the unit of its quantity."""
 
 
 class FollowPhase(Enum):
@@ -67,17 +85,24 @@ class Follow:
         self._rate = 6.0 * float(np.sqrt(self._gravity / self.body.height))
         self._began: float | None = None
         self._end = max(key.time for key in self.keys)
-        self._calm_since: float | None = None
+        self._calm = Calm(self.body)
         self._restless = False
         self._reached: dict[int, np.ndarray] = {}
         self._turned = {name: np.zeros(3) for name in self.parts}
 
-    def planned(self) -> dict[str, float]:
-        """How many keys there are, how long they take (seconds), and the worst miss so far,
-        in the unit of its quantity.
-        """
+    @property
+    def resting(self) -> bool:
+        """Whether the body is calm after the last key, or was waited for long enough."""
+        return self.phase is FollowPhase.REST
+
+    def planned(self) -> FollowPlan:
+        """How many keys there are, how long they take, and the worst miss so far."""
         misses = [float(np.linalg.norm(self._miss(index))) for index in self._reached]
-        return {"keys": float(len(self.keys)), "duration": self._end, "worst_miss": max(misses, default=0.0)}
+        return FollowPlan(float(len(self.keys)), self._end, max(misses, default=0.0))
+
+    def reached(self, trajectory: Trajectory, first: int, last: int) -> FollowReached:
+        """The worst miss of all keys."""
+        return FollowReached(self.planned().worst_miss)
 
     def notes(self) -> list[str]:
         """Which keys were missed, and whether the body never came to rest."""
@@ -123,13 +148,8 @@ class Follow:
             self.phase = FollowPhase.HOLD
         if self.phase is not FollowPhase.HOLD:
             return
-        time_unit, speed = np.sqrt(self.body.height / self._gravity), self.body.centre_of_mass(state.velocities)
-        if np.linalg.norm(speed) > CALM * np.sqrt(self._gravity * self.body.height):
-            self._calm_since = None
-        elif self._calm_since is None:
-            self._calm_since = elapsed
-        calm = self._calm_since is not None and elapsed - self._calm_since > CALM_TIME * time_unit
-        late = elapsed - self._end > LONGEST_HOLD * time_unit
+        calm = self._calm.held(self.body.centre_of_mass(state.velocities), elapsed)
+        late = elapsed - self._end > LONGEST_HOLD * np.sqrt(self.body.height / self._gravity)
         if calm or late:
             self.phase, self._restless = FollowPhase.REST, not calm
 

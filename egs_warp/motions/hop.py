@@ -2,45 +2,75 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
 import numpy as np
 
-from egs_warp.motions.jump import JumpTarget
-from egs_warp.motions.leap import Leap
+from egs_warp.fem.body import BodyState
+from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.stepper import StepReport
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.jump import Jump
+from egs_warp.motions.jump_plan import JumpPlan, JumpTarget
 from egs_warp.motions.sequence import Part, Place
-from egs_warp.motions.stance import Weights, sole_shares
+from egs_warp.motions.stance import sole_shares
 
 
-class Hop(Leap):
+@dataclass(frozen=True)
+class HopReached:
+    """How near a hop came to its square."""
+
+    square_miss: float
+    """From the middle of the feet to that of the square at the end, in lengths of the jump."""
+
+
+class Hop:
     """A jump whose feet aim at a point of the ground."""
 
-    def __init__(self, place: Place, square: np.ndarray, height: float, *, weights: Weights | None = None) -> None:
-        """``square`` (3,): where the middle of the feet shall land;
-        ``height``: rise of the centre of mass, both metres.
-        """
-        feet = sole_shares(place.body, place.ground, place.standing) @ place.standing
-        way = square - feet
+    def __init__(self, place: Place, square: np.ndarray, height: float) -> None:
+        """``square`` (3,): where the middle of the feet shall land; ``height``: rise of the centre of mass, both
+        metres."""
+        way = square - sole_shares(place.body, place.ground, place.standing) @ place.standing
         place = place.facing(way)
         forward, _, rise = place.ground.axes @ way
-        super().__init__(
-            place,
-            JumpTarget(float(forward), height + max(float(rise), 0.0), float(rise)),
-            weights=weights,
-        )
+        target = JumpTarget(float(forward), height + max(float(rise), 0.0), float(rise))
+        self.jump, self.square = Jump(place, target), square
         self._feet = sole_shares(place.body, place.ground, place.standing)
-        self.square = square
+
+    @property
+    def resting(self) -> bool:
+        """Whether the jump is at rest."""
+        return self.jump.resting
+
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
+        """Those of the jump."""
+        return self.jump.objectives(state, report, dt)
+
+    def planned(self) -> JumpPlan:
+        """What the jump aims at."""
+        return self.jump.plan
+
+    def reached(self, trajectory: Trajectory, first: int, last: int) -> HopReached:
+        """How near the feet came to the square."""
+        return HopReached(self.miss(trajectory.positions[last]) / self.jump.target.distance)
+
+    def notes(self) -> list[str]:
+        """What kept the jump from its target, for the user."""
+        return self.jump.notes()
 
     def miss(self, positions: np.ndarray) -> float:
         """Metres from the middle of the feet to the middle of the square, along the ground."""
         off = self._feet @ positions - self.square
-        return float(np.linalg.norm(off - (off @ self.ground.axes[2]) * self.ground.axes[2]))
+        up = self.jump.ground.axes[2]
+        return float(np.linalg.norm(off - (off @ up) * up))
 
 
 class Squares:
-    """A row of squares ahead of a place; made when the first hop begins,
-    so that later ones do not add up their errors.
-    """
+    """A row of squares ahead of a place; made when the first hop begins, so that later ones do not add up their
+    errors."""
 
-    def __init__(self, distance: float, height: float, count: int, asked: dict[str, float]) -> None:
+    def __init__(self, distance: float, height: float, count: int, asked: Mapping[str, float]) -> None:
         """``distance`` from square to square and ``height`` of each jump in metres; ``asked`` is what a report says."""
         self.distance, self.height, self.count, self.asked = distance, height, count, asked
         self._first: np.ndarray | None = None

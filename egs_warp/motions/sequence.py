@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from enum import Enum
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -13,7 +12,11 @@ from egs_warp.contact.terrain import Solid, surface_above
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.locomotion.objectives import Objective, SpinObjective
 from egs_warp.locomotion.stepper import StepReport
+from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.stance import Ground, heading_between, sole_shares
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 
 @dataclass(frozen=True)
@@ -62,19 +65,23 @@ class Place:
 
 
 class BodyMotion(Protocol):
-    """A state machine that ends in a phase whose value is "rest"."""
+    """A state machine that ends at rest."""
 
     @property
-    def phase(self) -> Enum:
-        """Where it is."""
+    def resting(self) -> bool:
+        """Whether it has come to its end."""
         ...
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[Objective | SpinObjective]:
         """Objectives of the step of ``dt`` seconds that starts at ``state``; ``report`` is of the step before."""
         ...
 
-    def planned(self) -> dict[str, float]:
+    def planned(self) -> DataclassInstance:
         """What it aims at."""
+        ...
+
+    def reached(self, trajectory: Trajectory, first: int, last: int) -> DataclassInstance | None:
+        """What it did beside what is measured of all motions; ``first`` and ``last`` are indices into ``time``."""
         ...
 
     def notes(self) -> list[str]:
@@ -87,7 +94,7 @@ class Done:
     """A motion of a sequence and when it began."""
 
     name: str
-    asked: dict[str, float]
+    asked: Mapping[str, float]
     motion: BodyMotion
     start_time: float
 
@@ -97,7 +104,7 @@ class Part:
     """A motion to come."""
 
     name: str
-    asked: dict[str, float]
+    asked: Mapping[str, float]
     begin: Callable[[Place], BodyMotion]
 
 
@@ -118,7 +125,7 @@ class MotionSequence:
 
     @property
     def _resting(self) -> bool:
-        return bool(self.done) and self.done[-1].motion.phase.value == "rest"
+        return bool(self.done) and self.done[-1].motion.resting
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[Objective | SpinObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``, from the motion whose turn it is."""
@@ -132,7 +139,7 @@ class MotionSequence:
         """What the last frame kept from its end, for the user."""
         notes = []
         if self.done and not self._resting:
-            notes.append(f"{self.done[-1].name} was cut off before it came to rest; give more --frames")
+            notes.append(f"{self.done[-1].name} was cut off before it came to rest; give more frames")
         if self._parts:
             names = ", ".join(part.name for part in self._parts)
             notes.append(f"{len(self._parts)} of {self._count} motions did not begin: {names}")

@@ -13,6 +13,13 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.objectives import Objective, SpinObjective, centre_of_mass_velocity, node_velocities
 from egs_warp.locomotion.stepper import StepReport
 
+SOLE = 0.06
+"""Body heights: what is at most this far above a standing body's lowest node is its sole."""
+CALM = 0.03
+"""Speed of the centre of mass, in sqrt(g H), below which a standing body is calm."""
+CALM_TIME = 0.3
+"""Of sqrt(H / g): for how long a body is calm before it is at rest."""
+
 
 @dataclass(frozen=True)
 class Weights:
@@ -77,6 +84,24 @@ class Ground:
     def world(self, points: np.ndarray) -> np.ndarray:
         """Ground coordinates (..., 3) to world points."""
         return self.origin + points @ self.axes
+
+
+class Calm:
+    """Whether the centre of mass has been slow for long enough."""
+
+    def __init__(self, body: SoftBody) -> None:
+        gravity = float(np.linalg.norm(body.gravity))
+        self._speed = CALM * np.sqrt(gravity * body.height)
+        self._time = CALM_TIME * float(np.sqrt(body.height / gravity))
+        self._since: float | None = None
+
+    def held(self, velocity: np.ndarray, time: float) -> bool:
+        """To be asked in every step, with the ``velocity`` (3,) of the centre of mass, m/s, and the ``time``, s."""
+        if np.linalg.norm(velocity) > self._speed:
+            self._since = None
+        elif self._since is None:
+            self._since = time
+        return self._since is not None and time - self._since > self._time
 
 
 class PoseFamily:
@@ -201,7 +226,7 @@ def sole_shares(body: SoftBody, ground: Ground, standing: np.ndarray) -> np.ndar
     the mass of the nodes that are near the ground at rest.
     """
     heights = standing @ ground.surface_normal
-    mass = body.node_mass * (heights < heights.min() + 0.06 * body.height)
+    mass = body.node_mass * (heights < heights.min() + SOLE * body.height)
     return mass / mass.sum()
 
 

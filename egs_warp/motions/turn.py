@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, dataclass
+
 import numpy as np
 
 from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import Objective, SpinObjective
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.motions.jump import JumpPhase, JumpTarget
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.jump import Jump
+from egs_warp.motions.jump_plan import JumpPlan, JumpTarget
 from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import Ground, PoseFamily
-from egs_warp.motions.twist import AIRBORNE_SHARE, Twist
+from egs_warp.motions.twist import AIRBORNE_SHARE, twist
 
 TOLERANCE = np.radians(8.0)
 """A body that has landed this near to its angle stays."""
@@ -21,6 +24,13 @@ RESERVE = 0.8
 """Part of what friction could do at most that one jump is asked for."""
 
 
+@dataclass(frozen=True)
+class TurnPlan(JumpPlan):
+    """The plan of the first jump of a turn, and how many there were."""
+
+    jumps: float
+
+
 class Turn:
     """Twists by ``turn`` radians in all that end ``target.distance`` ahead; what one leaves, the next ones make up."""
 
@@ -28,29 +38,22 @@ class Turn:
         self._place, self._height = place, target.height
         self._goal = place.ground.origin + target.distance * place.ground.axes[0]
         self._left = turn
-        first = Twist(place, target, turn)
+        first = twist(place, target, turn)
         self.most_in_a_jump = RESERVE * largest_turn(first, place)
         self._one_jump = abs(turn) <= self.most_in_a_jump
-        self.jumps = [first if self._one_jump else Twist(place, target, self._share())]
+        self.jumps = [first if self._one_jump else twist(place, target, self._share())]
 
     @property
-    def phase(self) -> JumpPhase:
-        """That of the present jump."""
-        return self.jumps[-1].phase
+    def resting(self) -> bool:
+        """Whether the present jump is at rest."""
+        return self.jumps[-1].resting
 
-    @property
-    def pose(self) -> PoseFamily:
-        """The family of poses of the present jump."""
-        return self.jumps[-1].pose
-
-    @property
-    def ground(self) -> Ground:
-        """The frame of the present jump."""
-        return self.jumps[-1].ground
-
-    def planned(self) -> dict[str, float]:
+    def planned(self) -> TurnPlan:
         """What the first jump aims at, and how many there were."""
-        return {**self.jumps[0].planned(), "jumps": float(len(self.jumps))}
+        return TurnPlan(**asdict(self.jumps[0].plan), jumps=float(len(self.jumps)))
+
+    def reached(self, trajectory: Trajectory, first: int, last: int) -> None:
+        """Nothing beside what is measured of all motions."""
 
     def notes(self) -> list[str]:
         """What kept the turn from its target, for the user."""
@@ -64,9 +67,10 @@ class Turn:
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
         result = self.jumps[-1].objectives(state, report, dt)
-        if self.phase is JumpPhase.REST and len(self.jumps) < MOST_JUMPS:
-            jump = self.jumps[-1]
-            left = self._left - jump.turn + jump.left(state)
+        jump = self.jumps[-1]
+        if jump.resting and len(self.jumps) < MOST_JUMPS:
+            # The frame of a landed jump is turned by what was asked of it, so its feet tell what it fell short by.
+            left = self._left - jump.facing.turn - jump.pose.sole_heading(state.positions)
             if abs(left) > TOLERANCE:
                 self._left = left
                 self.jumps.append(self._again(state))
@@ -77,7 +81,7 @@ class Turn:
         """One of the equal jumps that what is left takes, radians."""
         return self._left / float(np.ceil(abs(self._left) / self.most_in_a_jump))
 
-    def _again(self, state: BodyState) -> Twist:
+    def _again(self, state: BodyState) -> Jump:
         place = self._place.now(state.positions)
         way = self._goal - place.ground.origin
         distance = float(np.linalg.norm(place.ground.axes[:2] @ way))
@@ -85,19 +89,19 @@ class Turn:
             place = place.facing(way)
         else:
             distance = 0.0
-        return Twist(place, JumpTarget(distance, self._height), self._share())
+        return twist(place, JumpTarget(distance, self._height), self._share())
 
 
-def largest_turn(twist: Twist, place: Place) -> float:
+def largest_turn(jump: Jump, place: Place) -> float:
     """Radians that friction under the feet could turn the body by in one jump as planned (DESIGN 9).
 
     Its impulse is mu r_eff times that of the normal forces, m (v_z + g t), r_eff the mean distance of the feet from
     their middle.
     """
-    plan, body, up = twist.plan, place.body, place.ground.axes[2]
+    plan, body, up = jump.plan, place.body, place.ground.axes[2]
     arms = (place.touching - place.touching.mean(axis=0)) @ place.ground.axes[:2].T
     # Points are denser at the rim of a sole; over a disc the mean distance is 2/3 of the radius.
     lever = min(float(np.linalg.norm(arms, axis=1).mean()), 2.0 / 3.0 * float(np.linalg.norm(arms, axis=1).max()))
-    impulse = body.mass * (plan.speed_up + twist.gravity * plan.thrust_time)
+    impulse = body.mass * (plan.speed_up + jump.gravity * plan.thrust_time)
     rate = PYRAMID * place.friction * lever * impulse / float(up @ body.inertia(place.standing) @ up)
     return rate * AIRBORNE_SHARE * plan.flight_time

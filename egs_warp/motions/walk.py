@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -43,6 +43,18 @@ class WalkPhase(Enum):
     GATHER = "gather"
     """Back to the pose it stood in."""
     REST = "rest"
+
+
+@dataclass(frozen=True)
+class WalkPlan:
+    """Numbers of a walk; metres, seconds."""
+
+    steps: float
+    step_length: float
+    swing_time: float
+    double_time: float
+    lift: float
+    stride: float
 
 
 @dataclass(frozen=True)
@@ -119,9 +131,17 @@ class Walk:
             WalkPhase.GATHER: Passage(last, velocity, end, still, 3.0 * self._time_unit),
         }
 
-    def planned(self) -> dict[str, float]:
-        """What the walk aims at: metres, seconds."""
-        return {**{name: float(value) for name, value in asdict(self.gait).items()}, "stride": self.gait.stride}
+    @property
+    def resting(self) -> bool:
+        """Whether the body has gathered itself."""
+        return self.phase is WalkPhase.REST
+
+    def planned(self) -> WalkPlan:
+        """What the walk aims at."""
+        gait = self.gait
+        return WalkPlan(
+            float(gait.steps), gait.step_length, gait.swing_time, gait.double_time, gait.lift, stride=gait.stride
+        )
 
     def notes(self) -> list[str]:
         """What kept the walk from its target, for the user."""
@@ -133,7 +153,7 @@ class Walk:
             found.append(f"{self._late} swings took too long: a foot found no ground")
         return found
 
-    def footfalls(self, trajectory: Trajectory, first: int, last: int) -> Footfalls:
+    def reached(self, trajectory: Trajectory, first: int, last: int) -> Footfalls:
         """What the feet did between two states of a trajectory."""
         return footfalls(trajectory, self.feet, stride=self.gait.stride, first=first, last=last)
 

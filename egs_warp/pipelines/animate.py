@@ -9,19 +9,26 @@ import numpy as np
 from tqdm import tqdm
 
 from egs_warp.contact.terrain import Solid
-from egs_warp.errors import UserError
+from egs_warp.errors import ArgumentError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import writable_folder
-from egs_warp.locomotion.rollout import Simulation, simulate
 from egs_warp.locomotion.stepper import LocomotionSettings
 from egs_warp.locomotion.trajectory import audit, measure
-from egs_warp.motions.repertoire import also_reached, check_possible, longest, parts_of
-from egs_warp.motions.script import LARGEST_TARGET, LARGEST_TURN, parse_script
-from egs_warp.motions.sequence import MotionSequence
-from egs_warp.pipelines.creature import Creature, first_place, make_creature
+from egs_warp.motions.request import LARGEST_TARGET, LARGEST_TURN
+from egs_warp.motions.script import motion as script
+from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.film import Film, draw_film
-from egs_warp.pipelines.report import build_report, motion_entry, qp_summary, timing_summary, write_report
+from egs_warp.pipelines.performance import Performance, simulate
+from egs_warp.pipelines.report import (
+    CageFacts,
+    GaussianCounts,
+    MotionReport,
+    MuscleFacts,
+    QpCounts,
+    Report,
+    stage_times,
+)
 
 LARGEST_SIZE = 4096
 LARGEST_FRICTION = 10.0
@@ -51,23 +58,24 @@ class AnimateOptions:
     def __post_init__(self) -> None:
         for name, value in (("distance", self.distance), ("height", self.height)):
             if value is not None and not (0.0 <= value <= LARGEST_TARGET):
-                raise UserError(f"--{name} {value}: give a number of body heights from 0 to {LARGEST_TARGET:g}")
+                raise ArgumentError(name, f"give a number of body heights from 0 to {LARGEST_TARGET:g}", value=value)
         if self.height == 0.0:
-            raise UserError("--height 0: a jump needs a height above 0 body heights")
+            raise ArgumentError("height", "a jump needs a height above 0 body heights", value=0)
         turn = self.heading_degrees
         if turn is not None and not abs(turn) <= LARGEST_TURN:
-            raise UserError(
-                f"--heading-degrees {turn}: give a number of degrees from -{LARGEST_TURN:g} to {LARGEST_TURN:g}"
-            )
+            span = f"from -{LARGEST_TURN:g} to {LARGEST_TURN:g}"
+            raise ArgumentError("heading_degrees", f"give a number of degrees {span}", value=turn)
         if self.frames is not None and self.frames < 1:
-            raise UserError(f"--frames {self.frames}: give a whole number of at least 1")
+            raise ArgumentError("frames", "give a whole number of at least 1", value=self.frames)
         if not 16 <= self.size <= LARGEST_SIZE:
-            raise UserError(f"--size {self.size}: give a number of pixels from 16 to {LARGEST_SIZE}")
+            raise ArgumentError("size", f"give a number of pixels from 16 to {LARGEST_SIZE}", value=self.size)
         if not 0.0 <= self.friction <= LARGEST_FRICTION:
-            raise UserError(f"--friction {self.friction}: give a Coulomb coefficient from 0 to {LARGEST_FRICTION:g}")
+            advice = f"give a Coulomb coefficient from 0 to {LARGEST_FRICTION:g}"
+            raise ArgumentError("friction", advice, value=self.friction)
         if self.metres_per_unit is not None and not 1e-9 <= self.metres_per_unit <= 1e9:
             # Single precision holds no lengths far beyond; ``make_body`` says which of these fit the body.
-            raise UserError(f"--metres-per-unit {self.metres_per_unit}: give a positive number, from 1e-9 to 1e9")
+            advice = "give a positive number, from 1e-9 to 1e9"
+            raise ArgumentError("metres_per_unit", advice, value=self.metres_per_unit)
 
     def targets(self) -> dict[str, float | None]:
         """By the names that a script gives them."""
@@ -92,18 +100,18 @@ def animate(
     source: str = "capture",
     notes: tuple[str, ...] = (),
     quiet: bool = False,
-) -> dict:
+) -> Report:
     """Bring ``cloud`` (scene units) to life and write video, contact sheet, report and trajectory into ``out``.
 
     ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.motions.script``).
     ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
     the object to the camera. ``muscles_file``, ``solids``, ``gravity_up`` and ``settings``: see ``make_creature``;
-    ``forward`` (3,): see ``first_place``. Returns the report (docs/report.md). Raises ``UserError`` for bad input,
-    before any file of an earlier run is touched.
+    ``forward`` (3,): see ``first_place``. Returns what it wrote as ``report.json`` (docs/report.md). Raises
+    ``UserError`` for bad input, before any file of an earlier run is touched.
     """
     options = options or AnimateOptions()
-    requests = parse_script(motion, defaults=options.targets())
-    cut_off = longest(requests)
+    asked = script(motion, **options.targets())
+    cut_off = asked.frames()
     folder = writable_folder(out)
     with tqdm(total=1, desc="prepare", unit="capture", disable=quiet) as bar:
         creature = make_creature(
@@ -118,27 +126,12 @@ def animate(
             settings=settings,
         )
         bar.update()
-    place = first_place(creature, forward)
-    parts = parts_of(requests, creature.body.height)
-    check_possible(parts, place)
-    sequence = MotionSequence(place, parts)
-    frames = options.frames or cut_off
-    with tqdm(total=frames, desc="simulate", unit="frame", disable=quiet) as bar:
-        simulation = simulate(
-            creature.stepper,
-            creature.geometry,
-            creature.start,
-            sequence,
-            frames=frames,
-            finished=lambda: options.frames is None and sequence.finished,
-            progress=lambda _: bar.update(),
-        )
+    with tqdm(total=options.frames or cut_off, desc="simulate", unit="frame", disable=quiet) as bar:
+        performance = simulate(creature, asked, frames=options.frames, forward=forward, progress=lambda _: bar.update())
     film = draw_film(
-        creature,
-        simulation,
-        place.ground,
+        performance,
         folder,
-        name=requests[0].name if len({request.name for request in requests}) == 1 else "motions",
+        name=asked.name,
         size=options.size,
         background=background,
         view_from=view_from,
@@ -146,58 +139,43 @@ def animate(
         quiet=quiet,
     )
     report = _report(
-        creature, simulation, sequence, film, seed=options.seed, source=source, notes=(*notes, *sequence.cut_short())
+        performance, film, source=source, notes=(*notes, *performance.sequence.cut_short()), seed=options.seed
     )
-    simulation.trajectory.placed(creature.frame).save(folder / "trajectory.npz")
+    performance.trajectory.placed(creature.frame).save(folder / "trajectory.npz")
     creature.cage.mesh.write_vtu(folder / "cage.vtu")
-    write_report(folder / "report.json", report)
+    report.write(folder / "report.json")
     return report
 
 
-def _report(
-    creature: Creature,
-    simulation: Simulation,
-    sequence: MotionSequence,
-    film: Film,
-    *,
-    seed: int,
-    source: str,
-    notes: tuple[str, ...],
-) -> dict:
+def _report(performance: Performance, film: Film, *, source: str, notes: tuple[str, ...], seed: int) -> Report:
+    creature, sequence, simulation = performance.creature, performance.sequence, performance.simulation
     trajectory, reports = simulation.trajectory, simulation.reports
-    mesh, count = creature.cage.mesh, creature.cloud.count
-    spans = sequence.spans(trajectory.time)
-    return build_report(
-        motion=[
-            motion_entry(
+    mesh, spans = creature.cage.mesh, sequence.spans(trajectory.time)
+    return Report(
+        source=source,
+        motion=tuple(
+            MotionReport(
                 entry.name,
                 entry.asked,
                 entry.motion.planned(),
                 measure(trajectory, first=first, last=last),
-                entry.motion.notes(),
-                also_reached(entry.motion, trajectory, first, last),
+                entry.motion.reached(trajectory, first, last),
+                tuple(entry.motion.notes()),
             )
             for entry, (first, last) in zip(sequence.done, spans, strict=True)
-        ],
+        ),
         audit=audit(trajectory, newton_unconverged=sum(not report.converged for report in reports)),
-        qp=qp_summary(reports, simulation.frames),
-        timing=timing_summary(reports, simulation.frames, film.milliseconds),
-        cage={
-            "nodes": len(mesh.nodes),
-            "tets": len(mesh.tets),
-            "min_dihedral_degrees": mesh.min_dihedral_degrees(),
-            "mass": creature.body.mass,
-        },
-        muscles={"fibres": creature.muscles.fibre_count, "segments": creature.muscles.segment_count},
-        gaussians={
-            "in": count,
-            "split": film.gaussian_count - count,
-            "out": film.gaussian_count,
-            "left_out_of_contact": creature.geometry.left_out,
-            "left_out_of_contact_opacity": creature.geometry.left_out_opacity,
-        },
+        qp=QpCounts.of(reports, simulation.frames),
+        timing=stage_times(reports, simulation.frames, film.milliseconds),
+        cage=CageFacts(len(mesh.nodes), len(mesh.tets), mesh.min_dihedral_degrees(), creature.body.mass),
+        muscles=MuscleFacts(creature.muscles.fibre_count, creature.muscles.segment_count),
+        gaussians=GaussianCounts(
+            creature.cloud.count,
+            film.gaussian_count,
+            creature.geometry.left_out,
+            creature.geometry.left_out_opacity,
+        ),
+        notes=notes,
         device=str(creature.cloud.device),
         seed=seed,
-        source=source,
-        notes=notes,
     )

@@ -10,7 +10,7 @@ import numpy as np
 from egs_warp.contact.detection import ContactGeometry, contact_geometry
 from egs_warp.contact.terrain import Solid
 from egs_warp.deformation.rigid import in_body_frame
-from egs_warp.errors import UserError
+from egs_warp.errors import ArgumentError
 from egs_warp.fem.body import DEFAULT_SAG, BodyState, SoftBody, make_body
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -20,7 +20,7 @@ from egs_warp.locomotion.stepper import LocomotionSettings, LocomotionStepper
 from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame
 from egs_warp.meshing.cage import Cage, cage_of_body
 from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import Ground
+from egs_warp.motions.stance import SOLE, Ground
 from egs_warp.muscles.files import read_muscles
 from egs_warp.muscles.muscle_set import MuscleSet, automatic_muscles
 from egs_warp.segmentation.base_plane import find_base_plane
@@ -92,7 +92,9 @@ def make_creature(
     """
     normal = plane.normal if plane is not None else up
     if normal is None:
-        raise UserError("animate: neither up nor a plane is known; give --up or --plane")
+        raise ArgumentError(
+            "plane", "neither the ground nor which way is up is known; give one of them", check=("plane", "up")
+        )
     if gravity_up is not None:
         _check_slope(normal / np.linalg.norm(normal), gravity_up)
     standing = stand(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit)
@@ -152,10 +154,11 @@ def stand(
 def _check_slope(normal: np.ndarray, up: np.ndarray) -> None:
     slope = float(np.degrees(np.arccos(np.clip(normal @ up / np.linalg.norm(up), -1.0, 1.0))))
     if slope > STEEPEST_SLOPE:
-        raise UserError(
-            f"--gravity-up {','.join(f'{x:g}' for x in up)}: that makes the ground a slope of {slope:.0f} degrees;"
-            f" give a direction at most {STEEPEST_SLOPE:g} degrees from the ground's normal"
-            f" {','.join(f'{x:.3g}' for x in normal)}"
+        raise ArgumentError(
+            "gravity_up",
+            f"that makes the ground a slope of {slope:.0f} degrees; give a direction at most {STEEPEST_SLOPE:g} degrees"
+            f" from the ground's normal {','.join(f'{x:.3g}' for x in normal)}",
+            value=",".join(f"{x:g}" for x in up),
         )
 
 
@@ -194,9 +197,8 @@ def first_place(creature: Creature, forward: np.ndarray | None = None, *, step: 
     up = -body.gravity / np.linalg.norm(body.gravity)
     ahead = _forward(creature) if forward is None else creature.frame.axes @ forward
     if forward is not None and np.linalg.norm(np.cross(ahead, up)) < 1e-3 * np.linalg.norm(ahead):
-        raise UserError(
-            f"--forward {','.join(f'{x:g}' for x in forward)}: points up or down; give a way along the ground"
-        )
+        given = ",".join(f"{x:g}" for x in forward)
+        raise ArgumentError("forward", "points up or down; give a way along the ground", value=given)
     return Place(
         body,
         Ground.on(GROUND, ahead, body.centre_of_mass(start.positions), up=up),
@@ -213,7 +215,7 @@ def _forward(creature: Creature) -> np.ndarray:
     front to the camera; of a round one, its front.
     """
     nodes = creature.cage.mesh.nodes
-    sole = nodes[nodes[:, 2] < 0.06 * creature.body.height, :2]
+    sole = nodes[nodes[:, 2] < SOLE * creature.body.height, :2]
     flat = sole - sole.mean(axis=0)
     values, vectors = np.linalg.eigh(flat.T @ flat)
     if values[1] <= 1.2 * values[0]:

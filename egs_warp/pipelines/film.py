@@ -19,10 +19,10 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.video import VideoWriter, contact_sheet, write_png
 from egs_warp.locomotion.rollout import Simulation
-from egs_warp.motions.stance import Ground
-from egs_warp.pipelines.creature import FILMED_FROM, Creature
+from egs_warp.pipelines.creature import Creature
+from egs_warp.pipelines.performance import Performance
 from egs_warp.render.backdrop import Behind, CapturedScene, Floor
-from egs_warp.render.rasteriser import render
+from egs_warp.render.rasteriser import render_gaussians
 
 SHEET_FRAMES = 12
 SPLIT_KEY_FRAMES = 24
@@ -39,9 +39,7 @@ class Film:
 
 
 def draw_film(
-    creature: Creature,
-    simulation: Simulation,
-    ground: Ground,
+    performance: Performance,
     folder: Path,
     *,
     name: str,
@@ -53,11 +51,12 @@ def draw_film(
 ) -> Film:
     """Write ``name``.mp4 and sheet.png, ``size`` pixels both ways, into ``folder``.
 
-    ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
-    the object to the camera, both in the capture's frame.
+    ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from``: see
+    ``Performance.camera``.
     """
+    creature, simulation = performance.creature, performance.simulation
     trajectory, frames = simulation.trajectory, simulation.frames
-    camera = view_of(simulation, ground, size, None if view_from is None else creature.frame.axes @ view_from)
+    camera = performance.camera(size, view_from)
     behind = _behind(creature, simulation, camera, background, shadow=shadow)
     # The whole motion is known, so what it will bend is split before the first frame, and nothing can pop.
     started = time.perf_counter()
@@ -78,7 +77,7 @@ def draw_film(
             deformed = deformer.deform(trajectory.positions[step])
             marks.append(time.perf_counter())
             backdrop = behind.background(deformed.cloud, height=creature.body.height)
-            image = render(deformed.cloud, camera, background=backdrop).colour_srgb8()
+            image = render_gaussians(deformed.cloud, camera, background=backdrop).colour_srgb8()
             wp.synchronize_device(creature.cloud.device)
             marks.append(time.perf_counter())
             video.write(image)
@@ -106,33 +105,3 @@ def _behind(
         return Floor(camera, GROUND, centre=centre, reach=reach, cell=0.25 * height, shadow=shadow)
     scene = in_body_frame(background, creature.frame)
     return CapturedScene(scene, camera, GROUND, centre=centre, reach=reach, shadow=shadow)
-
-
-def view_of(simulation: Simulation, ground: Ground, size: int, view_from: np.ndarray | None = None) -> Camera:
-    """A fixed camera that holds the whole motion:
-    in front of the jump's side, or in the direction ``view_from`` (3,).
-    """
-    local = ground.local(simulation.trajectory.positions).reshape(-1, 3)
-    low, high = local.min(axis=0), local.max(axis=0)
-    low[2] = min(low[2], 0.0)
-    middle = 0.5 * (low + high)
-    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-    direction = np.array(FILMED_FROM) if view_from is None else ground.axes @ np.asarray(view_from, float)
-    direction /= np.linalg.norm(direction)
-    distance = float(np.linalg.norm(high - low))
-    for _ in range(60):
-        camera = Camera.look_at(
-            ground.world(middle + distance * direction),
-            ground.world(middle),
-            ground.axes[2],
-            width=size,
-            height=size,
-            vertical_fov_degrees=30.0,
-            near=0.01 * distance,
-        )
-        seen = ground.world(corners) @ camera.rotation.T + camera.translation
-        reach = np.abs(seen[:, :2] / seen[:, 2:]).max() * camera.fx / (0.5 * size)
-        if seen[:, 2].min() > 0 and reach < 0.86:
-            break
-        distance *= 1.05
-    return camera

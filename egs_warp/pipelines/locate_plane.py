@@ -12,6 +12,7 @@ from egs_warp.geometry.camera import Camera, shrunk
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
+from egs_warp.io.planes import KnownPlane
 from egs_warp.segmentation.base_plane import guess_up
 from egs_warp.segmentation.object_mask import ObjectSpec, Segmentation, segment, votes_of_masks
 from egs_warp.segmentation.plane_fit import PlaneFit
@@ -40,12 +41,15 @@ class LocatedPlane:
     segmentation: Segmentation
     notes: tuple[str, ...]
 
-    def facts(self) -> dict[str, object]:
-        """What ``plane.json`` says beside the plane itself."""
-        fit = self.fit
-        return {"centre": self.centre.tolist(), "size": self.size} | (
-            {} if fit is None else {"noise": fit.noise, "inlier_share": fit.inlier_share, "pixels": fit.pixel_count}
-        )
+    def known(self) -> KnownPlane:
+        """What ``plane.json`` says of it."""
+        found = KnownPlane(self.plane, centre=self.centre, size=self.size)
+        return found if self.fit is None else found.over(known_of_fit(self.fit))
+
+
+def known_of_fit(fit: PlaneFit) -> KnownPlane:
+    """What ``plane.json`` says of a fitted plane."""
+    return KnownPlane(fit.plane, noise=fit.noise, inlier_share=fit.inlier_share, pixels=fit.pixel_count)
 
 
 def locate_plane(
@@ -68,7 +72,7 @@ def locate_plane(
         return LocatedPlane(plane, None, _middle(cloud, found), found.size, found, ())
     if up is None:
         up, reason = _up_of(cloud, cameras)
-        notes.append(f"up is taken to be {','.join(f'{x:.2f}' for x in up)} ({reason}); if not, give --up")
+        notes.append(f"up is taken to be {','.join(f'{x:.2f}' for x in up)} ({reason}); if not, say which way is up")
     coarse = _coarse_plane(cloud, spec, up)
     found = segment(cloud, coarse, spec)
     centre = _middle(cloud, found)
@@ -128,12 +132,13 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> Pla
     plane = plane_under(planes, lowest, tolerance=0.0, least_share=least_share)
     if plane is None and spec.masks and planes:
         raise UserError(
-            "object: most of the mask lies on the floor, not on an object that stands on it; mark the object, or check "
-            "--view and --up"
+            "object: most of the mask lies on the floor, not on an object that stands on it; mark the object",
+            check=("view", "up"),
         )
     if plane is None:
         raise UserError(
-            "plane: none in sight under the object: nothing flat and level lies below it; check --up, or give --plane"
+            "plane: none in sight under the object: nothing flat and level lies below it; give the plane",
+            check=("plane", "up"),
         )
     return plane
 

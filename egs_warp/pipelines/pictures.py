@@ -13,7 +13,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.video import contact_sheet
 from egs_warp.render.backdrop import ContactShadow
-from egs_warp.render.rasteriser import render
+from egs_warp.render.rasteriser import render_gaussians
 
 _BACKDROP = (0.55, 0.75, 0.55)
 _SIDE = 480
@@ -37,7 +37,7 @@ def plane_picture(
     """
     frames = []
     for camera in cameras:
-        image = render(cloud, camera)
+        image = render_gaussians(cloud, camera)
         picture = np.clip(image.colour.numpy(), 0.0, 1.0)
         depth = np.where(image.alpha.numpy() > 0.5, image.depth.numpy(), np.inf)
         for number, plane in enumerate(planes):
@@ -58,9 +58,9 @@ def segmentation_picture(
     cloud: GaussianCloud, thing: GaussianCloud, background: GaussianCloud, cameras: Sequence[Camera]
 ) -> np.ndarray:
     """(H, W, 3) uint8: rows of the capture, the object alone and the background alone."""
-    frames = [_bytes(render(cloud, camera).colour.numpy()) for camera in cameras]
+    frames = [_bytes(render_gaussians(cloud, camera).colour.numpy()) for camera in cameras]
     for part in (thing, background):
-        frames += [_bytes(render(part, camera, background=_BACKDROP).colour.numpy()) for camera in cameras]
+        frames += [_bytes(render_gaussians(part, camera, background=_BACKDROP).colour.numpy()) for camera in cameras]
     labels = [""] * len(frames)
     for row, text in enumerate(("capture", "object", "background")):
         labels[row * len(cameras)] = text

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.holes import Hole, hole_under
-from egs_warp.io.planes import write_planes
+from egs_warp.io.planes import KnownPlane, write_planes
 from egs_warp.io.ply import write_ply
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane
 from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane, reach_across
@@ -58,17 +58,15 @@ class PreparedScene:
     filled: InpaintResult | None = None
     """How the background got its new floor; None where it got none."""
 
-    def write(self, folder: Path, known: Sequence[tuple[Plane, Mapping[str, object]]] = ()) -> None:
+    def write(self, folder: Path, known: Sequence[KnownPlane] = ()) -> None:
         """``object.ply``, ``background.ply`` and ``plane.json`` into ``folder``.
 
         ``known`` is what the file that gave the plane held; what is not found anew goes along.
         """
         write_ply(folder / "object.ply", self.object)
         write_ply(folder / "background.ply", self.background)
-        facts = dict(known[0][1]) if known else {}
-        facts |= self.located.facts() | {"hole": self.hole.facts()}
-        entries = [(self.plane, facts), *known[1:]]
-        write_planes(folder / "plane.json", [plane for plane, _ in entries], facts=[said for _, said in entries])
+        first = replace(self.located.known(), hole=self.hole.outline())
+        write_planes(folder / "plane.json", [first.over(known[0]) if known else first, *known[1:]])
 
 
 def prepare_scene(
@@ -122,7 +120,7 @@ def take_apart(
     untouched = cloud.subset(found.object_mask)
     heights, reach = reach_across(untouched, located.plane, options.clearing_options.reach)
     if not found.background_mask.any():
-        raise UserError("object: it is the whole capture, so there is no background; leave --object out")
+        raise UserError("object: it is the whole capture, so there is no background; animate the capture itself")
     thing = clear_plane(
         untouched,
         located.plane,

@@ -4,121 +4,211 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-import egs_warp
 from egs_warp.io.atomic import atomic_write
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Audit, Reached
+from egs_warp.version import __version__
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 SCHEMA_VERSION = 1
 MECHANICS = ("warp-lang", "numpy", "scipy", "osqp", "qdldl", "pytetwild")
 """Packages that decide how a body moves."""
 
 
-def motion_entry(
-    name: str, asked: dict, planned: dict, reached: Reached, notes: Sequence[str], also_reached: dict | None = None
-) -> dict:
-    """One element of ``motion``."""
-    measures = {**asdict(reached), **(also_reached or {})}
-    return {"name": name, "asked": asked, "planned": planned, "reached": measures, "notes": list(notes)}
-
-
-def qp_summary(reports: Sequence[StepReport], frames: np.ndarray) -> dict:
-    """Quadratic programs solved a frame; ``frames`` (n,) are indices into the trajectory's times."""
-    counts = np.array([0, *(report.qp_count for report in reports)])
-    per_frame = np.diff(np.cumsum(counts)[frames]) if len(frames) > 1 else np.zeros(1)
+def versions(names: Sequence[str] = MECHANICS) -> dict[str, str]:
+    """Of the package, Python and the packages ``names``, which the numbers depend on."""
     return {
-        "mean_per_frame": float(per_frame.mean()),
-        "worst_per_frame": int(per_frame.max()),
-        "infeasible": int(sum(report.qp_infeasible for report in reports)),
+        "egs-warp": __version__,
+        "python": platform.python_version(),
+        **{name: version(name) for name in names},
     }
 
 
-def timing_summary(reports: Sequence[StepReport], frames: np.ndarray, drawing: dict[str, list[float]]) -> dict:
-    """Milliseconds a frame by stage: mean and worst.
-    ``drawing`` holds the milliseconds of each drawn frame by stage.
-    """
-    stages: dict[str, list[float]] = {}
+@dataclass(frozen=True)
+class MotionReport:
+    """One motion: asked, planned, reached."""
+
+    name: str
+    asked: Mapping[str, float]
+    """Lengths in body heights."""
+    planned: DataclassInstance
+    """The record of its state machine."""
+    reached: Reached
+    also_reached: DataclassInstance | None
+    """The record of what only such a motion is measured by."""
+    notes: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """One element of ``motion``."""
+        also = asdict(self.also_reached) if self.also_reached is not None else {}
+        return {
+            "name": self.name,
+            "asked": dict(self.asked),
+            "planned": asdict(self.planned),
+            "reached": {**asdict(self.reached), **also},
+            "notes": list(self.notes),
+        }
+
+    def summary(self) -> list[str]:
+        """For the terminal."""
+        reached = asdict(self.reached)
+        pairs = [
+            f"{name} {reached[name]:.3f}" + (f" of {self.asked[name]:g}" if name in self.asked else "")
+            for name in ("distance", "height", "heading_degrees")
+        ]
+        line = (
+            f"{self.name}: {', '.join(pairs)}, tilt {self.reached.tilt_degrees:.1f} degrees, "
+            f"airborne {self.reached.airborne_frames:.0f} frames (lengths in body heights)"
+        )
+        return [line, *(f"note: {note}" for note in self.notes)]
+
+
+@dataclass(frozen=True)
+class QpCounts:
+    """Quadratic programs solved a frame."""
+
+    mean_per_frame: float
+    worst_per_frame: int
+    infeasible: int
+    """In all."""
+
+    @classmethod
+    def of(cls, reports: Sequence[StepReport], frames: np.ndarray) -> QpCounts:
+        """Of ``reports``; ``frames`` (n,) are indices into the trajectory's times."""
+        counts = np.array([0, *(report.qp_count for report in reports)])
+        per_frame = np.diff(np.cumsum(counts)[frames]) if len(frames) > 1 else np.zeros(1)
+        infeasible = int(sum(report.qp_infeasible for report in reports))
+        return cls(float(per_frame.mean()), int(per_frame.max()), infeasible)
+
+
+@dataclass(frozen=True)
+class StageTime:
+    """Milliseconds a frame."""
+
+    mean: float
+    worst: float
+
+
+def stage_times(
+    reports: Sequence[StepReport], frames: np.ndarray, drawing: Mapping[str, Sequence[float]]
+) -> dict[str, StageTime]:
+    """By stage. ``drawing`` holds the milliseconds of each drawn frame by stage."""
+    stages: dict[str, Sequence[float]] = {}
     for first, last in zip(frames[:-1], frames[1:], strict=True):
         sums: dict[str, float] = {}
         for report in reports[first:last]:
             for stage, value in report.milliseconds.items():
                 sums[stage] = sums.get(stage, 0.0) + value
         for stage, value in sums.items():
-            stages.setdefault(stage, []).append(value)
+            stages[stage] = [*stages.get(stage, ()), value]
     return {
-        stage: {"mean": float(np.mean(values)), "worst": float(np.max(values))}
+        stage: StageTime(float(np.mean(values)), float(np.max(values)))
         for stage, values in {**stages, **drawing}.items()
         if values
     }
 
 
-def versions(names: Sequence[str] = MECHANICS) -> dict[str, str]:
-    """Of the package, Python and the packages ``names``, which the numbers depend on."""
-    return {
-        "egs-warp": egs_warp.__version__,
-        "python": platform.python_version(),
-        **{name: version(name) for name in names},
-    }
+@dataclass(frozen=True)
+class CageFacts:
+    """The simulated mesh."""
+
+    nodes: int
+    tets: int
+    min_dihedral_degrees: float
+    mass: float
+    """kg."""
 
 
-def build_report(
-    *,
-    motion: list[dict],
-    audit: Audit,
-    qp: dict,
-    timing: dict,
-    cage: dict,
-    muscles: dict,
-    gaussians: dict,
-    device: str,
-    seed: int,
-    source: str,
-    notes: Sequence[str],
-) -> dict:
-    """The whole report, ready for JSON."""
-    return {
-        "schema": SCHEMA_VERSION,
-        "source": source,
-        "motion": motion,
-        "audit": asdict(audit),
-        "qp": qp,
-        "timing": timing,
-        "cage": cage,
-        "muscles": muscles,
-        "gaussians": gaussians,
-        "notes": list(notes),
-        "versions": versions(),
-        "device": device,
-        "seed": seed,
-    }
+@dataclass(frozen=True)
+class MuscleFacts:
+    """The muscles."""
+
+    fibres: int
+    segments: int
 
 
-def write_report(path: Path, report: dict) -> None:
+@dataclass(frozen=True)
+class GaussianCounts:
+    """Gaussians on their way from the capture to the pictures."""
+
+    read: int
+    """In the capture."""
+    drawn: int
+    """In the pictures; splitting has added the rest."""
+    left_out_of_contact: int
+    left_out_of_contact_opacity: float
+    """Share of the opacity mass."""
+
+    def to_json(self) -> dict[str, Any]:
+        """``gaussians``."""
+        return {
+            "in": self.read,
+            "split": self.drawn - self.read,
+            "out": self.drawn,
+            "left_out_of_contact": self.left_out_of_contact,
+            "left_out_of_contact_opacity": self.left_out_of_contact_opacity,
+        }
+
+
+@dataclass(frozen=True)
+class Report:
+    """Everything that ``report.json`` says."""
+
+    source: str
+    """Name of the capture."""
+    motion: tuple[MotionReport, ...]
+    audit: Audit
+    qp: QpCounts
+    timing: Mapping[str, StageTime]
+    cage: CageFacts
+    muscles: MuscleFacts
+    gaussians: GaussianCounts
+    notes: tuple[str, ...]
+    """For the user."""
+    device: str
+    seed: int
+    versions: Mapping[str, str] = field(default_factory=versions)
+
+    def to_json(self) -> dict[str, Any]:
+        """The whole report, ready for JSON."""
+        return {
+            "schema": SCHEMA_VERSION,
+            "source": self.source,
+            "motion": [motion.to_json() for motion in self.motion],
+            "audit": asdict(self.audit),
+            "qp": asdict(self.qp),
+            "timing": {stage: asdict(time) for stage, time in self.timing.items()},
+            "cage": asdict(self.cage),
+            "muscles": asdict(self.muscles),
+            "gaussians": self.gaussians.to_json(),
+            "notes": list(self.notes),
+            "versions": dict(self.versions),
+            "device": self.device,
+            "seed": self.seed,
+        }
+
+    def write(self, path: Path) -> None:
+        """``report.json``, whole or not at all."""
+        write_report(path, self.to_json())
+
+    def summary(self) -> str:
+        """A few lines for the terminal."""
+        lines = [line for motion in self.motion for line in motion.summary()]
+        lines.append("audit: " + ", ".join(f"{name} {value:.2g}" for name, value in asdict(self.audit).items()))
+        return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
+
+
+def write_report(path: Path, report: Mapping[str, Any]) -> None:
     """Write ``report`` as indented JSON; the file appears whole or not at all."""
     with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(report, indent=2) + "\n")
-
-
-def summary(report: dict) -> str:
-    """A few lines for the terminal."""
-    lines = []
-    for entry in report["motion"]:
-        reached, asked = entry["reached"], entry["asked"]
-        pairs = [
-            f"{name} {reached[name]:.3f} of {asked[name]:g}" if name in asked else f"{name} {reached[name]:.3f}"
-            for name in ("distance", "height", "heading_degrees")
-        ]
-        lines.append(
-            f"{entry['name']}: {', '.join(pairs)}, tilt {reached['tilt_degrees']:.1f} degrees, "
-            f"airborne {reached['airborne_frames']:.0f} frames (lengths in body heights)"
-        )
-        lines += [f"note: {note}" for note in entry["notes"]]
-    lines.append("audit: " + ", ".join(f"{name} {value:.2g}" for name, value in report["audit"].items()))
-    return "\n".join([*lines, *(f"note: {note}" for note in report["notes"])])

@@ -14,7 +14,7 @@ import torch
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.render import render
+from egs_warp.render import render_gaussians
 from egs_warp.training.finetune import Densification, FinetuneOptions, Rates, TrainingView, finetune, psnr, ssim
 from egs_warp.training.posed_photos import backdrop_colour, laid_over, read_views
 from egs_warp.training.rough_cloud import rough_cloud
@@ -122,6 +122,6 @@ def _score(
     held_out: bool,
     threads: int | None,
 ) -> PhotoScore:
-    picture = np.clip(render(cloud, view.camera, background=background, threads=threads).colour.numpy(), 0, 1)
+    picture = np.clip(render_gaussians(cloud, view.camera, background=background, threads=threads).colour.numpy(), 0, 1)
     likeness = float(ssim(torch.as_tensor(picture), torch.as_tensor(view.image)))
     return PhotoScore(view.name, held_out, psnr(picture, view.image), likeness)

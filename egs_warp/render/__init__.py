@@ -4,6 +4,6 @@ In: a cloud and a camera. Out: colour, alpha and depth; with ``autograd``, gradi
 """
 
 from egs_warp.render.compositing import RenderedImage
-from egs_warp.render.rasteriser import render, render_views
+from egs_warp.render.rasteriser import render_gaussians, render_views
 
-__all__ = ["RenderedImage", "render", "render_views"]
+__all__ = ["RenderedImage", "render_gaussians", "render_views"]

@@ -59,8 +59,7 @@ def render_torch(
     Gradients flow to all five, and to the camera's pose where ``rotation`` (3, 3) and ``translation`` (3,) are given
     (they then replace the camera's; the gradient by ``rotation`` is by its nine entries, taken as free). ``screen``
     (n, 2), any values, receives the gradient by the screen positions in pixels, which densification by splitting
-    watches. On CUDA the work is queued on torch's current stream. Raises ``UserError`` as ``egs_warp.render.render``
-    does.
+    watches. On CUDA the work is queued on torch's current stream. Raises ``UserError`` as ``render_gaussians`` does.
     """
     tensors = {
         "means": (means, (len(means), 3)),

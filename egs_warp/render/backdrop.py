@@ -11,7 +11,7 @@ import numpy as np
 from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
-from egs_warp.render.rasteriser import render
+from egs_warp.render.rasteriser import render_gaussians
 
 _SKY = np.array([1.0, 1.0, 1.0], np.float32)
 _FLOOR = np.array([0.86, 0.86, 0.87], np.float32)
@@ -142,7 +142,7 @@ class CapturedScene:
         """``scene`` in the world's units; ``centre`` (3,) and ``reach`` bound the shadow."""
         import cv2
 
-        image = render(scene, camera)
+        image = render_gaussians(scene, camera)
         self._image = np.clip(image.colour.numpy(), 0.0, 1.0)
         depth = np.where(image.alpha.numpy() > 0.5, image.depth.numpy(), 0.0).astype(np.float32)
         depth = cv2.medianBlur(depth, 5)

@@ -20,7 +20,7 @@ from egs_warp.render.projection import project, view_from_camera
 from egs_warp.render.tiles import build_tile_lists
 
 
-def render(
+def render_gaussians(
     cloud: GaussianCloud,
     camera: Camera,
     *,
@@ -50,8 +50,8 @@ def render(
 
 
 def render_views(cloud: GaussianCloud, cameras: Sequence[Camera], **options: Any) -> list[RenderedImage]:
-    """One picture of ``cloud`` for each camera; the options are those of ``render``."""
-    return [render(cloud, camera, **options) for camera in cameras]
+    """One picture of ``cloud`` for each camera; the options are those of ``render_gaussians``."""
+    return [render_gaussians(cloud, camera, **options) for camera in cameras]
 
 
 @contextmanager

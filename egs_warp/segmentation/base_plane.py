@@ -79,7 +79,7 @@ def _underside(cloud: GaussianCloud, normal: np.ndarray) -> _Underside:
     low, high = (_mass_quantile(heights, opacities, share) for share in (0.002, 0.998))
     if not high > low:
         raise UserError(
-            f"object: its {cloud.count} Gaussians have no height along up, so no plane can be found; check --up"
+            f"object: its {cloud.count} Gaussians have no height along up, so no plane can be found", check=("up",)
         )
     first, second, _ = upright_frame(means, opacities, Plane(normal, 0.0)).axes
     across = np.stack([means @ first, means @ second], axis=1)

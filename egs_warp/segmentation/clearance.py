@@ -19,7 +19,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.kernels.deformation.splitting import split_kernel
 from egs_warp.kernels.segmentation.clearance import half_space_kernel, reach_kernel
 from egs_warp.launching import empty, launch_rows
-from egs_warp.render.rasteriser import render
+from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.plane_fit import plane_depth
 
 if TYPE_CHECKING:
@@ -157,7 +157,7 @@ def views_above(cloud: GaussianCloud, plane: Plane, cameras: Sequence[Camera]) -
 
     views = []
     for camera in cameras:
-        image = render(cloud, camera, background=(0.0, 0.0, 0.0))
+        image = render_gaussians(cloud, camera, background=(0.0, 0.0, 0.0))
         alpha, depth = image.alpha.numpy(), image.depth.numpy()
         colour = np.clip(image.colour.numpy() / np.maximum(alpha, 1e-6)[..., None], 0.0, 1.0)
         behind = plane_depth(plane, camera)

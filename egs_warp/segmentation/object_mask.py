@@ -18,7 +18,9 @@ from egs_warp.segmentation.connectivity import close_to, connected_parts, enclos
 from egs_warp.segmentation.plane_search import lies_along
 from egs_warp.segmentation.votes import MaskedView, Votes, blending_votes, check_size
 
-_NOTHING_ABOVE = "object: nothing of it lies above the plane; check the masks, box or point, or give --plane"
+_NOTHING_ABOVE = (
+    "object: nothing of it lies above the plane; mark it by other masks, a box or a point, or give its plane"
+)
 _MIN_OPACITY = 0.1
 """Fainter Gaussians make no connection; they go with what surrounds them."""
 _SEEN = 0.02
@@ -121,7 +123,8 @@ def segment(cloud: GaussianCloud, plane: Plane, spec: ObjectSpec) -> Segmentatio
     if lowest > 0.1 * size:
         raise UserError(
             f"object: it touches no plane: its lowest part is {lowest / size:.2f} of its size above this one; "
-            "give --plane, or mark all of the object"
+            "mark all of the object, or give its plane",
+            check=("plane",),
         )
     # What lies below the object's foot is hidden, so nobody can tell whose it is; inpainting makes new floor there.
     buried = ~object_mask & ~above & (scene.heights > -0.25 * size) & (outline | claimed)
@@ -171,7 +174,7 @@ def _body(
     lying = core & scene.level & (scene.heights < 3.0 * foot) & (not spec.masks)
     indices = np.flatnonzero(core & ~lying)
     if len(indices) == 0:
-        raise UserError(_NOTHING_ABOVE)
+        raise UserError(_NOTHING_ABOVE, check=("plane",))
     parts = connected_parts(scene.cloud, indices, cell=size / CELLS, plane=scene.plane, above=foot)
     mass = np.bincount(parts, weights=scene.opacity[indices])
     if spec.point is not None:
@@ -190,7 +193,7 @@ def _body(
         claimed = np.bincount(parts, weights=scene.opacity[indices] * wanted[indices])
         best = int(np.argmax(claimed))
         if claimed[best] == 0.0:
-            raise UserError(_NOTHING_ABOVE)
+            raise UserError(_NOTHING_ABOVE, check=("plane",))
     chosen, small = np.zeros((2, len(core)), bool)
     chosen[indices[parts == best]] = True
     small[indices[mass[parts] < _SMALL * mass[best]]] = True
@@ -234,7 +237,7 @@ def _first_size(scene: _Scene, wanted: np.ndarray, spec: ObjectSpec) -> float:
         return float(np.linalg.norm(spec.box.high - spec.box.low))
     standing = wanted & scene.solid & (scene.heights > 0.0)
     if not standing.any():
-        raise UserError(_NOTHING_ABOVE)
+        raise UserError(_NOTHING_ABOVE, check=("plane",))
     return _diagonal(scene.means[standing]) * (0.5 if spec.point is not None else 1.0)
 
 
@@ -289,7 +292,7 @@ def masks_from_selection(cloud: GaussianCloud, selection: np.ndarray, cameras: S
     """Masks of where the Gaussians ``selection`` (n,) bool make up more than half of what shows,
     through ``cameras``.
     """
-    from egs_warp.render.rasteriser import render
+    from egs_warp.render.rasteriser import render_gaussians
 
     sh = np.zeros((cloud.count, 1, 3), np.float32)
     sh[:, 0, :] = np.where(selection, 0.5, -0.5)[:, None] / 0.28209479177387814
@@ -303,7 +306,9 @@ def masks_from_selection(cloud: GaussianCloud, selection: np.ndarray, cameras: S
     )
     return [
         MaskedView(
-            camera, render(painted, camera, background=(0.0, 0.0, 0.0)).colour.numpy()[..., 0] > 0.5, f"view {k}"
+            camera,
+            render_gaussians(painted, camera, background=(0.0, 0.0, 0.0)).colour.numpy()[..., 0] > 0.5,
+            f"view {k}",
         )
         for k, camera in enumerate(cameras)
     ]

@@ -13,7 +13,7 @@ from egs_warp.geometry.bitmaps import connected_parts
 from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
-from egs_warp.render.rasteriser import render
+from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.plane_fit import PlaneFit, PlaneView, fit_plane
 
 _TRIALS = 1500
@@ -184,7 +184,7 @@ def plane_views(
     bare = cloud if object_mask is None else cloud.subset(~object_mask)
     views = []
     for camera in chosen:
-        image = render(bare, camera)
+        image = render_gaussians(bare, camera)
         depth = image.depth.numpy().astype(np.float64)
         points = camera.centre + depth[..., None] * camera_rays(camera)
         across = points - centre

@@ -16,7 +16,7 @@ import warp as wp
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.render import render
+from egs_warp.render import render_gaussians
 from egs_warp.render.autograd import render_torch
 from egs_warp.training.relocation import Population
 
@@ -183,7 +183,10 @@ def views_of_capture(
     """Renders of the capture itself, to train against where the photos are not at hand."""
     return [
         TrainingView(
-            camera, np.clip(render(cloud, camera, background=background, antialiased=antialiased).colour.numpy(), 0, 1)
+            camera,
+            np.clip(
+                render_gaussians(cloud, camera, background=background, antialiased=antialiased).colour.numpy(), 0, 1
+            ),
         )
         for camera in cameras
     ]

@@ -11,7 +11,7 @@ import numpy as np
 from egs_warp.geometry.camera import shrunk
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.cameras import PosedImage
-from egs_warp.render.rasteriser import render
+from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.training import has_torch
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def photographs_in_colours_of(cloud: GaussianCloud, posed: Sequence[PosedImage])
             continue
         small = shrunk(one.camera, _PHOTO_SIDE)
         reduced = cv2.resize(picture, (small.width, small.height), interpolation=cv2.INTER_AREA)
-        image = render(cloud, small, background=(0.0, 0.0, 0.0))
+        image = render_gaussians(cloud, small, background=(0.0, 0.0, 0.0))
         photo = reduced[..., ::-1].astype(np.float32) / 255.0
         matched = in_colours_of(np.clip(image.colour.numpy(), 0.0, 1.0), photo, image.alpha.numpy() > _OPAQUE)
         views.append(TrainingView(small, matched))

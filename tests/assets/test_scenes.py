@@ -153,7 +153,7 @@ def test_sh_of_a_highlight() -> None:
     direction = np.array([[0.48, -0.6, 0.64]])
     sh = sh_from_colour(np.full((1, 3), 0.4), direction, np.array([0.2]), lobe_colour=(1.0, 1.0, 1.0))
     from egs_warp.geometry.camera import Camera
-    from egs_warp.render import render
+    from egs_warp.render import render_gaussians
 
     cloud = GaussianCloud.from_numpy(
         np.zeros((1, 3)), np.array([[1.0, 0, 0, 0]]), np.full((1, 3), -1.0), np.array([16.0]), sh
@@ -161,7 +161,7 @@ def test_sh_of_a_highlight() -> None:
 
     def seen_from(eye: np.ndarray) -> float:
         camera = Camera.look_at(eye, np.zeros(3), np.array([0.0, 1.0, 0.0]), width=65, height=65)
-        return float(render(cloud, camera).colour.numpy().reshape(65, 65, 3)[32, 32].mean())
+        return float(render_gaussians(cloud, camera).colour.numpy().reshape(65, 65, 3)[32, 32].mean())
 
     # The renderer caps alpha at 0.99 over white.
     assert seen_from(10.0 * direction[0]) == pytest.approx(0.99 * 0.6 + 0.01, abs=0.01)

@@ -22,10 +22,10 @@ from egs_warp.inpainting.inpaint import InpaintOptions, inpaint
 from egs_warp.inpainting.inpainters import inpainter_by_name
 from egs_warp.io import read_capture, write_ply
 from egs_warp.io.cameras import write_cameras
-from egs_warp.io.planes import read_planes, read_planes_and_facts, write_planes
+from egs_warp.io.planes import KnownPlane, read_planes, write_planes
 from egs_warp.pipelines.pictures import picture_cameras, plane_picture
 from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene, viewing_direction
-from egs_warp.render import render
+from egs_warp.render import render_gaussians
 from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane, reach_across
 from egs_warp.segmentation.object_mask import ObjectSpec, masks_from_selection
 from tests.segmentation.test_object_mask import FLOOR, ball_on_floor
@@ -56,26 +56,26 @@ def test_plane_then_segment_take_each_others_files(folder: Path, tmp_path: Path)
     scene, cameras, mask = str(folder / "scene.ply"), str(folder / "cameras.json"), str(folder / "photo1.png")
     shared = ["--object", mask, "--cameras", cameras, "--up", "z"]
     assert main(["plane", scene, *shared, "--out", str(tmp_path / "plane")]) == 0
-    plane = read_planes(tmp_path / "plane" / "plane.json")[0]
+    plane = read_planes(tmp_path / "plane" / "plane.json")[0].plane
     assert plane.normal[2] > np.cos(np.radians(0.5)) and abs(plane.offset) < 0.02
     with Image.open(tmp_path / "plane" / "plane.png") as picture:
         red, green, _ = np.moveaxis(np.asarray(picture, float), -1, 0)
         assert (red - green > 90).mean() > 0.01, "no grid in the picture"
-    found = read_planes_and_facts(tmp_path / "plane" / "plane.json")
-    found.append((Plane.from_coefficients(0.0, 0.0, 1.0, -0.8), {"support": 0.1}))
+    (found,) = read_planes(tmp_path / "plane" / "plane.json")
+    other = KnownPlane(Plane.from_coefficients(0.0, 0.0, 1.0, -0.8), support=0.1, others={"remark": "a shelf"})
     (tmp_path / "parts").mkdir()
     path = tmp_path / "parts" / "plane.json"
-    write_planes(path, [one for one, _ in found], facts=[facts for _, facts in found])
+    write_planes(path, [found, other])
     flags = ["--plane", str(path), "--straddling", "split"]
     assert main(["segment", scene, *shared, *flags, "--out", str(tmp_path / "parts")]) == 0
-    first, second = read_planes_and_facts(path)
-    assert first[1].keys() == found[0][1].keys() | {"hole"} and first[1]["noise"] == found[0][1]["noise"]
-    assert second[0].offset == -0.8 and second[1] == {"support": 0.1}
+    first, second = read_planes(path)
+    assert first.to_json().keys() == found.to_json().keys() | {"hole"} and first.noise == found.noise
+    assert second.to_json() == other.to_json()
     thing = read_capture(tmp_path / "parts" / "object.ply").cloud
     rest = read_capture(tmp_path / "parts" / "background.ply").cloud
     assert 1450 < thing.count <= 1525
     assert 3300 < rest.count <= 3601
-    np.testing.assert_allclose(read_planes(tmp_path / "parts" / "plane.json")[0].normal, plane.normal, atol=1e-9)
+    np.testing.assert_allclose(read_planes(tmp_path / "parts" / "plane.json")[0].plane.normal, plane.normal, atol=1e-9)
     assert (tmp_path / "parts" / "segment.png").is_file()
 
 
@@ -139,13 +139,13 @@ def test_photographs_beside_the_cameras_clear_the_plane(folder: Path) -> None:
     images = folder / "images"
     images.mkdir(exist_ok=True)
     for one in posed[:5]:
-        picture = render(cloud, one.camera, background=(0.0, 0.0, 0.0)).colour_srgb8()
+        picture = render_gaussians(cloud, one.camera, background=(0.0, 0.0, 0.0)).colour_srgb8()
         Image.fromarray(picture[:50] if one is posed[4] else picture).save(images / one.name)
     given = SceneInput(cloud, read_cameras(folder / "cameras.json"), None, None, None, ())
     photographs = photographs_in_colours_of(given.cloud, given.posed)
     assert len(photographs) == 4
     assert photographs[0].image.shape == (96, 96, 3)
-    expected = render(cloud, posed[0].camera, background=(0.0, 0.0, 0.0)).colour.numpy()
+    expected = render_gaussians(cloud, posed[0].camera, background=(0.0, 0.0, 0.0)).colour.numpy()
     np.testing.assert_allclose(photographs[0].image, np.clip(expected, 0.0, 1.0), atol=1.0 / 255)
     # Taken at a third of the exposure, in a warmer light, and with a stranger in front.
     expected = np.clip(expected, 0.0, 1.0)
@@ -238,8 +238,8 @@ def test_a_capture_with_nothing_flat_has_one_plane() -> None:
 def test_plane_files_are_checked(tmp_path: Path) -> None:
     path = tmp_path / "plane.json"
     planes = [FLOOR, Plane.from_coefficients(0.0, 1.0, 0.0, 2.0)]
-    write_planes(path, planes, facts=[{"noise": 0.01}])
-    for one, other in zip(read_planes(path), planes, strict=True):
+    write_planes(path, [KnownPlane(planes[0], noise=0.01), KnownPlane(planes[1])])
+    for one, other in zip((known.plane for known in read_planes(path)), planes, strict=True):
         np.testing.assert_allclose([*one.normal, one.offset], [*other.normal, other.offset])
     for text, message in (
         ("{", "not readable JSON"),

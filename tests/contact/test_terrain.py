@@ -68,7 +68,7 @@ def test_a_slope_that_nothing_stands_on_is_refused() -> None:
     with pytest.raises(UserError) as error:
         make_creature(thing.cloud, plane=thing.plane, gravity_up=np.array([1.0, 0.0, 0.5]))
     assert str(error.value) == (
-        "--gravity-up 1,0,0.5: that makes the ground a slope of 63 degrees; give a direction at most 45 degrees from"
+        "gravity_up 1,0,0.5: that makes the ground a slope of 63 degrees; give a direction at most 45 degrees from"
         " the ground's normal 0,0,1"
     )
 
@@ -81,6 +81,6 @@ def test_a_solid_that_holds_the_body_is_named(tmp_path: Path) -> None:
     with pytest.raises(UserError) as error:
         make_creature(thing.cloud, plane=thing.plane, solids=read_terrain(path))
     assert str(error.value) == (
-        "--terrain, solid 2: the body is inside it; inside is where n.x + d < 0 for every face [nx, ny, nz, d]:"
+        "solids: the body is inside number 2; inside is where n.x + d < 0 for every face [nx, ny, nz, d]:"
         " turn the signs of a face, or move the solid"
     )

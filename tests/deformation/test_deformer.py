@@ -16,7 +16,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.kernels.deformation.spherical_harmonics import rotate_sh_kernel
 from egs_warp.launching import launch_rows
-from egs_warp.render import render
+from egs_warp.render import render_gaussians
 from tests.support.carrying_scenes import bent, box, covariances, matrices, random_cloud
 
 
@@ -96,7 +96,7 @@ def test_turning_the_object_is_turning_the_camera(device: str) -> None:
     turned = deform(cloud, embed_gaussians(cloud, mesh), mesh.nodes @ turn.T).cloud
     middle, eye, up = np.full(3, 0.5), np.array([2.2, 0.9, 1.4]), np.array([0.0, 0.0, 1.0])
     pictures = [
-        render(each, Camera.look_at(r @ eye, r @ middle, r @ up, width=96, height=96)).colour.numpy()
+        render_gaussians(each, Camera.look_at(r @ eye, r @ middle, r @ up, width=96, height=96)).colour.numpy()
         for each, r in ((cloud, np.eye(3)), (turned, turn))
     ]
     difference = np.abs(pictures[0] - pictures[1])

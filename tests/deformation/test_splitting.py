@@ -21,7 +21,7 @@ from egs_warp.deformation.splitting import (
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.capture import read_capture
-from egs_warp.render.rasteriser import render
+from egs_warp.render.rasteriser import render_gaussians
 from tests.support.carrying_scenes import bent, box, covariances, random_cloud
 
 
@@ -131,7 +131,7 @@ def test_nothing_pops_in_an_animation_that_splits() -> None:
 
     def jerks(clouds: list[tuple[GaussianCloud, GaussianEmbedding]]) -> np.ndarray:
         pictures = [
-            render(Deformer(*each).deform(nodes).cloud, camera).colour.numpy()
+            render_gaussians(Deformer(*each).deform(nodes).cloud, camera).colour.numpy()
             for each, nodes in zip(clouds, frames, strict=True)
         ]
         # What a motion at even speed would make of two frames is taken off: compensation to first order.
@@ -168,5 +168,5 @@ def test_a_split_at_rest_cannot_be_seen(data_dir: Path) -> None:
         camera = Camera.look_at(
             middle + 1.8 * size * np.array(side), middle, np.array([0.0, -1.0, 0.0]), width=200, height=200
         )
-        pictures = [render(each, camera).colour.numpy() for each in (cloud, split.cloud)]
+        pictures = [render_gaussians(each, camera).colour.numpy() for each in (cloud, split.cloud)]
         assert -10.0 * np.log10(np.mean((pictures[0] - pictures[1]) ** 2)) >= 45.0

@@ -21,8 +21,8 @@ from egs_warp.inpainting.new_floor import rim_heights, with_gloss
 from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, mean_colours, rectify
 from egs_warp.inpainting.soap_film import soap_film
 from egs_warp.io import read_capture, write_ply
-from egs_warp.io.planes import write_planes
-from egs_warp.render import render
+from egs_warp.io.planes import KnownPlane, write_planes
+from egs_warp.render import render_gaussians
 from egs_warp.segmentation.plane_fit import plane_depth
 from egs_warp.segmentation.votes import MaskedView
 from egs_warp.training.finetune import psnr
@@ -64,8 +64,8 @@ def test_filled_floor_looks_like_the_truth(done: tuple[GaussianCloud, InpaintRes
     truth, result = done
     for azimuth, elevation in ((0.3, 0.6), (2.5, 1.0)):
         camera = look(azimuth, elevation)
-        before, after = render(truth, camera), render(result.cloud, camera)
-        hole = render(result.cloud.subset(result.is_new), camera).alpha.numpy() > 0.5
+        before, after = render_gaussians(truth, camera), render_gaussians(result.cloud, camera)
+        hole = render_gaussians(result.cloud.subset(result.is_new), camera).alpha.numpy() > 0.5
         assert hole.sum() > 1000
         assert psnr(after.colour.numpy()[hole], before.colour.numpy()[hole]) > 28.0
         assert after.alpha.numpy()[hole].min() > 0.94
@@ -76,7 +76,7 @@ def test_depth_is_the_planes(done: tuple[GaussianCloud, InpaintResult]) -> None:
     and those in front cover those behind)."""
     _, result = done
     camera = look(1.0, 0.7)
-    image = render(result.cloud.subset(result.is_new), camera)
+    image = render_gaussians(result.cloud.subset(result.is_new), camera)
     seen = image.alpha.numpy() > 0.9
     expected = plane_depth(PLANE, camera)[seen]
     off = image.depth.numpy()[seen] - expected
@@ -228,9 +228,9 @@ def test_holes_that_cannot_be_filled(place: tuple[float, float], radius: float, 
 
 
 def test_bad_options_and_objects() -> None:
-    with pytest.raises(UserError, match=r"--steps -1: give a whole number of at least 0"):
+    with pytest.raises(UserError, match=r"steps -1: give a whole number of at least 0"):
         InpaintOptions(steps=-1)
-    with pytest.raises(UserError, match=r"--margin 2: give a number from 0 to 1"):
+    with pytest.raises(UserError, match=r"margin 2: give a number from 0 to 1"):
         InpaintOptions(margin=2)
     window = disc(PLANE, on_plane(0, 0), 0.1).window
     with pytest.raises(UserError, match="the hole is empty; give the object, a mask, or a place on the plane"):
@@ -245,7 +245,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """From files to a filled capture and a picture; the gap is closed."""
     truth, hole = floor(spacing=0.04), disc(PLANE, on_plane(0.1, 0.05), RADIUS)
     write_ply(tmp_path / "background.ply", holed(truth, hole))
-    write_planes(tmp_path / "plane.json", [PLANE])
+    write_planes(tmp_path / "plane.json", [KnownPlane(PLANE)])
     x, y, z = on_plane(0.1, 0.05)
     files = [str(tmp_path / "background.ply"), "--plane", str(tmp_path / "plane.json"), "--out"]
     where = [f"--hole={x},{y},{z},{RADIUS}"]
@@ -253,7 +253,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "were replaced by" in capsys.readouterr().out
     filled = read_capture(tmp_path / "filled.ply").cloud
     camera = look(0.4, 0.8)
-    assert render(filled, camera).alpha.numpy()[70:90, 70:90].min() > 0.97
+    assert render_gaussians(filled, camera).alpha.numpy()[70:90, 70:90].min() > 0.97
     assert (tmp_path / "filled.png").stat().st_size > 10_000
     before = (tmp_path / "filled.ply").read_bytes()
     quick = [*files, str(tmp_path / "filled.ply"), *where, "--steps", "0", "--inpainter", "telea", "--picture"]

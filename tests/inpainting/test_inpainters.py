@@ -62,7 +62,7 @@ def test_opencv_continues_flat_colour_exactly(method: OpenCvMethod) -> None:
 def test_names(tmp_path: Path) -> None:
     assert isinstance(inpainter_by_name("patch"), PatchSynthesis)
     assert inpainter_by_name("ns") == OpenCvInpainter(OpenCvMethod.NAVIER_STOKES)
-    with pytest.raises(UserError, match="--inpainter lama: give patch, telea, ns or a TorchScript file"):
+    with pytest.raises(UserError, match="inpainter lama: give patch, telea, ns or a TorchScript file"):
         inpainter_by_name("lama")
     with pytest.raises(UserError, match=r"gone\.pt: no such file; give the TorchScript file"):
         inpainter_by_name(str(tmp_path / "gone.pt"))

@@ -13,7 +13,7 @@ from egs_warp.fem.body import BodyState, make_body
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.objectives import Objective, SpinObjective
-from egs_warp.motions.follow import Follow, FollowPhase
+from egs_warp.motions.follow import Follow, FollowPhase, FollowPlan
 from egs_warp.motions.keyframes import Key, Quantity
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.stance import Ground
@@ -146,7 +146,7 @@ def test_missed_keys_are_told_and_reached_ones_are_not(place: Place) -> None:
         positions = place.standing + forward * place.body.height * place.ground.axes[0]
         follow.objectives(BodyState(positions, 0 * positions, time), None, DT)
     assert follow.phase is FollowPhase.FOLLOW
-    assert follow.planned() == {"keys": 3.0, "duration": 0.3, "worst_miss": pytest.approx(0.08)}
+    assert follow.planned() == FollowPlan(3.0, 0.3, pytest.approx(0.08))
     assert follow.notes()[0].startswith("k.json, key 2: head position at 0.2 s: reached (0.12, ")
     assert follow.notes()[1] == "k.json, key 3: head position at 0.3 s was not reached in time"
     follow.objectives(BodyState(place.standing, 0 * place.standing, 0.4), None, DT)
@@ -201,7 +201,7 @@ def test_a_turn_is_reached_the_way_round_that_was_asked(place: Place, part: str,
         follow = Follow(place, [key(1.0, part, Quantity.ORIENTATION, (0.0, 0.0, asked))])
         for time in np.linspace(0.0, 1.0, 61):
             follow.objectives(spun(place, share * time * asked, time), None, DT)
-        assert follow.planned()["worst_miss"] == pytest.approx(miss, abs=1e-6)
+        assert follow.planned().worst_miss == pytest.approx(miss, abs=1e-6)
         assert len(follow.notes()) == (miss > 36.0)
 
 

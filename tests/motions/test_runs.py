@@ -11,15 +11,14 @@ from egs_warp.assets import pawn
 from egs_warp.contact.terrain import step
 from egs_warp.fem.body import BodyState
 from egs_warp.geometry.plane import Plane
-from egs_warp.locomotion.rollout import simulate
 from egs_warp.locomotion.trajectory import Reached, audit, measure
 from egs_warp.motions.follow import Follow
 from egs_warp.motions.hop import Hop
 from egs_warp.motions.keyframes import Quantity
-from egs_warp.motions.repertoire import longest, parts_of
-from egs_warp.motions.script import parse_script
+from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
-from egs_warp.pipelines.creature import first_place, make_creature
+from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.performance import simulate
 
 UP = np.array([0.0, 0.0, 1.0])
 FORWARD = np.array([1.0, 0.0, 0.0])
@@ -31,16 +30,8 @@ def run(script: str, **ground) -> tuple[MotionSequence, list[Reached], np.ndarra
     """
     thing = pawn(device="cpu")
     creature = make_creature(thing.cloud, plane=thing.plane, **ground)
-    requests = parse_script(script)
-    sequence = MotionSequence(first_place(creature, FORWARD), parts_of(requests, creature.body.height))
-    simulation = simulate(
-        creature.stepper,
-        creature.geometry,
-        creature.start,
-        sequence,
-        frames=longest(requests),
-        finished=lambda: sequence.finished,
-    )
+    performance = simulate(creature, motion(script), forward=FORWARD)
+    sequence, simulation = performance.sequence, performance.simulation
     trajectory = simulation.trajectory
     bounds = audit(trajectory, newton_unconverged=sum(not report.converged for report in simulation.reports))
     assert bounds.momentum_residual <= 1e-5 and bounds.angular_momentum_residual <= 1e-4
@@ -76,7 +67,7 @@ def test_hops_land_on_their_squares(script: str, ground: dict) -> None:
     sequence, reached, ends = run(script, **ground)
     for done, end, result in zip(sequence.done, ends, reached, strict=True):
         assert isinstance(done.motion, Hop)
-        assert done.motion.miss(end) <= 0.1 * done.motion.target.distance
+        assert done.motion.miss(end) <= 0.1 * done.motion.jump.target.distance
         assert result.tilt_degrees < 12.0 and result.airborne_frames > 10.0
 
 
@@ -90,7 +81,7 @@ def test_the_head_follows_its_key_and_the_body_comes_to_rest(tmp_path: Path) -> 
     sequence, (reached,), (end,) = run(f"trajectory {file}")
     follow = sequence.done[0].motion
     assert isinstance(follow, Follow) and sequence.finished and follow.notes() == []
-    assert follow.planned()["worst_miss"] < 0.002
+    assert follow.planned().worst_miss < 0.002
     held = follow._measured("head", Quantity.POSITION, BodyState(end, 0 * end))
     assert np.allclose(held, [0.05, 0.0, 0.0], atol=0.002)
     assert reached.tilt_degrees < 2.0 and reached.airborne_frames == 0.0

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from egs_warp.errors import UserError
-from egs_warp.motions.script import parse_script
+from egs_warp.motions.script import motion
 
 
 def test_a_line_of_motions() -> None:
-    hop, twist, walk, jump = parse_script("hop x3, twist -90 height=0.3,walk 2, JUMP 1 0.25")
+    hop, twist, walk, jump = motion("hop x3, twist -90 height=0.3,walk 2, JUMP 1 0.25").requests
     assert (hop.name, hop.repeat, hop.asked) == ("hop", 3, {"distance": 0.7, "height": 0.3})
     assert twist.asked == {"heading_degrees": -90.0, "distance": 0.0, "height": 0.3}
     assert (walk.name, walk.asked["steps"], walk.repeat) == ("walk", 2.0, 1)
@@ -20,12 +20,12 @@ def test_a_line_of_motions() -> None:
 
 def test_flags_are_defaults_of_motions_that_take_them() -> None:
     flags = {"distance": 0.6, "heading_degrees": 45.0, "height": None}
-    jump, twist, hop = parse_script("jump, twist distance=0, hop 0.8", defaults=flags)
+    jump, twist, hop = motion("jump, twist distance=0, hop 0.8", **flags).requests
     assert jump.asked == {"distance": 0.6, "height": 0.2}
     assert twist.asked == {"heading_degrees": 45.0, "distance": 0.0, "height": 0.3}
     assert hop.asked["distance"] == 0.8
-    with pytest.raises(UserError, match="--heading-degrees: no motion of 'jump' takes it"):
-        parse_script("jump", defaults={"heading_degrees": 30.0})
+    with pytest.raises(UserError, match=r"^heading_degrees: no motion of 'jump' takes it$"):
+        motion("jump", heading_degrees=30.0)
 
 
 def test_a_json_script_is_the_same_as_its_line(tmp_path: Path) -> None:
@@ -34,24 +34,24 @@ def test_a_json_script_is_the_same_as_its_line(tmp_path: Path) -> None:
         '[{"motion": "hop", "repeat": 2, "distance": 0.5}, {"motion": "twist", "heading_degrees": 90},'
         ' {"motion": "trajectory", "file": "keys.csv"}]'
     )
-    assert parse_script(str(path)) == parse_script(f"hop 0.5 x2, twist 90, trajectory {tmp_path / 'keys.csv'}")
+    assert motion(str(path)) == motion(f"hop 0.5 x2, twist 90, trajectory {tmp_path / 'keys.csv'}")
 
 
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("fly", "--motion, motion 1: unknown motion 'fly'; known motions are: jump, hop, twist, walk, trajectory"),
-        ("jump,", "--motion, motion 2: nothing between two commas; name a motion: jump, hop, twist, walk, trajectory"),
-        ("hop x0", "--motion, motion 1 ('hop x0'): repeat 0; give a whole number from 1 to 100"),
-        ("jump 1 2 3", "--motion, motion 1 ('jump 1 2 3'): '3' is one value too many; jump takes distance, height"),
-        ("hop, jump far", "--motion, motion 2 ('jump far'): distance far: give a number of body heights from 0 to 10"),
-        ("jump nan", "--motion, motion 1 ('jump nan'): distance nan: give a number of body heights from 0 to 10"),
+        ("fly", "motion 1: unknown motion 'fly'; known motions are: jump, hop, twist, walk, trajectory"),
+        ("jump,", "motion 2: nothing between two commas; name a motion: jump, hop, twist, walk, trajectory"),
+        ("hop x0", "motion 1 ('hop x0'): repeat 0; give a whole number from 1 to 100"),
+        ("jump 1 2 3", "motion 1 ('jump 1 2 3'): '3' is one value too many; jump takes distance, height"),
+        ("hop, jump far", "motion 2 ('jump far'): distance far: give a number of body heights from 0 to 10"),
+        ("jump nan", "motion 1 ('jump nan'): distance nan: give a number of body heights from 0 to 10"),
         ("twist 9999", "('twist 9999'): heading_degrees 9999: give a number of degrees from -720 to 720"),
         ("jump height=0", "('jump height=0'): height 0: give a number of body heights above 0 up to 10"),
         ("walk 1.5", "('walk 1.5'): steps 1.5: give a whole number of steps from 1 to 50"),
         ("jump speed=2", "('jump speed=2'): 'speed' is unknown; jump takes distance, height"),
         ("trajectory", "('trajectory'): trajectory needs a file of key frames, as trajectory keys.json"),
-        ("hop x60, hop x60", "--motion asks for 120 motions; at most 100 are done in a row"),
+        ("hop x60, hop x60", "motion: 120 motions are asked for; at most 100 are done in a row"),
         ("jump x2 x3", "('jump x2 x3'): 'x3' is a second number of repeats; give one"),
         ("jump x" + 5000 * "9", "repeat inf; give a whole number from 1 to 100"),
         ("jump distance=1 distance=2", "distance is given twice; give it once"),
@@ -61,7 +61,7 @@ def test_a_json_script_is_the_same_as_its_line(tmp_path: Path) -> None:
 )
 def test_mistakes_of_a_line(line: str, message: str) -> None:
     with pytest.raises(UserError) as error:
-        parse_script(line)
+        motion(line)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -89,6 +89,6 @@ def test_mistakes_of_a_file(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "s.json"
     path.write_text(text)
     with pytest.raises(UserError) as error:
-        parse_script(str(path))
+        motion(str(path))
     assert str(error.value).startswith(str(path))
     assert message in str(error.value)

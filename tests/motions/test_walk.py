@@ -53,7 +53,7 @@ def test_a_walk_goes_along_its_feet_and_refuses_other_bodies() -> None:
         centres = [place.standing[walk.feet[index].sole].mean(axis=0) for index in pair]
         assert np.allclose(centres[0][:2], -centres[1][:2], atol=1e-9)
     planned = walk.planned()
-    assert planned["steps"] == 3.0 and planned["stride"] == pytest.approx(0.16) and walk.notes() == []
+    assert planned.steps == 3.0 and planned.stride == pytest.approx(0.16) and walk.notes() == []
     strides_out = Walk(place, 3, 0.8)
     assert strides_out.gait.step_length == pytest.approx(0.5 * min(foot.length for foot in strides_out.feet))
     assert strides_out.notes()[0].startswith("steps of 1.00 body heights were asked; the legs are long enough for 0.3")
@@ -82,7 +82,7 @@ def test_a_coarse_stool_takes_a_step(slope: float) -> None:
         if walk.phase is WalkPhase.REST:
             break
     trajectory = record(body, stepper.geometry, start, 0.0, reports, drag=0.0, segments=stepper.muscles.segment_count)
-    fell, reached, found = walk.footfalls(trajectory, 0, -1), measure(trajectory), audit(trajectory)
+    fell, reached, found = walk.reached(trajectory, 0, -1), measure(trajectory), audit(trajectory)
     assert walk.phase is WalkPhase.REST and walk.notes() == []
     assert fell.landings == 4 and fell.slip < 0.02 and fell.sole_shift < 0.05
     assert air > 0.3 * walk.gait.lift

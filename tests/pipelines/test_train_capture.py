@@ -14,7 +14,7 @@ from egs_warp.cli import main
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io import read_capture
-from egs_warp.render import render
+from egs_warp.render import render_gaussians
 from tests.training.test_finetune import ball, ring
 
 pytest.importorskip("torch")
@@ -30,7 +30,7 @@ def posed_folder(folder: Path, *, count: int = 9, size: int = 32, alpha: bool = 
     cloud = GaussianCloud.from_numpy(**ball(80), device="cpu")
     frames = []
     for number, camera in enumerate(ring(count, size)):
-        picture = render(cloud, camera, background=(0.2, 0.3, 0.4))
+        picture = render_gaussians(cloud, camera, background=(0.2, 0.3, 0.4))
         pixels = picture.colour_srgb8()[:, :, ::-1]
         if alpha:
             pixels = np.dstack([pixels, np.rint(picture.alpha.numpy() * 255).astype(np.uint8)])

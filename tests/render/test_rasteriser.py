@@ -9,7 +9,7 @@ import warp as wp
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.render import render, render_views
+from egs_warp.render import render_gaussians, render_views
 from egs_warp.render.projection import project, view_from_camera
 from egs_warp.render.tiles import _lists_by_counting, _lists_by_sorting
 from tests.support.render_twin import render_twin, rotation_matrices, sh_basis
@@ -64,21 +64,21 @@ def assert_same(image: object, twin: dict[str, np.ndarray], *, near_cut: float =
 def test_same_picture_as_the_twin(device: str, coefficients: int) -> None:
     values = random_scene(300, coefficients=coefficients)
     camera = camera_of()
-    assert_same(render(cloud_of(values, device), camera), render_twin(values, camera))
+    assert_same(render_gaussians(cloud_of(values, device), camera), render_twin(values, camera))
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (16, 16), (17, 33), (250, 3)])
 def test_sizes_that_are_no_multiple_of_a_tile(device: str, width: int, height: int) -> None:
     values = random_scene(200, seed=width)
     camera = camera_of(width, height)
-    assert_same(render(cloud_of(values, device), camera), render_twin(values, camera), near_cut=0.02)
+    assert_same(render_gaussians(cloud_of(values, device), camera), render_twin(values, camera), near_cut=0.02)
 
 
 def test_antialiased_mode_and_background_image(device: str) -> None:
     values = random_scene(300, seed=3, log_scale=-4.5)
     camera = camera_of()
     background = np.random.default_rng(1).uniform(size=(camera.height, camera.width, 3))
-    image = render(cloud_of(values, device), camera, background=background, antialiased=True)
+    image = render_gaussians(cloud_of(values, device), camera, background=background, antialiased=True)
     assert_same(image, render_twin(values, camera, background=background, antialiased=True))
 
 
@@ -87,13 +87,13 @@ def test_long_thin_splats_do_not_cancel(device: str) -> None:
     values = random_scene(60, seed=5)
     values["log_scales"] = np.tile([1.0, -7.0, -9.0], (60, 1))
     camera = camera_of(200, 160)
-    assert_same(render(cloud_of(values, device), camera), render_twin(values, camera), near_cut=0.02)
+    assert_same(render_gaussians(cloud_of(values, device), camera), render_twin(values, camera), near_cut=0.02)
 
 
 def test_zero_visible_gives_the_background(device: str) -> None:
     values = random_scene(20)
     values["means"] -= [0, 0, 100.0]
-    image = render(cloud_of(values, device), camera_of(), background=(0.2, 0.4, 0.6))
+    image = render_gaussians(cloud_of(values, device), camera_of(), background=(0.2, 0.4, 0.6))
     np.testing.assert_allclose(image.colour.numpy(), np.broadcast_to([0.2, 0.4, 0.6], (45, 67, 3)), rtol=1e-6)
     assert not image.alpha.numpy().any()
     assert not image.depth.numpy().any()
@@ -103,7 +103,7 @@ def test_opacity_zero_and_one(device: str) -> None:
     camera = camera_of()
     for logit, centre_alpha in ((-100.0, 0.0), (100.0, 0.999)):
         values = one_splat(opacity_logits=[logit], log_scales=[[1.0, 1.0, 1.0]])
-        image = render(cloud_of(values, device), camera)
+        image = render_gaussians(cloud_of(values, device), camera)
         assert_same(image, render_twin(values, camera))
         assert image.alpha.numpy()[22, 33] == pytest.approx(centre_alpha, abs=1e-3)
 
@@ -112,7 +112,7 @@ def test_tiny_scales_show_as_the_low_pass(device: str) -> None:
     """A Gaussian of scale e^-10 covers what the 0.3 px low-pass gives it: 2 pi 0.3 opacity square pixels of alpha."""
     values = one_splat(log_scales=[[-10.0] * 3], opacity_logits=[8.0])
     camera = camera_of(64, 64)
-    image = render(cloud_of(values, device), camera)
+    image = render_gaussians(cloud_of(values, device), camera)
     assert_same(image, render_twin(values, camera))
     # The cut at 1/255 takes away less than 1/255 of the whole; sampling on the pixel grid adds less than 3 %.
     assert image.alpha.numpy().sum() == pytest.approx(2 * np.pi * 0.3, rel=0.05)
@@ -122,18 +122,18 @@ def test_camera_inside_a_gaussian_and_one_that_covers_the_screen(device: str) ->
     camera = camera_of()
     big = {"log_scales": [[3.0, 3.0, 3.0]], "opacity_logits": [0.0]}
     inside = one_splat(means=[EYE + 0.001 * camera.rotation[2]], **big)
-    assert not render(cloud_of(inside, device), camera).alpha.numpy().any(), "nearer than the near plane"
+    assert not render_gaussians(cloud_of(inside, device), camera).alpha.numpy().any(), "nearer than the near plane"
     just_ahead = one_splat(means=[EYE + 0.05 * camera.rotation[2]], **big)
-    assert_same(render(cloud_of(just_ahead, device), camera), render_twin(just_ahead, camera))
+    assert_same(render_gaussians(cloud_of(just_ahead, device), camera), render_twin(just_ahead, camera))
     covering = one_splat(**big)
-    image = render(cloud_of(covering, device), camera)
+    image = render_gaussians(cloud_of(covering, device), camera)
     assert image.alpha.numpy().min() > 0.45
 
 
 def test_near_and_far_planes(device: str) -> None:
     values = random_scene(200, seed=8)
     camera = camera_of(near=2.6, far=3.4)
-    image = render(cloud_of(values, device), camera)
+    image = render_gaussians(cloud_of(values, device), camera)
     assert_same(image, render_twin(values, camera))
     depth = image.depth.numpy()[image.alpha.numpy() > 0.01]
     assert 2.6 <= depth.min() < depth.max() <= 3.4
@@ -142,7 +142,7 @@ def test_near_and_far_planes(device: str) -> None:
 def test_median_depth_and_normal(device: str) -> None:
     values = random_scene(200, seed=11)
     camera = camera_of()
-    image = render(cloud_of(values, device), camera, geometry=True)
+    image = render_gaussians(cloud_of(values, device), camera, geometry=True)
     twin = render_twin(values, camera)
     assert np.abs(image.normal.numpy() - twin["normal"]).mean() < 1e-5
     # A rounding in the transmittance can move the median to the next splat in a few pixels.
@@ -155,7 +155,9 @@ def test_several_cameras_and_what_does_not_fit(monkeypatch: pytest.MonkeyPatch) 
     cameras = [camera_of(20, 30), camera_of(40, 10)]
     images = render_views(cloud, cameras, background=(0, 0, 0))
     for camera, image in zip(cameras, images, strict=True):
-        assert np.array_equal(image.colour.numpy(), render(cloud, camera, background=(0, 0, 0)).colour.numpy())
+        assert np.array_equal(
+            image.colour.numpy(), render_gaussians(cloud, camera, background=(0, 0, 0)).colour.numpy()
+        )
 
     def no_memory(*_: object, **__: object) -> None:
         raise RuntimeError("Failed to allocate 123 bytes on device 'cpu'")
@@ -164,7 +166,7 @@ def test_several_cameras_and_what_does_not_fit(monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(
         UserError, match=r"^render: 50 Gaussians at 20 x 30 do not fit into the memory of cpu; render a"
     ):
-        render(cloud, cameras[0])
+        render_gaussians(cloud, cameras[0])
 
 
 @pytest.mark.cuda
@@ -180,11 +182,11 @@ def test_a_full_gpu_refuses_and_works_again() -> None:
     with pytest.raises(
         UserError, match=r"^render: 200000 Gaussians at 640 x 480 do not fit into the memory of cuda:0; "
     ):
-        render(cloud, camera)
+        render_gaussians(cloud, camera)
     del hog
     torch.cuda.empty_cache()
     small = random_scene(300)
-    assert_same(render(cloud_of(small, "cuda:0"), camera_of()), render_twin(small, camera_of()))
+    assert_same(render_gaussians(cloud_of(small, "cuda:0"), camera_of()), render_twin(small, camera_of()))
 
 
 def test_rotating_the_object_equals_rotating_the_camera(device: str) -> None:
@@ -195,7 +197,10 @@ def test_rotating_the_object_equals_rotating_the_camera(device: str) -> None:
     left_product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     turned = values | {"means": values["means"] @ turn.T, "rotations": values["rotations"] @ left_product.T}
     turned_camera = Camera(**{**camera.__dict__, "rotation": camera.rotation @ turn.T})
-    one, other = render(cloud_of(values, device), camera), render(cloud_of(turned, device), turned_camera)
+    one, other = (
+        render_gaussians(cloud_of(values, device), camera),
+        render_gaussians(cloud_of(turned, device), turned_camera),
+    )
     off = np.abs(one.colour.numpy() - other.colour.numpy())
     assert off.mean() < 1e-5
     assert (off > 1e-4).mean() < 2e-3
@@ -213,7 +218,7 @@ def test_depth_of_a_half_opaque_plane_is_the_planes_depth(device: str) -> None:
         "sh": np.zeros((count, 1, 3)),
     }
     camera = Camera.look_at(np.array([0.5, -1.5, 3.0]), np.zeros(3), np.array([0, 0, 1.0]), width=64, height=48)
-    image = render(cloud_of(values, device), camera)
+    image = render_gaussians(cloud_of(values, device), camera)
     alpha, depth = image.alpha.numpy(), image.depth.numpy()
     py, px = np.mgrid[:48, :64] + 0.5
     rays = (
@@ -233,16 +238,16 @@ def test_sh_signs_follow_the_inria_convention(device: str) -> None:
         sh = np.zeros((1, 16, 3))
         sh[0, k] = 0.5
         values = one_splat(sh=sh, opacity_logits=[100.0], log_scales=[[3.0] * 3])
-        centre = render(cloud_of(values, device), camera, background=(0, 0, 0)).colour.numpy()[4, 4, 0]
+        centre = render_gaussians(cloud_of(values, device), camera, background=(0, 0, 0)).colour.numpy()[4, 4, 0]
         assert centre == pytest.approx(max(0.5 + 0.5 * basis[k], 0) * 0.999, abs=2e-4), k
 
 
 def test_threads_and_repeats_change_no_bit() -> None:
     values = random_scene(400, seed=6)
     cloud, camera = cloud_of(values), camera_of(150, 130)
-    first = render(cloud, camera, threads=1)
+    first = render_gaussians(cloud, camera, threads=1)
     for threads in (1, 2, 3):
-        again = render(cloud, camera, threads=threads)
+        again = render_gaussians(cloud, camera, threads=threads)
         for name in ("colour", "alpha", "depth"):
             assert np.array_equal(getattr(first, name).numpy(), getattr(again, name).numpy())
 
@@ -251,9 +256,9 @@ def test_threads_and_repeats_change_no_bit() -> None:
 def test_cuda_repeats_change_no_bit_and_match_the_cpu() -> None:
     values = random_scene(2000, seed=6)
     camera = camera_of(150, 130)
-    first, again = (render(cloud_of(values, "cuda:0"), camera) for _ in range(2))
+    first, again = (render_gaussians(cloud_of(values, "cuda:0"), camera) for _ in range(2))
     assert np.array_equal(first.colour.numpy(), again.colour.numpy())
-    cpu = render(cloud_of(values), camera)
+    cpu = render_gaussians(cloud_of(values), camera)
     assert_same(first, {name: getattr(cpu, name).numpy() for name in ("colour", "alpha", "depth")})
 
 
@@ -266,19 +271,19 @@ def test_non_finite_gaussians_are_rejected_by_name(device: str) -> None:
             **{**cloud.__dict__, name: wp.array(values, dtype=getattr(cloud, name).dtype, device=device)}
         )
         with pytest.raises(UserError, match=f"^render: {name} of Gaussian 7 is not finite; repair or remove it$"):
-            render(broken, camera_of())
+            render_gaussians(broken, camera_of())
 
 
 def test_impossible_cameras_and_backgrounds_are_refused() -> None:
     cloud = cloud_of(one_splat())
     with pytest.raises(UserError, match=r"image size 0 x 45 must be at least 1 x 1"):
-        render(cloud, Camera(**{**camera_of().__dict__, "width": 0}))
+        render_gaussians(cloud, Camera(**{**camera_of().__dict__, "width": 0}))
     with pytest.raises(UserError, match=r"near 2.0 and far 1.0 must satisfy"):
-        render(cloud, camera_of(near=2.0, far=1.0))
+        render_gaussians(cloud, camera_of(near=2.0, far=1.0))
     with pytest.raises(UserError, match="pose and intrinsics must be finite"):
-        render(cloud, Camera(**{**camera_of().__dict__, "fx": float("nan")}))
+        render_gaussians(cloud, Camera(**{**camera_of().__dict__, "fx": float("nan")}))
     with pytest.raises(UserError, match=r"an image of 45 x 67 x 3, not shape \(3, 3\)"):
-        render(cloud, camera_of(), background=np.ones((3, 3)))
+        render_gaussians(cloud, camera_of(), background=np.ones((3, 3)))
 
 
 @pytest.mark.parametrize("spread", [1.0, 1e-5])

@@ -142,7 +142,7 @@ def test_finetuning_clears_the_plane_and_keeps_the_looks() -> None:
     """Eq. (20), (21): a small ball on its plane; what crossed it is clear of it afterwards, and the picture stays."""
     pytest.importorskip("torch")
     from egs_warp.geometry.camera import Camera
-    from egs_warp.render import render
+    from egs_warp.render import render_gaussians
     from egs_warp.training.finetune import psnr
 
     random = np.random.default_rng(2)
@@ -168,6 +168,6 @@ def test_finetuning_clears_the_plane_and_keeps_the_looks() -> None:
     assert (after > 0.0).all()
     camera = Camera.look_at(np.array([0.3, -3.0, 1.0]), np.array([0.0, 0.0, 0.5]), floor.normal, width=96, height=96)
     view = views_above(ball, floor, [camera])[0]
-    pictures = [render(one, camera, background=(0.0, 0.0, 0.0)).colour.numpy() for one in (ball, tuned)]
+    pictures = [render_gaussians(one, camera, background=(0.0, 0.0, 0.0)).colour.numpy() for one in (ball, tuned)]
     counted = view.weight[..., None] > 0
     assert psnr(np.where(counted, pictures[0], 0.0), np.where(counted, pictures[1], 0.0)) > 30.0

@@ -8,7 +8,7 @@ import pytest
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.render import render
+from egs_warp.render import render_gaussians
 from egs_warp.segmentation.votes import MaskedView, blending_votes
 
 SH_0 = 0.28209479177387814
@@ -44,7 +44,7 @@ def test_votes_are_the_weights_that_paint_each_gaussian(device: str) -> None:
             sh,
             device=device,
         )
-        weight = render(painted, view, background=(0.0, 0.0, 0.0)).colour.numpy()[..., 0].astype(np.float64)
+        weight = render_gaussians(painted, view, background=(0.0, 0.0, 0.0)).colour.numpy()[..., 0].astype(np.float64)
         # The second view swaps in and out.
         assert votes.inside[chosen] == pytest.approx(weight.sum(), rel=1e-4, abs=1e-4)
         assert votes.outside[chosen] == pytest.approx(weight.sum(), rel=1e-4, abs=1e-4)

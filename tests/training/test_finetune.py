@@ -13,7 +13,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 
 torch = pytest.importorskip("torch")
-from egs_warp.render import render  # noqa: E402
+from egs_warp.render import render_gaussians  # noqa: E402
 from egs_warp.training.finetune import (  # noqa: E402
     MIN_LOG_SCALE,
     Densification,
@@ -51,7 +51,9 @@ def ball(count: int = 150, seed: int = 0) -> dict[str, np.ndarray]:
 
 
 def mean_psnr(cloud: GaussianCloud, views: list[TrainingView]) -> float:
-    return float(np.mean([psnr(np.clip(render(cloud, v.camera).colour.numpy(), 0, 1), v.image) for v in views]))
+    return float(
+        np.mean([psnr(np.clip(render_gaussians(cloud, v.camera).colour.numpy(), 0, 1), v.image) for v in views])
+    )
 
 
 def test_a_disturbed_capture_is_restored_from_its_own_renders() -> None:

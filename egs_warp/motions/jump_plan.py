@@ -1,0 +1,117 @@
+"""Numbers of a jump, from what is asked and the body's height alone (DESIGN 9)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+CARRIED = 2.0
+"""Speed ahead at the end of a crouch, in leans over its time: 2 is a steady acceleration, 0 a stop."""
+LEAN = 0.2
+"""Of the distance: how far the weight is put ahead before take-off. With it over the middle of the feet a push forward
+would turn the body backward."""
+FURTHEST_LEAN = 0.35
+"""Of the way from under the centre of mass to the front of the feet."""
+DEEPEST_CROUCH = 0.3
+"""Of the height of the centre of mass; a higher jump thrusts harder instead."""
+
+
+@dataclass(frozen=True)
+class JumpTarget:
+    """What is asked, in metres."""
+
+    distance: float
+    height: float
+    rise: float = 0.0
+    """How much higher the landing is than the start."""
+
+
+@dataclass(frozen=True)
+class JumpPlan:
+    """Numbers a jump is planned with; metres, seconds, m/s."""
+
+    crouch_depth: float
+    extension: float
+    crouch_time: float
+    thrust_time: float
+    flight_time: float
+    speed_up: float
+    speed_forward: float
+    lean: float
+    """How far the centre of mass moves ahead while crouching."""
+    landing_lag: float
+    """How far it is behind its place over the base at touch-down."""
+    landing_rate: float
+    """1/s of the critically damped descent on landing."""
+
+    @property
+    def _down(self) -> np.ndarray:
+        """(3,) from where the centre of mass stands to where the crouch brings it."""
+        return np.array([self.lean, 0.0, -self.crouch_depth])
+
+    @property
+    def _onset(self) -> np.ndarray:
+        """(3,) m/s. The crouch ends at rest over the ground but already on the way ahead: friction has little left to
+        give during the thrust."""
+        return np.array([min(CARRIED * self.lean / self.crouch_time, self.speed_forward), 0.0, 0.0])
+
+    def crouch(self, start: np.ndarray, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
+        """Position and velocity (3,) of the centre of mass that stood at ``start`` (3,), ``elapsed`` seconds into the
+        crouch."""
+        s = min(elapsed / self.crouch_time, 1.0)
+        blend, slope = s * s * (3 - 2 * s), 6 * s * (1 - s) / self.crouch_time
+        carried, rate = s * s * (s - 1) * self.crouch_time, s * (3 * s - 2)
+        return start + blend * self._down + carried * self._onset, slope * self._down + rate * self._onset
+
+    def thrust(self, start: np.ndarray, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
+        """The same, ``elapsed`` seconds into the thrust: a steady acceleration to the speed of the take-off."""
+        onset, take_off = self._onset, np.array([self.speed_forward, 0.0, self.speed_up])
+        position = start + self._down + onset * elapsed + 0.5 * (take_off - onset) * elapsed**2 / self.thrust_time
+        return position, onset + (take_off - onset) * elapsed / self.thrust_time
+
+
+def plan_jump(
+    target: JumpTarget,
+    *,
+    height: float,
+    com_height: float,
+    support_ahead: float,
+    gravity: float,
+    step: float,
+    lean: float,
+) -> JumpPlan:
+    """Stroke, times and take-off velocity for a jump of ``target`` by a body of ``height`` H (DESIGN 9).
+
+    Its centre of mass is ``com_height`` over the ground and the front of its feet ``support_ahead`` of it, gravity is
+    in m/s^2, a solver step takes ``step`` seconds and ``lean`` is that of the plan; metres.
+    """
+    time_unit = np.sqrt(height / gravity)
+    extension = min(0.04 * height, 0.25 * target.height)
+    rise = target.height - extension
+    speed_up = np.sqrt(2.0 * gravity * rise) + 0.5 * gravity * step
+    acceleration = 1.6 * gravity
+    stroke = max(speed_up**2 / (2.0 * acceleration), extension + 0.02 * height)
+    thrust_time = 2.0 * stroke / speed_up
+    # Every step goes its whole way at the speed of its end: half a step's way more than steady acceleration takes.
+    stroke += 0.5 * speed_up * step
+    flight_time = np.sqrt(2.0 * rise / gravity) + np.sqrt(2.0 * max(rise - target.rise, 0.0) / gravity)
+    # A body that comes in with speed v stops over its base if that is ahead by v sqrt(h/g) (the capture point); the
+    # front of the footprint helps.
+    capture_time = np.sqrt(com_height / (1.3 * gravity))
+    footprint_help = min(0.3 * support_ahead, 0.5 * target.distance * capture_time / flight_time)
+    speed_forward = (target.distance - lean + footprint_help) / (flight_time + capture_time + 0.5 * thrust_time)
+    crouch_depth = min(stroke - extension, DEEPEST_CROUCH * com_height)
+    thrust_time = max(2.0 * (crouch_depth + extension) / speed_up - step, 2.0 * step)
+    return JumpPlan(
+        crouch_depth=float(crouch_depth),
+        extension=float(extension),
+        crouch_time=float(1.1 * time_unit),
+        thrust_time=float(thrust_time),
+        flight_time=float(flight_time),
+        speed_up=float(speed_up),
+        speed_forward=float(speed_forward),
+        lean=float(lean),
+        landing_lag=float(speed_forward * capture_time - footprint_help),
+        landing_rate=float(4.0 / time_unit),
+    )

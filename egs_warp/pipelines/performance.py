@@ -1,0 +1,102 @@
+"""A creature moves: motions by name become what its body does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from egs_warp.geometry.camera import Camera
+from egs_warp.locomotion import rollout
+from egs_warp.locomotion.rollout import FRAME_RATE, Simulation
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.script import Script
+from egs_warp.motions.sequence import MotionSequence, Place
+from egs_warp.pipelines.creature import FILMED_FROM, Creature, first_place
+
+
+@dataclass(frozen=True)
+class Performance:
+    """What a creature did."""
+
+    creature: Creature
+    place: Place
+    """Where it stood at the start."""
+    sequence: MotionSequence
+    """The motions that it went through."""
+    simulation: Simulation
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Every solver step."""
+        return self.simulation.trajectory
+
+    @property
+    def frames(self) -> np.ndarray:
+        """(n, N, 3) metres: the nodes of the cage in each frame of a video at 60 Hz."""
+        return self.trajectory.positions[self.simulation.frames]
+
+    def camera(self, size: int, view_from: np.ndarray | None = None) -> Camera:
+        """A fixed camera of ``size`` pixels both ways that holds the whole motion: in front of the motion's side, or in
+        the direction ``view_from`` (3,) of the capture."""
+        ground = self.place.ground
+        local = ground.local(self.trajectory.positions).reshape(-1, 3)
+        low, high = local.min(axis=0), local.max(axis=0)
+        low[2] = min(low[2], 0.0)
+        middle = 0.5 * (low + high)
+        corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+        direction = np.array(FILMED_FROM)
+        if view_from is not None:
+            direction = ground.axes @ self.creature.frame.axes @ np.asarray(view_from, float)
+        direction /= np.linalg.norm(direction)
+        distance = float(np.linalg.norm(high - low))
+        for _ in range(60):
+            camera = Camera.look_at(
+                ground.world(middle + distance * direction),
+                ground.world(middle),
+                ground.axes[2],
+                width=size,
+                height=size,
+                vertical_fov_degrees=30.0,
+                near=0.01 * distance,
+            )
+            seen = ground.world(corners) @ camera.rotation.T + camera.translation
+            reach = np.abs(seen[:, :2] / seen[:, 2:]).max() * camera.fx / (0.5 * size)
+            if seen[:, 2].min() > 0 and reach < 0.86:
+                break
+            distance *= 1.05
+        return camera
+
+
+def simulate(
+    creature: Creature,
+    motion: Script,
+    *,
+    frames: int | None = None,
+    forward: np.ndarray | None = None,
+    step: float | None = None,
+    progress: Callable[[int], object] = lambda frame: None,
+) -> Performance:
+    """Run ``motion`` for ``frames`` at 60 Hz, or else until the body has come to rest or the motion is cut off.
+
+    ``forward`` (3,) is the way of the motion, the long axis of the footprint if not given; ``step`` the seconds of a
+    solver step, if not the usual. ``progress`` is told each frame done. Raises ``UserError`` for a motion that the body
+    cannot do.
+    """
+    place = first_place(creature, forward, step=step)
+    motion.check(place)
+    sequence = MotionSequence(place, motion.parts(creature.body.height))
+    # A frame is as long as a step that is longer than it.
+    share = 1.0 if step is None else min(1.0, 1.0 / (FRAME_RATE * step))
+    simulation = rollout.simulate(
+        creature.stepper,
+        creature.geometry,
+        creature.start,
+        sequence,
+        frames=frames or round(share * motion.frames()),
+        step=step,
+        finished=lambda: frames is None and sequence.finished,
+        progress=progress,
+    )
+    return Performance(creature, place, sequence, simulation)

@@ -1,0 +1,48 @@
+"""``plane.json``: what is known of planes comes back, what is not goes along, what is damaged is named."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.plane import Plane
+from egs_warp.io.planes import HoleOutline, KnownPlane, read_planes, write_planes
+
+FLOOR = Plane(np.array([0.0, 0.0, 1.0]), -0.25)
+HOLE = HoleOutline(np.array([1.0, 2.0, 0.25]), 0.5, (8, 6), (np.array([[1, 1], [4, 1], [4, 5]]),))
+
+
+def test_all_that_is_known_comes_back(tmp_path: Path) -> None:
+    known = KnownPlane(FLOOR, np.array([1.0, 2.0, 3.0]), 0.7, 0.01, 0.9, 120, 0.3, HOLE, {"remark": ["a", 1]})
+    write_planes(tmp_path / "plane.json", [known, KnownPlane(FLOOR)])
+    full, bare = read_planes(tmp_path / "plane.json")
+    assert full.to_json() == known.to_json() and full.pixels == 120 and full.others == {"remark": ["a", 1]}
+    assert full.hole is not None and full.hole.texels == (8, 6) and np.array_equal(full.hole.outlines, HOLE.outlines)
+    assert bare.to_json() == {"normal": [0.0, 0.0, 1.0], "offset": -0.25}
+
+
+def test_what_is_found_anew_takes_the_place_of_what_was_known() -> None:
+    before = KnownPlane(FLOOR, noise=0.01, size=0.7, others={"remark": 1})
+    now = KnownPlane(Plane(np.array([0.0, 0.0, 1.0]), 0.0), size=0.8).over(before)
+    assert now.plane.offset == 0.0 and (now.noise, now.size, now.others) == (0.01, 0.8, {"remark": 1})
+
+
+@pytest.mark.parametrize(
+    ("facts", "message"),
+    [
+        ({"hole": {"texels": [8, 6]}}, "its hole is damaged; make it again with egs-warp segment"),
+        ({"hole": 3}, "its hole is damaged; make it again with egs-warp segment"),
+        ({"noise": "low"}, "the facts of plane 0 are damaged; make it again"),
+        ({"centre": [1.0]}, "the facts of plane 0 are damaged; make it again"),
+    ],
+)
+def test_damage_is_named(tmp_path: Path, facts: dict[str, object], message: str) -> None:
+    path = tmp_path / "plane.json"
+    path.write_text(json.dumps({"planes": [{"normal": [0, 0, 1], "offset": 0, **facts}]}))
+    with pytest.raises(UserError) as error:
+        read_planes(path)
+    assert str(error.value) == f"{path}: {message}"

@@ -1,0 +1,48 @@
+"""Errors name arguments; commands name flags."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from egs_warp.commands.flags import flag_of, one_line_errors
+from egs_warp.errors import ArgumentError, UserError
+
+PACKAGE = Path(__file__).parents[1] / "egs_warp"
+FLAG = re.compile(r"(?<![\w-])--[a-z]")
+
+
+def test_an_argument_is_called_by_its_name_or_by_its_flag() -> None:
+    error = ArgumentError("metres_per_unit", "give a positive number", value=-2.0)
+    assert str(error) == "metres_per_unit -2.0: give a positive number"
+    assert error.told(flag_of) == "--metres-per-unit -2.0: give a positive number"
+    error = ArgumentError("solids", "the body is inside number 2", check=("plane", "muscles_file"))
+    assert str(error) == "solids: the body is inside number 2; check plane and muscles_file"
+    assert error.told(flag_of) == "--terrain: the body is inside number 2; check --plane and --muscles"
+    assert UserError("object: it is flat", check=("up",)).told(flag_of) == "object: it is flat; check --up"
+
+
+def test_a_line_stays_one_line() -> None:
+    error = ArgumentError("motion", "a\nb" + 3000 * "c", value="\x1b[1m")
+    assert str(error).startswith("motion \\x1b[1m: a\\nbccc") and len(str(error)) < 2010
+
+
+def test_a_program_ends_with_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end, one_line_errors("jump.py"):
+        raise ArgumentError("size", "give a number of pixels", value=0)
+    assert end.value.code == 2 and capsys.readouterr().err == "jump.py: --size 0: give a number of pixels\n"
+
+
+def test_only_the_commands_speak_of_flags() -> None:
+    """No text of the library, docstrings apart, holds ``--flag``."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        if path.is_relative_to(PACKAGE / "commands") or path.name == "cli.py":
+            continue
+        tree = ast.parse(path.read_text())
+        bare = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in bare:
+                assert not FLAG.search(node.value), f"{path.name}:{node.lineno}: {node.value}"

@@ -1,0 +1,82 @@
+"""``import egs_warp as egs``: small, lazy, complete, and as README and docs say."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import egs_warp as egs
+
+ROOT = Path(__file__).parents[1]
+FACE = ROOT / "egs_warp" / "__init__.py"
+
+
+def readme_lines() -> str:
+    """The Python of the README."""
+    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    return block
+
+
+def test_the_face_is_what_the_docs_teach() -> None:
+    rows = re.findall(r"^\| (`.*?) \|", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE)
+    taught = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
+    assert sorted(taught) == sorted(egs.__all__) == dir(egs)
+    for name in egs.__all__:
+        assert getattr(egs, name).__doc__, name
+    with pytest.raises(AttributeError, match="module 'egs_warp' has no attribute 'fly'"):
+        egs.fly  # noqa: B018
+
+
+def test_type_checkers_see_the_same_names_in_the_same_places() -> None:
+    (block,) = [node for node in ast.parse(FACE.read_text()).body if isinstance(node, ast.If)]
+    seen = {alias.name: node.module for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    assert seen == egs._MODULE_OF
+    assert FACE.with_name("py.typed").exists()
+
+
+def test_importing_the_face_imports_nothing_else() -> None:
+    code = "import sys, egs_warp; print(*sorted(name.split('.')[0] for name in sys.modules))"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    assert not {"torch", "cv2", "warp", "numpy", "scipy"} & set(loaded.split())
+    code += "; egs_warp.UserError; assert 'warp' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT, capture_output=True)
+
+
+def test_the_examples_import_the_package_by_its_face_alone() -> None:
+    for path in sorted((ROOT / "examples").glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom):
+                assert not (node.module or "").startswith("egs_warp"), f"{path.name}: {node.module}"
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names if alias.name.startswith("egs_warp")]
+                assert set(names) <= {"egs_warp"}, f"{path.name}: {names}"
+
+
+def test_the_readme_shows_the_paper_in_fifteen_lines() -> None:
+    assert sum(bool(line.strip()) for line in readme_lines().splitlines()) <= 15
+
+
+@pytest.mark.slow
+def test_the_lines_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Word for word, on the pawn and the floor near it, cut off early: a video of some size comes out, and the pawn has
+    crouched."""
+    room = egs.scene("pawn", device="cpu").whole()[0]
+    near = np.linalg.norm(room.means.numpy()[:, :2], axis=1) < 1.2
+    egs.write_ply(tmp_path / "scene.ply", room.subset(near))
+    monkeypatch.chdir(tmp_path)
+    simulate = egs.simulate
+    monkeypatch.setattr(egs, "simulate", lambda creature, motion: simulate(creature, motion, frames=24))
+    names: dict[str, object] = {}
+    exec(compile(readme_lines(), "README.md", "exec"), names)
+    performance = names["performance"]
+    assert isinstance(performance, egs.Performance) and len(performance.frames) == 25
+    heights = performance.frames @ performance.place.ground.axes[2]
+    assert heights[-1].max() < heights[0].max() - 0.005
+    assert np.isfinite(performance.frames).all()
+    assert (tmp_path / "jump.mp4").stat().st_size > 10_000
