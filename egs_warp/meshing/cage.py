@@ -82,7 +82,7 @@ def build_cage(
 
     ``dilation`` is in units of the object's longest side; it is raised, and the mesh refined (up to 1.75 times the
     nodes), until all but 0.07 % of the object's opacity mass is inside.
-    The same input gives the same bits (``CageMethod.VOXEL``). DESIGN section 4.
+    The same input gives the same bits (``CageMethod.VOXEL``). See docs/concepts/cage.md.
 
     Raises ``UserError`` for an object without volume (flat, tiny, nothing opaque above the plane).
     """

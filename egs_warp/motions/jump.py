@@ -1,4 +1,4 @@
-"""Motions as closed-loop state machines that write objectives from the measured state (DESIGN 9)."""
+"""Motions as closed-loop state machines that write objectives from the measured state (docs/concepts/motions.md)."""
 
 from __future__ import annotations
 
@@ -73,7 +73,9 @@ def plan_jump(
     step: float,
     lean: float | None = None,
 ) -> JumpPlan:
-    """Stroke, times and take-off velocity for a jump of ``target`` by a body of ``height`` H (DESIGN 9).
+    """Stroke, times and take-off velocity for a jump of ``target`` by a body of ``height`` H.
+
+    See docs/concepts/motions.md.
 
     ``lean`` (metres) replaces the choice made here.
     """
