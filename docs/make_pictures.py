@@ -62,6 +62,8 @@ PICTURES = (
     Picture("bow.mp4", BOW, "bow/trajectory.mp4", 400),
     Picture("bow.webp", BOW, "bow/trajectory.mp4", 400, at=0.2),
     Picture("bow_sheet.webp", BOW, "bow/sheet.png", 1200),
+    Picture("scene.mp4", SCENE, "figurine/jump.mp4", 400),
+    Picture("scene.webp", SCENE, "figurine/jump.mp4", 400, at=0.45),
     Picture("segment.webp", SCENE, "figurine/segment.png", 1200),
     Picture("filled.webp", SCENE, "figurine/filled.png", 1200),
     Picture("muscles.webp", MUSCLES, "muscles.png", 1200),

@@ -18,16 +18,17 @@ document$.subscribe(({ body }) => {
   for (const film of films) seen.observe(film);
 });
 
-// A command that is wrapped breaks between its options, not within "--object".
+// A line of code that is wrapped breaks between options and in paths, not within "--object" or a name.
 document$.subscribe(({ body }) => {
-  for (const code of body.querySelectorAll(".gallery pre code")) {
+  for (const code of body.querySelectorAll(".gallery pre code, :not(pre) > code")) {
     for (const text of textsOf(code)) {
-      text.replaceWith(...text.data.split(/(--\S+)/).map((part) => {
-        if (!part.startsWith("--")) return part;
+      text.replaceWith(...text.data.split(/(--[\w-]+|\/|::)/).flatMap((part) => {
+        if (part === "/" || part === "::") return [part, document.createElement("wbr")];
+        if (!part.startsWith("--")) return [part];
         const option = document.createElement("span");
         option.className = "option";
         option.textContent = part;
-        return option;
+        return [option];
       }));
     }
   }
