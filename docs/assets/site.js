@@ -20,7 +20,7 @@ document$.subscribe(({ body }) => {
 
 // A line of code that is wrapped breaks between options and in paths, not within "--object" or a name.
 document$.subscribe(({ body }) => {
-  for (const code of body.querySelectorAll(".gallery pre code, :not(pre) > code")) {
+  for (const code of body.querySelectorAll("pre code:not(:has(span[class])), :not(pre) > code")) {
     for (const text of textsOf(code)) {
       text.replaceWith(...text.data.split(/(--[\w-]+|\/|::)/).flatMap((part) => {
         if (part === "/" || part === "::") return [part, document.createElement("wbr")];
