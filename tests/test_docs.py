@@ -8,6 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from egs_warp.assets import BUILT_IN_SCENES, scene
+from egs_warp.io import read_capture
+from egs_warp.motions.keyframes import read_keyframes
+
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 TEXTS = sorted(
@@ -53,3 +57,12 @@ def test_every_page_of_concepts_says_where_its_code_is() -> None:
     for page in (DOCS / "concepts").glob("*.md"):
         for room in re.findall(r"`(egs_warp/[\w/]+?)/?`", page.read_text()):
             assert (ROOT / room).exists() or (ROOT / f"{room}.py").exists(), f"{page.name}: no {room}"
+
+
+def test_pages_start_from_captures_and_keys_that_can_be_read(tmp_path: Path) -> None:
+    runpy.run_path(str(ROOT / "examples" / "captures.py"))["main"](["--out", str(tmp_path)])
+    for name in BUILT_IN_SCENES:
+        made = scene(name)
+        assert read_capture(tmp_path / f"{name}.ply").cloud.count == made.object.count
+        assert read_capture(tmp_path / f"{name}_in_room.ply").cloud.count == made.whole()[0].count
+    assert {key.part for key in read_keyframes(ROOT / "examples" / "bow.csv")} == {"head"}
