@@ -23,7 +23,6 @@ HOP = "python examples/hop.py --hops 3 --out out/hop"
 TWIST = "python examples/twist.py --out out/twist"
 JUMP = "python examples/jump.py --out out/jump"
 WALK = 'egs-warp animate out/captures/stool_in_room.ply --up z --object 0,0,0.97 --motion "walk 6" --out out/stool'
-BOW = 'egs-warp animate out/captures/figurine.ply --up z --motion "trajectory examples/bow.csv" --out out/bow'
 SCENE = "egs-warp animate out/captures/figurine_in_room.ply --up z --object 0,0,0.5 --motion jump --out out/figurine"
 MUSCLES = "egs-warp muscles out/captures/pawn.ply --up z --plot out/muscles.png"
 
@@ -59,9 +58,6 @@ PICTURES = (
     Picture("walk.mp4", WALK, "stool/walk.mp4", 400),
     Picture("walk.webp", WALK, "stool/walk.mp4", 400, at=0.5),
     Picture("walk_sheet.webp", WALK, "stool/sheet.png", 1200),
-    Picture("bow.mp4", BOW, "bow/trajectory.mp4", 400),
-    Picture("bow.webp", BOW, "bow/trajectory.mp4", 400, at=0.2),
-    Picture("bow_sheet.webp", BOW, "bow/sheet.png", 1200),
     Picture("scene.mp4", SCENE, "figurine/jump.mp4", 400),
     Picture("scene.webp", SCENE, "figurine/jump.mp4", 400, at=0.45),
     Picture("segment.webp", SCENE, "figurine/segment.png", 1200),
