@@ -51,9 +51,7 @@ class PenaltyTerms:
 @dataclass
 class ImplicitStep:
     """The function Phi of one step and its minimisation; forces and muscle tensions are constant over the
-
-    See docs/concepts/body.md.
-    step.
+    step: docs/concepts/body.md.
 
     Phi(v) = 1/2 (v-v0)^T M (v-v0) + Psi(p + dt v) + dt beta/2 sum V E':C:E' - dt v^T f, E' the mean strain rate of the
     step; ``minimise`` adds the energy of the muscles, V(p + dt v).

@@ -96,8 +96,7 @@ def simulate(
     """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``.
 
     ``step``: seconds of a solver step, if not the usual (docs/concepts/conventions.md); one longer than a
-    frame makes the frame as long.
-    ``progress`` is told each frame done.
+    frame makes the frame as long. ``progress`` is told each frame done.
     """
     per_frame = steps_per_frame(stepper.body) if step is None else max(round(1.0 / (FRAME_RATE * step)), 1)
     dt = step or 1.0 / (FRAME_RATE * per_frame)

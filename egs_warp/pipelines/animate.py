@@ -99,8 +99,7 @@ def animate(
     ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
     the object to the camera. ``muscles_file``, ``solids``, ``gravity_up`` and ``settings``: see ``make_creature``;
     ``forward`` (3,): see ``first_place``. Returns the report (docs/guide/report.md). Raises ``UserError`` for bad
-    input,
-    before any file of an earlier run is touched.
+    input, before any file of an earlier run is touched.
     """
     options = options or AnimateOptions()
     requests = parse_script(motion, defaults=options.targets())

@@ -174,7 +174,7 @@ def lean(moved: np.ndarray) -> np.ndarray:
 
 
 def test_longitudinal_fibres_shorten_and_on_one_side_bend(column_body: SoftBody, column_muscles: MuscleSet) -> None:
-    """Eq. (7), all of them lower the top without leaning; those on +x alone lean it towards +x.
+    """Eq. (7): all of them lower the top without leaning; those on +x alone lean it towards +x.
 
     See docs/concepts/muscles.md.
     """
@@ -198,7 +198,7 @@ def test_radial_fibres_lengthen(column_body: SoftBody, column_muscles: MuscleSet
 
 
 def test_oblique_fibres_twist_by_their_hand_and_hoops_do_not(column_body: SoftBody, column_muscles: MuscleSet) -> None:
-    """Eq. (7), right- and left-handed helices twist opposite ways; hoops and radial fibres hardly at all.
+    """Eq. (7): right- and left-handed helices twist opposite ways; hoops and radial fibres hardly at all.
 
     A right-handed helix that contracts unwinds: seen from above its upper end turns clockwise (negative).
 
