@@ -1,7 +1,7 @@
 """Every picture of these pages, from the built-in captures alone: runs the commands that the pages show, then shrinks.
 
-python docs/make_pictures.py [NAME ...] makes all, or those named, of what ``out`` does not have yet. All of it takes about
-half an hour on two cores.
+python docs/make_pictures.py [NAME ...] makes all, or those named, of what ``out`` does not have yet. All of it takes
+about half an hour on two cores.
 """
 
 from __future__ import annotations
