@@ -6,7 +6,7 @@ FRAMES ?=
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test setup lint types examples clean
+.PHONY: demo test setup lint types docs pictures build examples clean
 
 demo: $(VENV)/demo.stamp
 	$(BIN)/python examples/jump.py --out out/jump $(FRAMES:%=--frames %)
@@ -30,14 +30,25 @@ lint: setup
 types: setup
 	$(BIN)/pyright
 
+docs: setup
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+# What docs/assets holds, from the built-in captures; half an hour on two cores.
+pictures: setup
+	$(BIN)/python docs/make_pictures.py
+
+# Wheel and sdist into out/dist, both tried in an empty environment outside of the tree.
+build: setup
+	VENV=$(VENV) .ci/package
+
 $(VENV)/demo.stamp: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(PIP) -e .
 	touch $@
 
 $(VENV)/setup.stamp: $(VENV)/demo.stamp
-	$(PIP) -e ".[torch,dev]"
+	$(PIP) -e ".[torch,dev,docs]"
 	touch $@
 
 clean:
-	rm -rf $(VENV) out
+	rm -rf $(VENV) out site

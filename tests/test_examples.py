@@ -1,4 +1,4 @@
-"""The examples of single motions, each for a few frames: they run, and write what docs/report.md says."""
+"""The examples of single motions, each for a few frames: they run, and write what docs/guide/report.md says."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def add_parser(commands: Commands) -> None:
         "--terrain", type=Path, help="JSON with steps and walls: solids as lists of faces [nx,ny,nz,d]"
     )
     animate.add_argument(
-        "--muscles", type=Path, help="JSON with fibres (docs/motions.md); else they are made automatically"
+        "--muscles", type=Path, help="JSON with fibres (docs/motions/muscles.md); else they are made automatically"
     )
     animate.add_argument("--distance", type=float, help="body heights: of a jump (0.5), hop (0.7) or twist (0)")
     animate.add_argument(

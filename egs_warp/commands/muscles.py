@@ -17,7 +17,7 @@ def add_parser(commands: Commands) -> None:
         "--plot", required=True, type=Path, help="picture (.png, .jpg, ...) with the body from three sides"
     )
     muscles.add_argument(
-        "--muscles", type=Path, help="JSON with fibres (docs/motions.md); else they are made automatically"
+        "--muscles", type=Path, help="JSON with fibres (docs/motions/muscles.md); else they are made automatically"
     )
     muscles.add_argument("--up", help="axis that points up: x, y, z or with a minus, as --up=-y; else it is guessed")
     muscles.add_argument(

@@ -96,7 +96,7 @@ def contact_geometry(
     gamma: float = 3.0,
     device: str | None = None,
 ) -> ContactGeometry:
-    """Points of all T+ and T- (Eq. 3); endpoints below a plane at rest are shortened to it (DESIGN 7).
+    """Points of all T+ and T- (Eq. 3); endpoints below a plane at rest are shortened to it (docs/concepts/contact.md).
 
     ``planes`` bound half spaces, the first of them the ground; ``solids`` stand on it.
     Only vertices of the convex hull of each tetrahedron's points are kept: a deformation is affine inside a
@@ -241,7 +241,8 @@ class ContactDetector:
 def independent_contacts(compliance: np.ndarray, kept: int, limit: int, tolerance: float) -> np.ndarray:
     """Pivoted Cholesky of N S^-1 N^T (n, n): indices of at most ``limit`` well-conditioned points.
 
-    The first ``kept`` points go first in line. Stops at pivots below ``tolerance`` of the largest diagonal (DESIGN 7).
+    The first ``kept`` points go first in line. Stops at pivots below ``tolerance`` of the largest diagonal:
+    docs/concepts/contact.md.
     """
     residual = np.diag(compliance).copy()
     scale = residual.max(initial=0.0)
@@ -265,7 +266,7 @@ def independent_contacts(compliance: np.ndarray, kept: int, limit: int, toleranc
 
 def push_out_speeds(gaps: np.ndarray, dt: float, cap: float, factor: float = 0.5) -> np.ndarray:
     """(n,) constant of the normal measure c = N^T u' + min(phi, 0) b / dt + max(phi, 0) / dt,
-    the push-out capped (DESIGN 7).
+    the push-out capped (docs/concepts/contact.md).
     """
     return np.maximum(gaps, 0.0) / dt + np.maximum(np.minimum(gaps, 0.0) * factor / dt, -cap)
 

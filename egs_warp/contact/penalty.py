@@ -29,7 +29,7 @@ class Prediction:
 @dataclass(frozen=True)
 class PenaltyContact:
     """Normal force -k_n min(0, c) and friction of Huber slope min(k_f |u_t|, cap);
-    c is the normal measure of DESIGN 7.
+    c is the normal measure of docs/concepts/contact.md.
     """
 
     contacts: ContactSet

@@ -108,7 +108,9 @@ def make_body(
     damping_ratio: float = 0.05,
     device: str | None = None,
 ) -> SoftBody:
-    """A body whose elasticity follows from its own height H: E = density g H / sag, that of a column (DESIGN 4).
+    """A body whose elasticity follows from its own height H: E = density g H / sag, that of a column.
+
+    See docs/concepts/cage.md.
 
     A body on thin legs would sink further into them than a column does; it is stiffened until its centre of mass sinks
     by no more than ``LARGEST_SINK`` H under its weight.

@@ -50,8 +50,8 @@ class PenaltyTerms:
 
 @dataclass
 class ImplicitStep:
-    """The function Phi of one step (DESIGN 5) and its minimisation; forces and muscle tensions are constant over the
-    step.
+    """The function Phi of one step and its minimisation; forces and muscle tensions are constant over the
+    step: docs/concepts/body.md.
 
     Phi(v) = 1/2 (v-v0)^T M (v-v0) + Psi(p + dt v) + dt beta/2 sum V E':C:E' - dt v^T f, E' the mean strain rate of the
     step; ``minimise`` adds the energy of the muscles, V(p + dt v).
@@ -272,7 +272,9 @@ class ImplicitStep:
 def conserve_angular_momentum(
     body: SoftBody, before: BodyState, positions: np.ndarray, velocities: np.ndarray, external: np.ndarray, dt: float
 ) -> tuple[np.ndarray, float]:
-    """Velocities (N, 3) whose spin obeys L+ = L + dt sum (x - c) x f with the arms of the step's start (DESIGN 5).
+    """Velocities (N, 3) whose spin obeys L+ = L + dt sum (x - c) x f with the arms of the step's start.
+
+    See docs/concepts/body.md.
 
     ``external`` (N, 3) newtons: forces that carry torque (contact, drag). Also returns the size of the added spin,
     rad/s.

@@ -1,4 +1,7 @@
-"""Contact states of the QP and how they change (Eq. 9, 13; pivoting after Tan, Turk and Liu 2012; DESIGN 8)."""
+"""Contact states of the QP and how they change (Eq. 9, 13; pivoting after Tan, Turk and Liu 2012).
+
+See docs/concepts/locomotion.md.
+"""
 
 from __future__ import annotations
 
@@ -116,7 +119,9 @@ def proposed_pivots(
     *,
     zero: float = 1e-4,
 ) -> list[Pivot]:
-    """(gain, contact, new state), best first, read from the multipliers (rows,) of the rows held at zero (DESIGN 8).
+    """(gain, contact, new state), best first, read from the multipliers (rows,) of the rows held at zero.
+
+    See docs/concepts/locomotion.md.
 
     ``x`` and ``w`` (pairs,) as ``ContactProgram.pairs`` gives them. Only states that the point itself obeys are
     proposed, so no proposal is infeasible, nor are several contacts' proposals together. ``zero`` is the accuracy of x,

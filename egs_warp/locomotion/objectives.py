@@ -1,4 +1,4 @@
-"""What a motion asks of the end velocity: weighted squares of linear functions of v (DESIGN 9)."""
+"""What a motion asks of the end velocity: weighted squares of linear functions of v (docs/concepts/motions.md)."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class SpinObjective:
     """weight |L+ - target|^2 / (m r)^2, r the radius of gyration, for the angular momentum about the centre of mass at
     the end of the step.
 
-    The stepper keeps L+ = L + dt sum (x - c) x f (DESIGN 5), so contact forces alone steer it.
+    The stepper keeps L+ = L + dt sum (x - c) x f (docs/concepts/body.md), so contact forces alone steer it.
     """
 
     target: np.ndarray

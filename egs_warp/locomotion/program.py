@@ -1,4 +1,7 @@
-"""The condensed problem of one step (Eq. 13): its cost, its rows and the linear response behind both (DESIGN 8)."""
+"""The condensed problem of one step (Eq. 13): its cost, its rows and the linear response behind both.
+
+See docs/concepts/locomotion.md.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +61,7 @@ class ContactProgram:
 
 @dataclass(frozen=True)
 class LinearResponse:
-    """v = base + response y, linearised at the prediction (DESIGN 8)."""
+    """v = base + response y, linearised at the prediction (docs/concepts/locomotion.md)."""
 
     base: np.ndarray
     """(3N,) m/s without muscles and contact."""

@@ -42,7 +42,7 @@ class Simulation:
 
 
 def steps_per_frame(body: SoftBody) -> int:
-    """Solver steps a frame, so that a step is at most sqrt(H / g) / 19 (DESIGN 4)."""
+    """Solver steps a frame, so that a step is at most sqrt(H / g) / 19 (docs/concepts/conventions.md)."""
     longest = np.sqrt(body.height / np.linalg.norm(body.gravity)) / 19.0
     return int(np.ceil(1.0 / (FRAME_RATE * longest) - 1e-3))
 
@@ -95,8 +95,8 @@ def simulate(
 ) -> Simulation:
     """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``.
 
-    ``step``: seconds of a solver step, if not the usual (DESIGN 4); one longer than a frame makes the frame as long.
-    ``progress`` is told each frame done.
+    ``step``: seconds of a solver step, if not the usual (docs/concepts/conventions.md); one longer than a
+    frame makes the frame as long. ``progress`` is told each frame done.
     """
     per_frame = steps_per_frame(stepper.body) if step is None else max(round(1.0 / (FRAME_RATE * step)), 1)
     dt = step or 1.0 / (FRAME_RATE * per_frame)

@@ -191,7 +191,10 @@ class LocomotionStepper:
         return self._finish(step, state, plan, result, clock)
 
     def choose_contacts(self, step: ImplicitStep, memory: StepMemory) -> np.ndarray:
-        """(n,) points that the step may bring to a plane, well-conditioned, last step's first (DESIGN 7)."""
+        """(n,) points that the step may bring to a plane, well-conditioned, last step's first.
+
+        See docs/concepts/contact.md.
+        """
         ballistic = step.state.velocities + step.dt * self.body.gravity
         gaps, _ = self.detector.gaps(step.end_positions(ballistic))
         candidates = self.detector.candidates(memory.points, gaps, self.settings.near * self.body.height)

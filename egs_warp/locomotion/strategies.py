@@ -1,4 +1,7 @@
-"""Strategies that choose the contact states of a step's program (Eq. 13): static, QPCC, two-stage, exact (DESIGN 8)."""
+"""Strategies that choose the contact states of a step's program (Eq. 13): static, QPCC, two-stage, exact.
+
+See docs/concepts/locomotion.md.
+"""
 
 from __future__ import annotations
 

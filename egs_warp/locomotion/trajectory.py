@@ -101,7 +101,7 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Audit:
-    """Maxima over all steps, as defined in docs/report.md; all but the counts are dimensionless."""
+    """Maxima over all steps, as defined in docs/guide/report.md; all but the counts are dimensionless."""
 
     momentum_residual: float
     angular_momentum_residual: float

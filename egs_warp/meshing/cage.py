@@ -109,7 +109,7 @@ def cage_of_body(
     ``cloud`` is in its body's frame (``body_gaussians``), whose axes and origin are those of the lattice.
     ``dilation`` is in units of the object's longest side; it is raised, and the mesh refined (up to 1.75 times the
     nodes), until all but 0.07 % of the object's opacity mass is inside.
-    The same input gives the same bits (``CageMethod.VOXEL``). DESIGN section 4.
+    The same input gives the same bits (``CageMethod.VOXEL``). See docs/concepts/cage.md.
 
     Raises ``UserError`` for an object without volume (flat, tiny, nothing opaque above the plane).
     """

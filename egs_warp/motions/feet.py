@@ -1,4 +1,7 @@
-"""Feet and legs of a body: separate patches on the ground, and the limbs that carry the body on them (DESIGN 9)."""
+"""Feet and legs of a body: separate patches on the ground, and the limbs that carry the body on them.
+
+See docs/concepts/motions.md.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Follow a user's own key frames as nearly as the muscles and the ground allow (DESIGN 9)."""
+"""Follow a user's own key frames as nearly as the muscles and the ground allow (docs/concepts/motions.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Hops: jumps in a row, each to its own square, aimed from where the one before has landed (DESIGN 9)."""
+"""Hops: jumps in a row, each to its own square, aimed from where the one before has landed.
+
+See docs/concepts/motions.md.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""A jump to a place, as a closed-loop state machine that writes objectives from the measured state (DESIGN 9).
+"""A jump to a place, as a closed-loop state machine that writes objectives from the measured state
+(docs/concepts/motions.md).
 
 From take-off on it is told in the frame of the landing, which may be turned, higher or lower.
 """

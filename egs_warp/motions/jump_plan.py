@@ -1,4 +1,4 @@
-"""Numbers of a jump, from what is asked and the body's height alone (DESIGN 9)."""
+"""Numbers of a jump, from what is asked and the body's height alone (docs/concepts/motions.md)."""
 
 from __future__ import annotations
 
@@ -81,7 +81,8 @@ def plan_jump(
     step: float,
     lean: float,
 ) -> JumpPlan:
-    """Stroke, times and take-off velocity for a jump of ``target`` by a body of ``height`` H (DESIGN 9).
+    """Stroke, times and take-off velocity for a jump of ``target`` by a body of ``height`` H
+    (docs/concepts/motions.md).
 
     Its centre of mass is ``com_height`` over the ground and the front of its feet ``support_ahead`` of it, gravity is
     in m/s^2, a solver step takes ``step`` seconds and ``lean`` is that of the plan; metres.

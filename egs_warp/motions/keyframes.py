@@ -1,4 +1,6 @@
-"""Key frames of a user's own trajectory, from JSON or CSV: what a part of the body shall do, and when (DESIGN 9).
+"""Key frames of a user's own trajectory, from JSON or CSV: what a part of the body shall do, and when.
+
+See docs/concepts/motions.md.
 
 JSON: a list of keys, ``[{"time": 0.5, "part": "head", "quantity": "position", "value": [0.1, 0, 0]}]``; CSV: a header
 ``time,part,quantity,x,y,z`` and a key a row. Both may give a ``weight``.

@@ -105,7 +105,10 @@ class Calm:
 
 
 class PoseFamily:
-    """Affine poses of the rest shape, A = stretch along up, bulge across it, shear by the lean (DESIGN 9)."""
+    """Affine poses of the rest shape, A = stretch along up, bulge across it, shear by the lean.
+
+    See docs/concepts/motions.md.
+    """
 
     def __init__(self, body: SoftBody, ground: Ground, standing: np.ndarray, touching: np.ndarray) -> None:
         """``standing`` (N, 3): nodes at rest; ``touching`` (k, 3): points of the body on the ground then."""

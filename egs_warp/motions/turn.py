@@ -1,4 +1,4 @@
-"""Turn by an asked angle in as few twists as friction allows (DESIGN 9)."""
+"""Turn by an asked angle in as few twists as friction allows (docs/concepts/motions.md)."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Turn:
 
 
 def largest_turn(jump: Jump, place: Place) -> float:
-    """Radians that friction under the feet could turn the body by in one jump as planned (DESIGN 9).
+    """Radians that friction under the feet could turn the body by in one jump as planned (docs/concepts/motions.md).
 
     Its impulse is mu r_eff times that of the normal forces, m (v_z + g t), r_eff the mean distance of the feet from
     their middle.

@@ -1,4 +1,7 @@
-"""Twist: a jump that turns, its spin built by friction under the feet while the muscles thrust (DESIGN 9)."""
+"""Twist: a jump that turns, its spin built by friction under the feet while the muscles thrust.
+
+See docs/concepts/motions.md.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Walk: diagonal pairs of feet swing and stand in turn, and the body moves on evenly over them (DESIGN 9)."""
+"""Walk: diagonal pairs of feet swing and stand in turn, and the body moves on evenly over them.
+
+See docs/concepts/motions.md.
+"""
 
 from __future__ import annotations
 

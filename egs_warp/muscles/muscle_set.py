@@ -212,7 +212,7 @@ def automatic_muscles(
     young_modulus: float | None = None,
     max_segments: int | None = None,
 ) -> MuscleSet:
-    """Muscles for any body: fibres of every kind along each branch of its curve skeleton (DESIGN 6).
+    """Muscles for any body: fibres of every kind along each branch of its curve skeleton (docs/concepts/muscles.md).
 
     ``plane_normal`` (3,) points away from the ground; ``body_weight`` in newtons; ``height`` in metres along the
     normal; ``strength`` is F_max of a segment in body weights. It is lowered where the body is thin: all longitudinal

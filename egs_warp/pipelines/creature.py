@@ -53,6 +53,10 @@ class Creature:
     solids: tuple[Solid, ...]
     """All that there is to stand on, the ground (z = 0) first."""
 
+    def placed(self, cloud: GaussianCloud) -> GaussianCloud:
+        """Something else of the same capture, such as what is behind it, in the frame of the body."""
+        return in_body_frame(cloud, self.frame)
+
     @property
     def body(self) -> SoftBody:
         """The soft body."""
@@ -92,9 +96,8 @@ def make_creature(
     """
     normal = plane.normal if plane is not None else up
     if normal is None:
-        raise ArgumentError(
-            "plane", "neither the ground nor which way is up is known; give one of them", check=("plane", "up")
-        )
+        advice = "neither the ground nor which way is up is known; give one of them"
+        raise ArgumentError("plane", advice, check=("plane", "up"))
     if gravity_up is not None:
         _check_slope(normal / np.linalg.norm(normal), gravity_up)
     standing = stand(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit)

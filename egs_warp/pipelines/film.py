@@ -12,7 +12,6 @@ from tqdm import tqdm
 
 from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.embedding import embed_gaussians
-from egs_warp.deformation.rigid import in_body_frame
 from egs_warp.deformation.splitting import split_for_motion
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.camera import Camera
@@ -51,8 +50,8 @@ def draw_film(
 ) -> Film:
     """Write ``name``.mp4 and sheet.png, ``size`` pixels both ways, into ``folder``.
 
-    ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from``: see
-    ``Performance.camera``.
+    ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
+    the object to the camera, both in the capture's frame.
     """
     creature, simulation = performance.creature, performance.simulation
     trajectory, frames = simulation.trajectory, simulation.frames
@@ -103,5 +102,5 @@ def _behind(
     reach = 2.2 * (height + float(np.linalg.norm(np.ptp(path, axis=0))))
     if background is None:
         return Floor(camera, GROUND, centre=centre, reach=reach, cell=0.25 * height, shadow=shadow)
-    scene = in_body_frame(background, creature.frame)
+    scene = creature.placed(background)
     return CapturedScene(scene, camera, GROUND, centre=centre, reach=reach, shadow=shadow)

@@ -29,17 +29,17 @@ class Performance:
 
     @property
     def trajectory(self) -> Trajectory:
-        """Every solver step."""
+        """Every solver step, in the frame of the body."""
         return self.simulation.trajectory
 
     @property
     def frames(self) -> np.ndarray:
-        """(n, N, 3) metres: the nodes of the cage in each frame of a video at 60 Hz."""
+        """(n, N, 3) metres, in the frame of the body: the nodes of the cage in each frame of a video at 60 Hz."""
         return self.trajectory.positions[self.simulation.frames]
 
     def camera(self, size: int, view_from: np.ndarray | None = None) -> Camera:
         """A fixed camera of ``size`` pixels both ways that holds the whole motion: in front of the motion's side, or in
-        the direction ``view_from`` (3,) of the capture."""
+        the direction ``view_from`` (3,) of the capture's frame."""
         ground = self.place.ground
         local = ground.local(self.trajectory.positions).reshape(-1, 3)
         low, high = local.min(axis=0), local.max(axis=0)
@@ -48,7 +48,7 @@ class Performance:
         corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
         direction = np.array(FILMED_FROM)
         if view_from is not None:
-            direction = ground.axes @ self.creature.frame.axes @ np.asarray(view_from, float)
+            direction = ground.axes @ (self.creature.frame.axes @ np.asarray(view_from, float))
         direction /= np.linalg.norm(direction)
         distance = float(np.linalg.norm(high - low))
         for _ in range(60):

@@ -1,4 +1,4 @@
-"""``report.json``: what was asked and reached, the audit, and what it cost. The schema is in docs/report.md."""
+"""``report.json``: what was asked and reached, the audit, and what it cost. The schema is in docs/guide/report.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The renderer on one page: project, list, composite (DESIGN: Kerbl et al. 2023, in Warp kernels)."""
+"""The renderer on one page: project, list, composite (Kerbl et al. 2023, in Warp kernels).
+
+See docs/concepts/renderer.md.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""How much each Gaussian shows inside and outside a mask: its blending weight, summed over pixels (DESIGN 10)."""
+"""How much each Gaussian shows inside and outside a mask: its blending weight, summed over pixels.
+
+See docs/concepts/segmentation.md.
+"""
 
 from __future__ import annotations
 

@@ -129,7 +129,10 @@ def test_endpoints_are_shortened_to_the_plane_at_rest() -> None:
 
 
 def test_gaussians_below_the_plane_are_left_out_and_counted() -> None:
-    """DESIGN 7: a Gaussian whose mean lies below the plane takes no part; its share of the opacity mass is reported."""
+    """A Gaussian whose mean lies below the plane takes no part; its share of the opacity mass is reported.
+
+    See docs/concepts/contact.md.
+    """
     mesh = block_mesh()
     means = np.array([[0.0, 0.0, 0.1], [0.1, 0.0, 0.5], [0.0, 0.1, -0.01]])
     logits = np.log([1.0, 3.0, 0.25])

@@ -25,7 +25,7 @@ def body() -> SoftBody:
 
 
 def test_material_follows_from_height() -> None:
-    """DESIGN 4: E = rho g H / sag, for any size and any up."""
+    """docs/concepts/cage.md: E = rho g H / sag, for any size and any up."""
     for size, normal in ((0.3, [0.0, 0.0, 1.0]), (2.0, [0.0, 1.0, 0.0])):
         mesh = block_mesh(size=(0.4 * size, 0.4 * size, size))
         made = make_body(mesh, Plane(np.array(normal), 0.1), sag=0.03, density=800.0, device="cpu")

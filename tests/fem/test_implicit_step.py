@@ -267,8 +267,10 @@ def held_by_springs(
 
 
 def test_column_sags_by_half_the_sag_ratio() -> None:
-    """DESIGN 4: with E = rho g H / sag a column on a frictionless base shortens by sag/2 (Poisson ratio 0, linear
+    """With E = rho g H / sag a column on a frictionless base shortens by sag/2 (Poisson ratio 0, linear
     limit).
+
+    See docs/concepts/cage.md.
     """
     sag = 0.01
     mesh = block_mesh(3, 3, 17, (0.3, 0.3, 1.0))

@@ -105,10 +105,12 @@ def test_states_of_pairs_are_states_the_point_obeys() -> None:
 
 
 def test_moves_are_feasible_and_almost_always_better() -> None:
-    """DESIGN 8: the optimum of any states obeys the states of each proposed move, and of all together; most moves are
+    """The optimum of any states obeys the states of each proposed move, and of all together; most moves are
     better.
 
     A move that one multiplier proposes without regard to the contact's other rows is often not feasible at all.
+
+    See docs/concepts/locomotion.md.
     """
     proposed = solved = better = plain = plain_lost = 0
     for seed in range(12):
@@ -139,7 +141,7 @@ def test_moves_are_feasible_and_almost_always_better() -> None:
 
 
 def test_moves_name_the_contact_that_helps() -> None:
-    """DESIGN 8: a closed contact that holds the body down is opened,
+    """docs/concepts/locomotion.md: a closed contact that holds the body down is opened,
     an open one that could help is closed to sliding.
     """
     layout = ContactLayout(0, 1, 4)

@@ -174,7 +174,10 @@ def lean(moved: np.ndarray) -> np.ndarray:
 
 
 def test_longitudinal_fibres_shorten_and_on_one_side_bend(column_body: SoftBody, column_muscles: MuscleSet) -> None:
-    """Eq. (7), DESIGN 6: all of them lower the top without leaning; those on +x alone lean it towards +x."""
+    """Eq. (7): all of them lower the top without leaning; those on +x alone lean it towards +x.
+
+    See docs/concepts/muscles.md.
+    """
     segments = column_muscles.segments_of_kind(FibreKind.LONGITUDINAL)
     together = linear_response(column_body, column_muscles, segments)
     assert rise(together) < -1e-3
@@ -188,16 +191,18 @@ def test_longitudinal_fibres_shorten_and_on_one_side_bend(column_body: SoftBody,
 
 
 def test_radial_fibres_lengthen(column_body: SoftBody, column_muscles: MuscleSet) -> None:
-    """Eq. (7), DESIGN 6: thinning the body raises its top (Poisson's ratio)."""
+    """Eq. (7), docs/concepts/muscles.md: thinning the body raises its top (Poisson's ratio)."""
     moved = linear_response(column_body, column_muscles, column_muscles.segments_of_kind(FibreKind.RADIAL))
     assert rise(moved) > 1e-5
     assert np.linalg.norm(lean(moved)) < 0.3 * rise(moved)
 
 
 def test_oblique_fibres_twist_by_their_hand_and_hoops_do_not(column_body: SoftBody, column_muscles: MuscleSet) -> None:
-    """Eq. (7), DESIGN 6: right- and left-handed helices twist opposite ways; hoops and radial fibres hardly at all.
+    """Eq. (7): right- and left-handed helices twist opposite ways; hoops and radial fibres hardly at all.
 
     A right-handed helix that contracts unwinds: seen from above its upper end turns clockwise (negative).
+
+    See docs/concepts/muscles.md.
     """
     turned = {
         kind: twist(linear_response(column_body, column_muscles, column_muscles.segments_of_kind(kind)))
@@ -212,7 +217,7 @@ def test_oblique_fibres_twist_by_their_hand_and_hoops_do_not(column_body: SoftBo
 
 def test_hoops_make_no_axial_torque_between_halves(column_muscles: MuscleSet) -> None:
     """A planar hoop's forces turn neither half of the body about the axis,
-    whatever its activations (erratum, DESIGN 6).
+    whatever its activations (erratum, docs/concepts/muscles.md).
     """
     columns = muscle_columns(column_muscles, COLUMN.nodes).reshape(-1, 3, column_muscles.segment_count)
     x = COLUMN.nodes

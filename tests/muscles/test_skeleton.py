@@ -120,7 +120,10 @@ def test_the_skeleton_follows_its_up_axis_and_its_bits_repeat() -> None:
 
 @pytest.mark.parametrize(("make", "branch_count"), [(column, 1), (stool, 4), (figure, 5)])
 def test_every_branch_gets_every_kind_of_fibre(make: Callable[[], TetMesh], branch_count: int) -> None:
-    """DESIGN 6: four or more longitudinal fibres and all other kinds on each branch, within the budget of segments."""
+    """Four or more longitudinal fibres and all other kinds on each branch, within the budget of segments.
+
+    See docs/concepts/muscles.md.
+    """
     mesh = make()
     muscles = automatic_muscles(mesh, UP, body_weight=100.0, height=1.0)
     assert muscles.segment_count <= (120 if make is stool else 112)

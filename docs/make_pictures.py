@@ -1,0 +1,140 @@
+"""Every picture of these pages, from the built-in captures alone: runs the commands that the pages show, then shrinks.
+
+python docs/make_pictures.py [NAME ...] makes all, or those named, of what ``out`` does not have yet. All of it takes
+about half an hour on two cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from imageio_ffmpeg import get_ffmpeg_exe
+from PIL import Image
+
+ROOT = Path(__file__).parents[1]
+ASSETS = ROOT / "docs" / "assets"
+CAPTURES = "python examples/captures.py --out out/captures"
+HOP = "python examples/hop.py --hops 3 --out out/hop"
+TWIST = "python examples/twist.py --out out/twist"
+JUMP = "python examples/jump.py --out out/jump"
+WALK = 'egs-warp animate out/captures/stool_in_room.ply --up z --object 0,0,0.97 --motion "walk 6" --out out/stool'
+SCENE = "egs-warp animate out/captures/figurine_in_room.ply --up z --object 0,0,0.5 --motion jump --out out/figurine"
+MUSCLES = "egs-warp muscles out/captures/pawn.ply --up z --plot out/muscles.png"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A file of docs/assets."""
+
+    name: str
+    command: str
+    """That makes its source; the page shows it."""
+    source: str
+    """In ``out``."""
+    width: int
+    """Pixels."""
+    at: float = 0.0
+    """Share of the film that a still is taken at."""
+    sky: float = 0.0
+    """Share of the height that is cut off above."""
+
+
+PICTURES = (
+    Picture("hop.mp4", HOP, "hop/hop.mp4", 512, sky=0.16),
+    Picture("hop_loop.webp", HOP, "hop/hop.mp4", 360, sky=0.16),
+    Picture("hop.webp", HOP, "hop/hop.mp4", 512, at=0.18, sky=0.16),
+    Picture("hop_sheet.webp", HOP, "hop/sheet.png", 1200),
+    Picture("jump.mp4", JUMP, "jump/jump.mp4", 400),
+    Picture("jump.webp", JUMP, "jump/jump.mp4", 400, at=0.45),
+    Picture("jump_sheet.webp", JUMP, "jump/sheet.png", 1200),
+    Picture("twist.mp4", TWIST, "twist/twist.mp4", 400),
+    Picture("twist.webp", TWIST, "twist/twist.mp4", 400, at=0.3),
+    Picture("twist_sheet.webp", TWIST, "twist/sheet.png", 1200),
+    Picture("walk.mp4", WALK, "stool/walk.mp4", 400),
+    Picture("walk.webp", WALK, "stool/walk.mp4", 400, at=0.5),
+    Picture("walk_sheet.webp", WALK, "stool/sheet.png", 1200),
+    Picture("scene.mp4", SCENE, "figurine/jump.mp4", 400),
+    Picture("scene.webp", SCENE, "figurine/jump.mp4", 400, at=0.45),
+    Picture("segment.webp", SCENE, "figurine/segment.png", 1200),
+    Picture("filled.webp", SCENE, "figurine/filled.png", 1200),
+    Picture("muscles.webp", MUSCLES, "muscles.png", 1200),
+)
+
+
+def run(command: str) -> None:
+    """Run a command of a page from the root of the tree, with this Python."""
+    program, *rest = shlex.split(command)
+    module = {"python": [], "egs-warp": ["-m", "egs_warp.cli"]}[program]
+    subprocess.run([sys.executable, *module, *rest], cwd=ROOT, check=True)
+
+
+def ffmpeg(*arguments: str) -> None:
+    """Run ffmpeg."""
+    subprocess.run([get_ffmpeg_exe(), "-y", "-loglevel", "error", *arguments], check=True)
+
+
+def seconds(film: Path) -> float:
+    """Length of a film of 60 frames a second."""
+    told = subprocess.run([get_ffmpeg_exe(), "-i", str(film)], capture_output=True, text=True).stderr
+    hours, minutes, rest = told.split("Duration: ")[1].split(",")[0].split(":")
+    return 3600 * int(hours) + 60 * int(minutes) + float(rest)
+
+
+def make(picture: Picture) -> None:
+    """Write ``picture`` into docs/assets, running its command if its source is not there."""
+    source, target = ROOT / "out" / picture.source, ASSETS / picture.name
+    if not source.is_file():
+        run(picture.command)
+    if target.suffix == ".mp4" or target.stem.endswith("_loop"):
+        # The last frame is held, so that the loop has a rest.
+        film = target.suffix == ".mp4"
+        cut = f"crop=iw:trunc(ih*{1 - picture.sky:g}/2)*2:0:ih-oh"
+        shrink = f"fps={30 if film else 20},{cut},scale={picture.width}:-2:flags=lanczos"
+        x264 = (
+            "-c:v",
+            "libx264",
+            "-preset",
+            "veryslow",
+            "-crf",
+            "20",
+            "-pix_fmt",
+            "yuv420p",
+            "-movflags",
+            "+faststart",
+        )
+        webp = ("-c:v", "libwebp_anim", "-loop", "0", "-quality", "70")
+        hold = f"{shrink},tpad=stop_mode=clone:stop_duration=0.6"
+        ffmpeg("-i", str(source), "-vf", hold, "-an", *(x264 if film else webp), str(target))
+        return
+    still = source
+    if source.suffix == ".mp4":
+        still = source.with_suffix(".still.png")
+        ffmpeg("-ss", f"{picture.at * seconds(source):.3f}", "-i", str(source), "-frames:v", "1", str(still))
+    with Image.open(still) as opened:
+        small = opened.convert("RGB")
+        kept = int(small.height * (1 - picture.sky) / 2) * 2
+        small = small.crop((0, small.height - kept, small.width, small.height))
+        small.thumbnail((picture.width, picture.width), Image.Resampling.LANCZOS)
+        small.save(target, quality=86, method=6)
+
+
+def main() -> None:
+    """Make the pictures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", help="of docs/assets; all without any")
+    chosen = parser.parse_args()
+    if not (ROOT / "out" / "captures").is_dir():
+        run(CAPTURES)
+    for picture in PICTURES:
+        if not chosen.names or picture.name in chosen.names:
+            make(picture)
+            print(f"{picture.name}: {(ASSETS / picture.name).stat().st_size / 1e3:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,26 @@
+"""The built-in objects and rooms as captures on disk, to try every command on: each object alone, and in its room."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import egs_warp as egs
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the example."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("out/captures"))
+    folder = egs.writable_folder(parser.parse_args(arguments).out)
+    for name in egs.BUILT_IN_SCENES:
+        made = egs.scene(name)
+        egs.write_ply(folder / f"{name}.ply", made.object)
+        egs.write_ply(folder / f"{name}_in_room.ply", made.whole()[0])
+    names = ", ".join(egs.BUILT_IN_SCENES)
+    print(f"wrote {names} as NAME.ply and NAME_in_room.ply into {folder}; z is up, 1 is their height")
+
+
+if __name__ == "__main__":
+    with egs.one_line_errors("captures.py"):
+        main()

@@ -1,0 +1,68 @@
+"""Pages that code and texts cite exist, and every picture of the docs stands by the command that makes it."""
+
+from __future__ import annotations
+
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+
+from egs_warp.assets import BUILT_IN_SCENES, scene
+from egs_warp.io import read_capture
+from egs_warp.motions.keyframes import read_keyframes
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+TEXTS = sorted(
+    [path for room in ("egs_warp", "tests", "benchmarks", "examples", "docs") for path in (ROOT / room).rglob("*.py")]
+    + [ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "THIRD_PARTY.md", "mkdocs.yml")]
+    + [path for path in DOCS.rglob("*.md") if path.parent.name != "vendor"]
+)
+CITED = re.compile(r"\bdocs/[\w/]+\.md\b")
+SHOWN = re.compile(r'(?:\(|src="|poster=")((?:\.\./)?assets/[\w.]+)')
+
+
+PICTURES = {picture.name: picture for picture in runpy.run_path(str(DOCS / "make_pictures.py"))["PICTURES"]}
+
+
+def test_cited_pages_exist() -> None:
+    cited = {(str(path.relative_to(ROOT)), page) for path in TEXTS for page in CITED.findall(path.read_text())}
+    assert len(cited) > 40
+    assert not [pair for pair in sorted(cited) if not (ROOT / pair[1]).is_file() and "NAME" not in pair[1]]
+
+
+def test_no_page_that_is_not_in_the_tree_is_cited() -> None:
+    """Such as the DESIGN of the first days, whose content is docs/concepts."""
+    elsewhere = re.compile(r"\bDESIGN\b(?! of the first days)")
+    assert not [str(path) for path in TEXTS if elsewhere.search(path.read_text())]
+
+
+def test_pictures_are_small_and_all_made_by_the_script() -> None:
+    made = [path for path in (DOCS / "assets").iterdir() if path.suffix in (".webp", ".mp4")]
+    assert {path.name for path in made} == set(PICTURES)
+    assert (DOCS / "assets" / "hop.mp4").stat().st_size <= 1e6
+    assert sum(path.stat().st_size for path in (DOCS / "assets").iterdir()) <= 4e6
+
+
+@pytest.mark.parametrize("page", sorted(DOCS.rglob("*.md")), ids=lambda page: str(page.relative_to(DOCS)))
+def test_every_picture_has_its_command_on_its_page(page: Path) -> None:
+    text = page.read_text()
+    for shown in SHOWN.findall(text):
+        picture = PICTURES[Path(shown).name]
+        assert picture.command in text, f"{page.name} shows {picture.name}, not how it is made: {picture.command}"
+
+
+def test_every_page_of_concepts_says_where_its_code_is() -> None:
+    for page in (DOCS / "concepts").glob("*.md"):
+        for room in re.findall(r"`(egs_warp/[\w/]+?)/?`", page.read_text()):
+            assert (ROOT / room).exists() or (ROOT / f"{room}.py").exists(), f"{page.name}: no {room}"
+
+
+def test_pages_start_from_captures_and_keys_that_can_be_read(tmp_path: Path) -> None:
+    runpy.run_path(str(ROOT / "examples" / "captures.py"))["main"](["--out", str(tmp_path)])
+    for name in BUILT_IN_SCENES:
+        made = scene(name)
+        assert read_capture(tmp_path / f"{name}.ply").cloud.count == made.object.count
+        assert read_capture(tmp_path / f"{name}_in_room.ply").cloud.count == made.whole()[0].count
+    assert {key.part for key in read_keyframes(ROOT / "examples" / "bow.csv")} == {"head"}
