@@ -22,7 +22,7 @@ import mesh_scenes as scenes
 from egs_warp.deformation.peers import CarryMethod, carry
 from egs_warp.io.video import write_png
 from egs_warp.render import render
-from egs_warp.training.finetune import psnr
+from egs_warp.training.likeness import psnr
 
 
 def main() -> None:

@@ -36,7 +36,8 @@ from egs_warp.io import read_capture
 from egs_warp.io.video import contact_sheet, write_png
 from egs_warp.render import render
 from egs_warp.segmentation.plane_fit import plane_depth
-from egs_warp.training.finetune import FinetuneOptions, TrainingView, finetune, psnr
+from egs_warp.training.finetune import FinetuneOptions, TrainingView, finetune
+from egs_warp.training.likeness import psnr
 
 AIMS = ("beats_cv2_by_3db", "beats_no_prior_by_3db", "seconds_on_gpu", "hole_size_independent")
 OURS, CV2, NO_PRIOR = "ours", "cv2 in the picture", "no plane prior"

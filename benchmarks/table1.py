@@ -39,7 +39,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.io.video import write_png
 from egs_warp.meshing.cage import build_cage
 from egs_warp.render import render
-from egs_warp.training.finetune import psnr, ssim
+from egs_warp.training.likeness import psnr, ssim
 
 MOTIONS = ("bend", "twist", "fall")
 OBJECTS = ("chair", "plant", "microphone")

@@ -34,7 +34,7 @@ from egs_warp.render import render
 from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane
 from egs_warp.segmentation.object_mask import ObjectSpec, masks_from_selection
 from egs_warp.segmentation.votes import blending_votes
-from egs_warp.training.finetune import psnr, ssim
+from egs_warp.training.likeness import psnr, ssim
 
 BUILT_IN = ("pawn", "stool", "figurine")
 CAPTURES = {"koala.ply": (0.1, -0.7, 0.15), "narcissus.sog": (0.0, -0.8, 0.0)}

@@ -22,7 +22,8 @@ from egs_warp.io.atomic import writable_folder
 from egs_warp.io.video import contact_sheet, write_png
 from egs_warp.render import render
 from egs_warp.render.autograd import render_torch
-from egs_warp.training.finetune import FinetuneOptions, Rates, finetune, psnr, views_of_capture
+from egs_warp.training.finetune import FinetuneOptions, Rates, finetune, views_of_capture
+from egs_warp.training.likeness import psnr
 
 
 def ring_of_cameras(cloud: GaussianCloud, up: np.ndarray, *, count: int, size: int) -> list[Camera]:

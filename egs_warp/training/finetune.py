@@ -17,11 +17,17 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.render import render
-from egs_warp.render.autograd import render_torch
+from egs_warp.render.autograd import TorchImage, render_torch
+from egs_warp.training.growth import Growth
+from egs_warp.training.likeness import ssim
+from egs_warp.training.misfits import Misfits
 from egs_warp.training.relocation import Population
+from egs_warp.training.tones import Tones
 
 MIN_LOG_SCALE = -10.0
 """Scales are kept at e^-10 or above, as in the paper."""
+_UNSEEN_STEPS = 20
+"""Steps on a GPU between two looks at the losses."""
 
 
 class Densification(enum.Enum):
@@ -71,8 +77,14 @@ class FinetuneOptions:
     background: tuple[float, float, float] | None = (1.0, 1.0, 1.0)
     """One colour; None draws a random one each step, which needs views with alpha to make sense."""
     densification: Densification = Densification.NONE
-    max_gaussians: int = 100_000
-    """The cap that relocation grows to."""
+    max_gaussians: int | None = 100_000
+    """The cap that relocation grows to; None grows while the pictures gain by it."""
+    sh_steps: int = 0
+    """Steps after which the next degree of SH begins; 0 trains all from the start."""
+    tones: bool = False
+    """Each view has an exposure and white balance of its own, found with the cloud."""
+    leave_out_misfits: bool = False
+    """Views that never fit the others are left out on the way."""
     antialiased: bool = False
     seed: int = 0
     threads: int | None = None
@@ -103,6 +115,10 @@ class FinetuneResult:
     cloud: GaussianCloud
     losses: np.ndarray
     """(iterations,) float64."""
+    tones: np.ndarray | None = None
+    """(views, 3, 4) float64: each view's colours are these times the cloud's and 1; None unless asked for."""
+    misfits: tuple[int, ...] = ()
+    """Numbers of the views that were left out."""
 
 
 ExtraLoss = Callable[[GaussianTensors], torch.Tensor]
@@ -133,44 +149,87 @@ def finetune(
     population = Population(_tensors(cloud, device), vars(options.rates), extent=extent, generator=generator)
     frozen = None if trainable is None else torch.as_tensor(~np.asarray(trainable, bool), device=device)
     targets = [_Target.of(view, device) for view in views]
+    relocating = options.densification is Densification.RELOCATION
+    tones = Tones(len(views), options.iterations, device) if options.tones else None
+    misfits = Misfits(len(views))
+    growth = Growth(len(views), options.max_gaussians, device)
     losses = np.zeros(options.iterations)
+    pending: list[tuple[int, int, torch.Tensor]] = []
+    # Asking a GPU for a loss waits for it: the losses of many steps are fetched at once.
+    patience = 1 if device == "cpu" else _UNSEEN_STEPS
     queue: list[int] = []
     for step in range(options.iterations):
-        queue = queue or order.permutation(len(views)).tolist()
-        target = targets[queue.pop()]
+        if not queue:
+            kept = [number for number in range(len(views)) if number not in misfits.found]
+            queue = [kept[i] for i in order.permutation(len(kept))]
+        number = queue.pop()
+        target = targets[number]
         background = options.background
         if background is None:
             background = tuple(torch.rand(3, generator=generator, device=device).tolist())
         tensors = GaussianTensors(**population.tensors)
-        picture = render_torch(
+        bands = tensors.sh_rest
+        if options.sh_steps > 0:
+            bands = bands[:, : (step // options.sh_steps + 1) ** 2 - 1]
+        image = render_torch(
             *(tensors.means, tensors.rotations, tensors.log_scales, tensors.opacity_logits),
-            torch.cat([tensors.sh_band_0, tensors.sh_rest], dim=1),
+            torch.cat([tensors.sh_band_0, bands], dim=1),
             target.camera,
             background=background,
             antialiased=options.antialiased,
             threads=options.threads,
-        ).colour
-        loss = target.loss(picture, background, options.ssim_weight)
+        )
+        loss = target.loss(_toned(image, background, tones, number, target), background, options.ssim_weight)
+        pending.append((step, number, loss.detach()))
+        if tones is not None:
+            loss = loss + tones.pull()
         if extra_loss is not None:
             loss = loss + extra_loss(tensors)
-        if options.densification is Densification.RELOCATION:
+        if relocating:
             loss = loss + population.regularisation()
-        losses[step] = float(loss.detach())
-        if not np.isfinite(losses[step]):
-            raise UserError(f"finetune: the loss is not finite at step {step}; lower the rates or check the views")
         loss.backward()
         if frozen is not None:
             for tensor in population.tensors.values():
                 if tensor.grad is not None:
                     tensor.grad[frozen] = 0.0
-        population.step(decay=0.01 ** (step / max(options.iterations, 1)))
+        population.step(done=step / max(options.iterations, 1), settling=relocating)
+        if tones is not None:
+            tones.step(number, step)
         with torch.no_grad():
             population.tensors["log_scales"].clamp_(min=MIN_LOG_SCALE)
-        if options.densification is Densification.RELOCATION:
-            population.evolve(step, options.iterations, options.max_gaussians)
-        if progress is not None:
-            progress(step, losses[step])
-    return FinetuneResult(_cloud(population.tensors), losses)
+        if len(pending) >= patience or step + 1 == options.iterations:
+            for at, seen, value in zip(
+                *([p[k] for p in pending] for k in (0, 1)), torch.stack([p[2] for p in pending]).tolist(), strict=True
+            ):
+                losses[at] = value
+                if not np.isfinite(value):
+                    raise UserError(
+                        f"finetune: the loss is not finite at step {at}; lower the rates or check the views"
+                    )
+                misfits.see(seen, value)
+                growth.see(value, len(tensors.means))
+                if progress is not None:
+                    progress(at, value)
+            pending.clear()
+            if options.leave_out_misfits:
+                misfits.judge(step / options.iterations)
+        if relocating:
+            population.evolve(step, options.iterations, growth)
+    return FinetuneResult(
+        _cloud(population.tensors), losses, None if tones is None else tones.matrices(), tuple(misfits.found)
+    )
+
+
+def _toned(
+    image: TorchImage, background: Sequence[float], tones: Tones | None, number: int, target: _Target
+) -> torch.Tensor:
+    """(H, W, 3) the render in the tone of its view; a backdrop that is no part of the photo keeps its colour."""
+    if tones is None:
+        return image.colour
+    if target.alpha is None:
+        return tones.applied(number, image.colour)
+    behind = (1 - image.alpha)[:, :, None] * torch.tensor(background, device=image.colour.device)
+    return tones.applied(number, image.colour - behind, image.alpha) + behind
 
 
 def views_of_capture(
@@ -197,31 +256,6 @@ def scene_extent(cameras: Sequence[Camera], cloud: GaussianCloud) -> float:
     of_cloud = 2.0 * float(np.linalg.norm(means - np.median(means, axis=0), axis=1).mean())
     candidates = [value for value in (of_cameras, of_cloud) if value > 0]
     return min(candidates) if candidates else 1.0
-
-
-def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Mean structural similarity of two pictures (H, W, 3) in 0 to 1: 11 x 11 Gaussian window, sigma 1.5, zero padding."""
-    offsets = torch.arange(-5.0, 6.0, device=a.device)
-    line = torch.exp(-(offsets**2) / (2 * 1.5**2))
-    line = line / line.sum()
-    stack = torch.cat([t.permute(2, 0, 1) for t in (a, b, a * a, b * b, a * b)])[None]
-    channels = stack.shape[1]
-    blurred = torch.nn.functional.conv2d(stack, line.expand(channels, 1, 1, 11), padding=(0, 5), groups=channels)
-    blurred = torch.nn.functional.conv2d(
-        blurred, line[:, None].expand(channels, 1, 11, 1), padding=(5, 0), groups=channels
-    )
-    mean_a, mean_b, aa, bb, ab = blurred[0].reshape(5, 3, *a.shape[:2])
-    c1, c2 = 0.01**2, 0.03**2
-    covariance = ab - mean_a * mean_b
-    variances = aa - mean_a**2 + bb - mean_b**2
-    return (
-        (2 * mean_a * mean_b + c1) * (2 * covariance + c2) / ((mean_a**2 + mean_b**2 + c1) * (variances + c2))
-    ).mean()
-
-
-def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    """Peak signal to noise ratio in dB of two pictures in 0 to 1; at most 100."""
-    return float(-10.0 * np.log10(max(float(np.mean((a.astype(np.float64) - b) ** 2)), 1e-10)))
 
 
 @dataclass(frozen=True)

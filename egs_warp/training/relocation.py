@@ -10,6 +10,8 @@ from collections.abc import Mapping
 
 import torch
 
+from egs_warp.training.growth import Growth
+
 _FAINT = 0.005
 """Opacity below which a Gaussian is moved."""
 _MAX_COPIES = 50
@@ -17,6 +19,8 @@ _EVERY = 100
 """Steps between relocations."""
 _GROWTH = 1.05
 """Least factor by which the number of Gaussians grows at each."""
+_SETTLING_FROM, _SETTLED = 0.5, 0.1
+"""Share of the steps from which the rates of all but the means fall, and to which part."""
 
 
 class Population:
@@ -32,28 +36,35 @@ class Population:
     ) -> None:
         self.tensors = tensors
         self._rates = {name: rates[name] * (extent if name == "means" else 1.0) for name in tensors}
+        self._extent = extent
         self._generator = generator
+        on_gpu = next(iter(tensors.values())).is_cuda
         self._optimiser = torch.optim.Adam(
-            [{"params": [tensor], "lr": self._rates[name], "name": name} for name, tensor in tensors.items()], eps=1e-15
+            [{"params": [tensor], "lr": self._rates[name], "name": name} for name, tensor in tensors.items()],
+            eps=1e-15,
+            fused=on_gpu or None,
         )
 
-    def step(self, *, decay: float) -> None:
-        """One step of Adam; the rate of the means is multiplied by ``decay``."""
+    def step(self, *, done: float, settling: bool = False) -> None:
+        """One step of Adam; the rate of the means falls to a hundredth as ``done`` goes from 0 to 1, and with ``settling``
+        the others to a tenth over the last part."""
+        late = max(0.0, done - _SETTLING_FROM) / (1 - _SETTLING_FROM) if settling else 0.0
         for group in self._optimiser.param_groups:
-            if group["name"] == "means":
-                group["lr"] = self._rates["means"] * decay
+            group["lr"] = self._rates[group["name"]] * (0.01**done if group["name"] == "means" else _SETTLED**late)
         self._optimiser.step()
         self._optimiser.zero_grad(set_to_none=True)
 
     def regularisation(self) -> torch.Tensor:
         """Pull on opacities and scales that lets useless Gaussians fade, so that they can be moved."""
         return 0.01 * (
-            torch.sigmoid(self.tensors["opacity_logits"]).mean() + torch.exp(self.tensors["log_scales"]).mean()
+            torch.sigmoid(self.tensors["opacity_logits"]).mean()
+            + torch.exp(self.tensors["log_scales"]).mean() / self._extent
         )
 
     @torch.no_grad()
-    def evolve(self, step: int, steps: int, cap: int) -> None:
-        """Jitter the means; now and then move faint Gaussians onto opaque ones and grow, to reach ``cap`` at half time."""
+    def evolve(self, step: int, steps: int, growth: Growth) -> None:
+        """Jitter the means; now and then move faint Gaussians onto opaque ones and grow: to a cap that was asked for by
+        half time, else at the least pace while ``growth`` lets them."""
         self._jitter()
         # The last fifth of the steps settles what is there.
         if step % _EVERY != _EVERY - 1 or step > 0.8 * steps:
@@ -69,8 +80,8 @@ class Population:
             self._forget(torch.cat([places, chosen]))
         count = len(opacity)
         turns_left = max(1, round((0.5 * steps - step) / _EVERY))
-        growth = max(_GROWTH, (cap / count) ** (1 / turns_left))
-        more = min(cap, int(growth * count) + 1) - count
+        pace = _GROWTH if growth.asked is None else max(_GROWTH, (growth.cap / count) ** (1 / turns_left))
+        more = min(growth.cap, int(pace * count) + 1) - count
         if more > 0:
             chosen = self._draw(torch.sigmoid(self.tensors["opacity_logits"]), more)
             self._share(chosen)
@@ -121,7 +132,8 @@ class Population:
             self.tensors[group["name"]] = new
 
     def _jitter(self) -> None:
-        """Noise of each Gaussian's own shape on the faint ones' means: 5e5 times the rate, as published."""
+        """Noise of each Gaussian's own shape on the faint ones' means: 5e5 times the rate, as published for scenes of
+        extent 1."""
         rate = next(group["lr"] for group in self._optimiser.param_groups if group["name"] == "means")
         opacity = torch.sigmoid(self.tensors["opacity_logits"])
         gate = torch.sigmoid(-100.0 * (opacity - _FAINT) + 0.0)
@@ -129,7 +141,7 @@ class Population:
         noise = torch.randn(scales.shape, generator=self._generator, device=scales.device)
         axes = _rotation_matrices(self.tensors["rotations"])
         # Sigma noise = R S S R^T noise.
-        local = torch.einsum("nji,nj->ni", axes, noise) * scales**2
+        local = torch.einsum("nji,nj->ni", axes, noise) * (scales / self._extent) ** 2
         self.tensors["means"] += torch.einsum("nij,nj->ni", axes, local) * (gate * 5e5 * rate)[:, None]
 
 

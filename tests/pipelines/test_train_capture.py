@@ -19,7 +19,8 @@ from tests.training.test_finetune import ball, ring
 
 pytest.importorskip("torch")
 from egs_warp.pipelines.train_capture import train
-from egs_warp.training.finetune import TrainingView, psnr
+from egs_warp.training.finetune import TrainingView
+from egs_warp.training.likeness import psnr
 from egs_warp.training.posed_photos import backdrop_colour, laid_over, read_views
 from egs_warp.training.rough_cloud import middle_of, rough_cloud
 
