@@ -17,10 +17,11 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.render import render
-from egs_warp.render.autograd import TorchImage, render_torch
+from egs_warp.render.autograd import render_torch
 from egs_warp.training.growth import Growth
 from egs_warp.training.likeness import ssim
 from egs_warp.training.misfits import Misfits
+from egs_warp.training.photo_loss import PhotoLoss, Target
 from egs_warp.training.relocation import Population
 from egs_warp.training.tones import Tones
 
@@ -148,9 +149,10 @@ def finetune(
     extent = scene_extent([view.camera for view in views], cloud)
     population = Population(_tensors(cloud, device), vars(options.rates), extent=extent, generator=generator)
     frozen = None if trainable is None else torch.as_tensor(~np.asarray(trainable, bool), device=device)
-    targets = [_Target.of(view, device) for view in views]
+    targets = [_target(view, device) for view in views]
     relocating = options.densification is Densification.RELOCATION
     tones = Tones(len(views), options.iterations, device) if options.tones else None
+    photo_loss = PhotoLoss(options.ssim_weight, device, options.threads)
     misfits = Misfits(len(views))
     growth = Growth(len(views), options.max_gaussians, device)
     losses = np.zeros(options.iterations)
@@ -174,20 +176,21 @@ def finetune(
         image = render_torch(
             *(tensors.means, tensors.rotations, tensors.log_scales, tensors.opacity_logits),
             torch.cat([tensors.sh_band_0, bands], dim=1),
-            target.camera,
+            views[number].camera,
             background=background,
             antialiased=options.antialiased,
             threads=options.threads,
         )
-        loss = target.loss(_toned(image, background, tones, number, target), background, options.ssim_weight)
+        if tones is None:
+            loss = _loss(target, image.colour, background, options.ssim_weight)
+        else:
+            loss = photo_loss(image.colour, image.alpha, tones.of(number), target, background)
         pending.append((step, number, loss.detach()))
-        if tones is not None:
-            loss = loss + tones.pull()
         if extra_loss is not None:
             loss = loss + extra_loss(tensors)
-        if relocating:
-            loss = loss + population.regularisation()
         loss.backward()
+        if relocating:
+            population.pull()
         if frozen is not None:
             for tensor in population.tensors.values():
                 if tensor.grad is not None:
@@ -220,18 +223,6 @@ def finetune(
     )
 
 
-def _toned(
-    image: TorchImage, background: Sequence[float], tones: Tones | None, number: int, target: _Target
-) -> torch.Tensor:
-    """(H, W, 3) the render in the tone of its view; a backdrop that is no part of the photo keeps its colour."""
-    if tones is None:
-        return image.colour
-    if target.alpha is None:
-        return tones.applied(number, image.colour)
-    behind = (1 - image.alpha)[:, :, None] * torch.tensor(background, device=image.colour.device)
-    return tones.applied(number, image.colour - behind, image.alpha) + behind
-
-
 def views_of_capture(
     cloud: GaussianCloud,
     cameras: Sequence[Camera],
@@ -258,36 +249,29 @@ def scene_extent(cameras: Sequence[Camera], cloud: GaussianCloud) -> float:
     return min(candidates) if candidates else 1.0
 
 
-@dataclass(frozen=True)
-class _Target:
-    camera: Camera
-    image: torch.Tensor
-    alpha: torch.Tensor | None
-    weight: torch.Tensor | None
+def _target(view: TrainingView, device: str) -> Target:
+    def upload(values: np.ndarray | None) -> torch.Tensor | None:
+        return None if values is None else torch.as_tensor(values, dtype=torch.float32, device=device).contiguous()
 
-    @classmethod
-    def of(cls, view: TrainingView, device: str) -> _Target:
-        def upload(values: np.ndarray | None) -> torch.Tensor | None:
-            return None if values is None else torch.as_tensor(values, dtype=torch.float32, device=device)
+    image = upload(view.image)
+    assert image is not None
+    return Target(image, upload(view.alpha), upload(view.weight))
 
-        image = upload(view.image)
-        assert image is not None
-        return cls(view.camera, image, upload(view.alpha), upload(view.weight))
 
-    def loss(self, picture: torch.Tensor, background: Sequence[float], ssim_weight: float) -> torch.Tensor:
-        image = self.image
-        if self.alpha is not None:
-            alpha = self.alpha[:, :, None]
-            image = image * alpha + (1 - alpha) * torch.tensor(background, device=image.device)
-        off = (picture - image).abs()
-        if self.weight is not None:
-            off = off * self.weight[:, :, None]
-            # What does not count must not reach the windows of the similarity either.
-            picture = torch.where(self.weight[:, :, None] > 0, picture, image)
-        loss = (1 - ssim_weight) * off.mean()
-        if ssim_weight > 0:
-            loss = loss + ssim_weight * (1 - ssim(picture, image))
-        return loss
+def _loss(target: Target, picture: torch.Tensor, background: Sequence[float], ssim_weight: float) -> torch.Tensor:
+    image = target.image
+    if target.alpha is not None:
+        alpha = target.alpha[:, :, None]
+        image = image * alpha + (1 - alpha) * torch.tensor(background, device=image.device)
+    off = (picture - image).abs()
+    if target.weight is not None:
+        off = off * target.weight[:, :, None]
+        # What does not count must not reach the windows of the similarity either.
+        picture = torch.where(target.weight[:, :, None] > 0, picture, image)
+    loss = (1 - ssim_weight) * off.mean()
+    if ssim_weight > 0:
+        loss = loss + ssim_weight * (1 - ssim(picture, image))
+    return loss
 
 
 def _check(

@@ -26,20 +26,17 @@ class Tones:
         self._steps = steps
         self._identity = torch.eye(3, 4, device=device)
 
-    def applied(self, number: int, colour: torch.Tensor, alpha: torch.Tensor | None = None) -> torch.Tensor:
-        """``colour`` (H, W, 3) in the tone of view ``number``; where given, it is premultiplied by ``alpha`` (H, W)."""
+    def of(self, number: int) -> torch.Tensor:
+        """(3, 4) the tone of view ``number``, a leaf whose gradient ``step`` takes."""
         self._leaf = leaf = (self._identity + self._offsets[number]).requires_grad_()
-        return colour @ leaf[:, :3].T + (leaf[:, 3] if alpha is None else leaf[:, 3] * alpha[:, :, None])
-
-    def pull(self) -> torch.Tensor:
-        """Loss that holds the tone that was applied last near the mean."""
-        return _PULL * (self._leaf - self._identity).square().sum()
+        return leaf
 
     @torch.no_grad()
     def step(self, number: int, step: int) -> None:
         """Move the tone of view ``number`` along its gradient, and all such that their mean stays."""
         gradient = self._leaf.grad
         assert gradient is not None
+        gradient = gradient + 2 * _PULL * self._offsets[number]
         self._visits[number] += 1
         visits = self._visits[number]
         first = self._first[number].lerp_(gradient, 0.1)
