@@ -42,7 +42,7 @@ def read_photo(posed: PosedImage, *, max_side: int | None = None) -> Photo:
     """
     if posed.image is None:
         raise UserError(f"{posed.name}: the photo is not beside the poses; put it there")
-    pixels = _decoded(posed.image)
+    pixels = decoded(posed.image)
     turn = _turn_to_fit(posed, pixels.shape[:2])
     shape = pixels.shape[:2]
     pixels = turned(pixels, turn)
@@ -115,7 +115,7 @@ def turned(pixels: np.ndarray, turn: int) -> np.ndarray:
     return np.ascontiguousarray(pixels[::rows, ::columns])
 
 
-def _decoded(image: Path) -> np.ndarray:
+def decoded(image: Path) -> np.ndarray:
     """(H, W) or (H, W, C) as stored, BGR, not turned. Raises ``UserError`` for what is not a whole picture."""
     from PIL import Image
 
