@@ -7,8 +7,8 @@ import numpy as np
 _JUDGED_AT = (0.3, 0.5, 0.7)
 """Shares of the steps."""
 _LAST_VISITS = 3
-_TIMES_MEDIAN = 2.0
-_SPREADS = 6.0
+_TIMES_MEDIAN = 1.8
+_SPREADS = 3.0
 """Robust standard deviations of the logarithm."""
 _MOST = 0.1
 """Share of the photos that may be left out: where more do not fit, it is not they."""

@@ -95,7 +95,9 @@ def test_a_photo_through_a_lens_is_straightened(model: str, numbers: dict[str, f
         np.array([0.0, 1.2, 2.2]), np.array([0.0, 0.5, 0.0]), np.array([0.0, 1.0, 0.0]), width=size, height=size
     )
     # Seen finer and wider than the photo, so that bending it loses little.
-    fine = replace(camera, width=4 * size, height=4 * size, fx=2 * camera.fx, fy=2 * camera.fy, cx=2 * size, cy=2 * size)
+    fine = replace(
+        camera, width=4 * size, height=4 * size, fx=2 * camera.fx, fy=2 * camera.fy, cx=2 * size, cy=2 * size
+    )
     cloud = pawn(gaussian_count=3000, device="cpu").cloud
     picture = render(cloud, fine).colour.numpy()
     straight = photographed(picture, fine, camera, Lens())

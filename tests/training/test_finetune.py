@@ -193,7 +193,7 @@ def test_impossible_training_is_refused(tmp_path: Path) -> None:
         '{"camera_angle_x": 0.7, "w": 8, "h": 8, "frames": [{"file_path": "r_0.png", '
         '"transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,3],[0,0,0,1]]}]}'
     )
-    with pytest.raises(UserError, match="is not beside the poses; put the images there"):
+    with pytest.raises(UserError, match=r"none of its 1 photos can be used; the first: r_0.png: the photo is not"):
         train(tmp_path)
 
 
