@@ -40,6 +40,7 @@ class PhotoLoss:
     """(1 - w) L1 + w (1 - SSIM), its scratch memory kept from step to step."""
 
     def __init__(self, ssim_weight: float, device: str, threads: int | None) -> None:
+        wp.init()
         self.ssim_weight = ssim_weight
         self.threads = threads
         line = torch.exp(-(torch.arange(-5.0, 6.0) ** 2) / (2 * 1.5**2))
