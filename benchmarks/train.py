@@ -28,8 +28,8 @@ from egs_warp.render import render
 
 OURS, GSPLAT = "egs_warp", "gsplat MCMC"
 CASES = ("bonsai", "mouse", "plush_dog", "lego")
-_NOISE = 0.1
-"""dB: seeds differ by this much."""
+_WARM_UP = 20
+"""Steps of both before the first timed case, so that kernels are compiled."""
 
 
 def data_folder() -> Path:
@@ -56,6 +56,7 @@ def run_case(case: str, options: argparse.Namespace) -> tuple[list[dict[str, Any
     """Rows of both methods, and a strip of photo and renders."""
     folder = data_folder() / case
     marks: dict[str, float] = {}
+    has_peer = options.device.startswith("cuda") and has_gsplat()
 
     def stage(text: str) -> None:
         marks[text.split()[0]] = time.perf_counter()
@@ -72,7 +73,7 @@ def run_case(case: str, options: argparse.Namespace) -> tuple[list[dict[str, Any
     clouds = {OURS: result.cloud}
     rows = [row_of(case, OURS, result.cloud, marks["judging"] - marks["training"], result)]
     rows[0]["left_out"] = [one.name for one in result.left_out]
-    if options.device.startswith("cuda") and has_gsplat():
+    if has_peer:
         trained = [
             view
             for view, score in zip(result.photos if result.cut_out else result.views, result.scores, strict=True)
@@ -103,6 +104,20 @@ def run_case(case: str, options: argparse.Namespace) -> tuple[list[dict[str, Any
     return rows, contact_sheet(frames, len(frames), [f"{case}: photo", *clouds])
 
 
+def warm_up(options: argparse.Namespace) -> None:
+    """Compile every kernel outside of the timed runs."""
+    folder = data_folder() / options.cases[0]
+    result = train(folder, iterations=_WARM_UP, max_gaussians=1000, max_side=120, device=options.device)
+    if options.device.startswith("cuda") and has_gsplat():
+        train_with_gsplat(
+            result.views,
+            read_points(folder),
+            iterations=_WARM_UP,
+            max_gaussians=options.gaussians,
+            device=options.device,
+        )
+
+
 def judge(rows: list[dict[str, Any]]) -> tuple[dict[str, bool | None], dict[str, str]]:
     """The aims, from the rows."""
     aims: dict[str, bool | None] = {"psnr_vs_gsplat": None, "not_slower": None}
@@ -113,7 +128,7 @@ def judge(rows: list[dict[str, Any]]) -> tuple[dict[str, bool | None], dict[str,
         [next(row for row in rows if row["case"] == case and row["method"] == method) for method in (OURS, GSPLAT)]
         for case in sorted(cases)
     ]
-    aims["psnr_vs_gsplat"] = all(a["held_out_psnr"] >= b["held_out_psnr"] - _NOISE for a, b in pairs)
+    aims["psnr_vs_gsplat"] = all(a["held_out_psnr"] >= b["held_out_psnr"] for a, b in pairs)
     aims["not_slower"] = all(a["seconds"] <= b["seconds"] for a, b in pairs)
     return aims, {}
 
@@ -138,6 +153,9 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     strips = []
     missing = [case for case in options.cases if not (data_folder() / case).is_dir()]
+    options.cases = [case for case in options.cases if case not in missing]
+    if options.cases:
+        warm_up(options)
     for case in options.cases:
         if case not in missing:
             part, strip = run_case(case, options)

@@ -120,7 +120,7 @@ def train_with_gsplat(
             backgrounds=background,
         )
         picture, image = colours[0], target.image
-        if background is not None:
+        if background is not None and target.alpha is not None:
             image = image * target.alpha + background[0] * (1 - target.alpha)
         loss = (1 - _SSIM_WEIGHT) * (picture - image).abs().mean() + _SSIM_WEIGHT * (1 - ssim(picture, image))
         loss = loss + _OPACITY_WEIGHT * torch.sigmoid(params["opacities"]).mean()

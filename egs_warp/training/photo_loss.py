@@ -98,10 +98,10 @@ class _Loss(torch.autograd.Function):
         by_alpha = torch.empty(pixels if cut_out else 1, device=colour.device)
         behind = torch.tensor([backdrop], device=colour.device) if cut_out else task.nothing
 
-        def of(tensor: torch.Tensor | None, dtype: Any = wp.vec3) -> wp.array:
-            tensor = task.nothing if tensor is None else tensor
+        def of(given: torch.Tensor | None, dtype: Any = wp.vec3) -> wp.array:
+            tensor = task.nothing if given is None else given
             count = tensor.numel() // (3 if dtype is wp.vec3 else 1)
-            return wp.array(ptr=tensor.data_ptr(), dtype=dtype, shape=(max(count, 1),), device=device)
+            return wp.array(ptr=tensor.data_ptr(), dtype=dtype, shape=(count,), device=device)
 
         at = {name: of(tensor, wp.vec3 if tensor.ndim == 2 else wp.float32) for name, tensor in held.items()}
         window, tones, backdrops = of(task.window, wp.float32), of(tone, wp.float32), of(behind)

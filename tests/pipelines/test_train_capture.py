@@ -248,3 +248,15 @@ def test_cameras_that_see_nothing_in_common_are_refused() -> None:
     view = TrainingView(away, np.zeros((camera.height, camera.width, 3), np.float32))
     with pytest.raises(UserError, match="train: the cameras do not look at a place in common; check the poses"):
         rough_cloud([view], count=100, sh_degree=0, device="cpu")
+
+
+@pytest.mark.data
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "least"), [("bonsai", 17.0), ("mouse", 22.0)])
+def test_photos_of_a_room_become_a_capture(name: str, least: float, data_dir: Path) -> None:
+    """A room through a lens that bends a little, and a desk in portrait and landscape: small, but right."""
+    result = train(data_dir / "posed" / name, iterations=300, max_gaussians=5000, max_side=90, device="cpu")
+    held_out = result.mean_score(held_out=True)
+    assert held_out is not None and held_out[0] > least
+    if name == "mouse":
+        assert {view.image.shape[:2] for view in result.views} == {(90, 68), (68, 90)}
