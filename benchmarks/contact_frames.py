@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
@@ -27,6 +25,7 @@ from egs_warp.motions.stance import Weights
 from egs_warp.muscles.muscle_set import MuscleColumns, MuscleSet, automatic_muscles
 from egs_warp.muscles.tension import MuscleTension
 from egs_warp.segmentation.base_plane import find_base_plane
+from harness import data_folder
 
 CAPTURES = {"monkey": ("monkey.ply", (0.0, 1.0, 0.0)), "plush dog": ("plush_dog.ply", (0.0, -1.0, 0.0))}
 """File and up axis of real captures in the data folder."""
@@ -45,11 +44,6 @@ class Frame:
     """(M,) those of this step."""
 
 
-def data_folder() -> Path:
-    """Folder of the real captures: $EGS_WARP_DATA, else beside the repository."""
-    return Path(os.environ.get("EGS_WARP_DATA", Path(__file__).parents[2] / "shared" / "data"))
-
-
 @dataclass(frozen=True)
 class BenchBody:
     """A standing body with muscles and a ground."""
@@ -60,7 +54,9 @@ class BenchBody:
 
 
 def body_named(name: str, device: str, *, nodes: int = 250) -> BenchBody:
-    """A built-in body ("pawn", "stool") or a real capture of ``CAPTURES``, 1 m tall, with a cage of about ``nodes`` nodes."""
+    """A built-in body ("pawn", "stool") or a real capture of ``CAPTURES``, 1 m tall,
+    with a cage of about ``nodes`` nodes.
+    """
     if name in CAPTURES:
         file, up = CAPTURES[name]
         cloud = read_capture(data_folder() / "objects" / file, device=device).cloud
@@ -86,12 +82,15 @@ def body_named(name: str, device: str, *, nodes: int = 250) -> BenchBody:
 
 
 def grouped_segments(muscles: MuscleSet, nodes: np.ndarray, groups: int, seed: int) -> np.ndarray:
-    """(M, groups) 0 or 1: each group is neighbouring segments of a like direction that act as one; ``nodes`` (N, 3) at rest."""
+    """(M, groups) 0 or 1: each group is neighbouring segments of a like direction that act as one;
+    ``nodes`` (N, 3) at rest.
+    """
     ends = muscles.end_points(nodes)
     first, second = ends[muscles.segments[:, 0]], ends[muscles.segments[:, 1]]
     upright = np.abs(second - first)[:, 2] / np.linalg.norm(second - first, axis=1)
     features = np.column_stack([0.5 * (first + second), 0.5 * upright * np.ptp(nodes, axis=0).max()])
-    _, group = kmeans2(features, groups, minit="++", seed=seed)
+    # scipy 1.15 renamed the argument, with other random numbers under the new name.
+    _, group = kmeans2(features, groups, minit="++", seed=seed)  # pyright: ignore[reportCallIssue]
     return np.eye(groups)[group]
 
 

@@ -6,27 +6,23 @@ Aims: ``cuda_within_2x_copy`` (on a GPU, at most twice the time that its bytes n
 
 from __future__ import annotations
 
-import argparse
 import functools
-import json
-import statistics
-import sys
-import time
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 import warp as wp
 
-sys.path.insert(0, str(Path(__file__).parent))
 import mesh_scenes as scenes
-
 from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.embedding import GaussianEmbedding, embed_gaussians
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.kernels.deformation.carried_cage import load_row, store_row
+from harness import Table, flags, median_ms, report
+from kernels import copy_kernel
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 BYTES_READ = 12 + 16 + 12 + 4
 """Mean, rotation, scales, tetrahedron of the mean; the carried cage itself stays in cache."""
@@ -36,17 +32,6 @@ BYTES_WRITTEN = 12 + 16 + 12 + 16
 """Mean, rotation, scales, turn."""
 BYTES_OF_COLOUR = 192 + 192
 """16 coefficients, read and written."""
-
-
-@wp.kernel(enable_backward=False)
-def copy_kernel(
-    # In:
-    source: wp.array[wp.vec4],
-    # Out:
-    target_out: wp.array[wp.vec4],
-):
-    row = wp.tid()
-    store_row(target_out, row, load_row(source, row))
 
 
 def random_cloud(count: int, seed: int, device: str) -> GaussianCloud:
@@ -134,31 +119,11 @@ class TorchTwin:
         return mean.float(), frame, scales, colour
 
 
-def median_ms(calls: dict[str, Callable[[], Any]], repeats: int, synchronise: Callable[[], Any]) -> dict[str, float]:
-    """Median milliseconds of each; they take turns."""
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for turn in range(repeats + 2):
-        for name, call in calls.items():
-            synchronise()
-            start = time.perf_counter()
-            call()
-            synchronise()
-            if turn >= 2:
-                times[name].append(1e3 * (time.perf_counter() - start))
-    return {name: statistics.median(values) for name, values in times.items()}
-
-
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    wp.init()
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--device", default="cuda:0" if wp.is_cuda_available() else "cpu")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--plot", type=Path)
+    parser = flags(__doc__, quick="200,000 Gaussians on a CPU, fewer repeats")
     parser.add_argument("--gaussians", type=int)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     device = wp.get_device(options.device)
     count = options.gaussians or (1_000_000 if device.is_cuda or not options.quick else 200_000)
     cage = scenes.box_cage(np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]), 7)
@@ -193,8 +158,11 @@ def main() -> None:
             calls[name]()
             with wp.ScopedCapture(device=device) as capture:
                 calls[name]()
-            calls[f"{name}_in_graph"] = functools.partial(wp.capture_launch, capture.graph)
-    times = median_ms(calls, 5 if options.quick else 15, lambda: wp.synchronize_device(device))
+            if capture.graph is not None:
+                calls[f"{name}_in_graph"] = functools.partial(wp.capture_launch, capture.graph)
+    times = median_ms(
+        calls, repeats=5 if options.quick else 15, synchronise=lambda: wp.synchronize_device(device), warm_up=2
+    )
     fastest = min(times["deform"], times.get("deform_in_graph", np.inf))
     copy = min(time for name, time in times.items() if name.startswith("copy"))
     row = {
@@ -214,29 +182,28 @@ def main() -> None:
         "cpu_5x_twin": None if device.is_cuda else row["twin_over_ours"] >= 5.0,
     }
     why = {name: f"cannot be measured on {device.name}" for name, value in aims.items() if value is None}
-    print(f"{count} Gaussians on {device.name}: " + ", ".join(f"{name} {ms:.3f} ms" for name, ms in times.items()))
-    print(
-        f"  {row['times_copy']:.2f} times the copy of its bytes, {row['twin_over_ours']:.1f} times as fast as PyTorch"
-    )
-    print(f"  difference from PyTorch: {off}")
-    print(json.dumps({"aims": aims, "why_null": why}, indent=1))
-    environment = {**scenes.environment(options.device, options.seed), "torch": torch.__version__}
-    environment["torch_threads"] = torch.get_num_threads()
-    if options.json:
-        options.json.write_text(
-            json.dumps({"rows": [row], "environment": environment, "aims": aims, "why_null": why}, indent=1)
-        )
-    if options.plot:
-        import matplotlib
+    print(f"{count} Gaussians on {device.name}")
+    table = Table(call="<20", ms="10.3f")
+    for name, ms in times.items():
+        table.row(name, ms)
+    print(f"{row['times_copy']:.2f} times the copy of its bytes, {row['twin_over_ours']:.1f} times as fast as PyTorch")
+    print(f"difference from PyTorch: {off}")
 
-        matplotlib.use("Agg")
-        from matplotlib import pyplot
-
-        figure, axes = pyplot.subplots(figsize=(5, 2.5))
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
         axes.barh(list(times), list(times.values()))
         axes.set_xlabel(f"ms for {count:,} Gaussians, {device.name}")
-        figure.tight_layout()
-        figure.savefig(options.plot)
+
+    report(
+        options,
+        [row],
+        aims=aims,
+        why_null=why,
+        packages=["torch"],
+        conditions={"torch_threads": torch.get_num_threads()},
+        draw=draw,
+        size=(5.0, 2.5),
+    )
 
 
 if __name__ == "__main__":

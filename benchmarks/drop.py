@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from egs_warp.contact.corrector import contact_step
@@ -42,11 +42,11 @@ class Drop:
     def at_impact(self, points: np.ndarray) -> np.ndarray:
         """Where ``points`` (P, 3) of the rest shape are in the frame of greatest deformation.
 
-        Between the nodes, and around them where a coarse cage does not reach, the motion is the affine one that fits the nearest nodes
-        best, their weights falling smoothly to nothing (moving least squares).
+        Between the nodes, and around them where a coarse cage does not reach, the motion is the affine one that fits
+        the nearest nodes best, their weights falling smoothly to nothing (moving least squares).
         """
         count = min(NEAREST, len(self.rest))
-        distance, near = cKDTree(self.rest).query(points, k=count)
+        distance, near = (np.asarray(found) for found in KDTree(self.rest).query(points, k=count))
         weights = (1.0 - distance / (1.001 * distance[:, -1:])) ** 2
         weights /= weights.sum(axis=1, keepdims=True)
         before, after = self.rest[near], self.frames[int(np.argmax(self.energies))][near]

@@ -1,52 +1,44 @@
-"""Every example as the paper's supplement tabulates its own: sizes of the body, contacts, QPs and milliseconds a frame by stage.
+"""Every example as the paper's supplement tabulates its own: sizes of the body, contacts, QPs and milliseconds a frame
+by stage.
 
 python benchmarks/examples.py [--quick] [--device cpu] [--json PATH] [--plot PATH]
 """
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
-import json
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from egs_warp.pipelines.report import versions
+from harness import Row, Table, flags, report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 EXAMPLES = ("jump", "twist", "hop", "walk")
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run the examples and tabulate their reports."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="six frames of each")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--seed", type=int, default=0, help="not used: nothing here is random")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--plot", type=Path)
-    arguments = parser.parse_args()
+    options = flags(
+        __doc__, quick="six frames of each", device="cpu", seed="not used: nothing here is random"
+    ).parse_args(arguments)
     rows = []
     for name in EXAMPLES:
         with tempfile.TemporaryDirectory() as folder:
-            flags = ["--out", folder, "--device", arguments.device, *(["--frames", "6"] if arguments.quick else [])]
-            report = example(name).main(flags)
+            asked = ["--out", folder, "--device", options.device, *(["--frames", "6"] if options.quick else [])]
+            told = example(name).main(asked)
             with np.load(Path(folder) / "trajectory.npz") as trajectory:
                 steps = len(trajectory["time"]) - 1
                 contacts = np.bincount(trajectory["contact_step"], minlength=steps)
-        rows.append(row_of(name, report, contacts))
-    print(table(rows))
-    result = {
-        "rows": rows,
-        "environment": {"device": arguments.device, "seed": arguments.seed, **versions()},
-        "aims": {},
-    }
-    if arguments.json:
-        arguments.json.write_text(json.dumps(result, indent=2) + "\n")
-    if arguments.plot:
-        plot(rows, arguments.plot)
+        rows.append(row_of(name, told, contacts))
+    print_rows(rows)
+    report(options, rows, aims={}, draw=lambda figure: draw(figure, rows), size=(7.0, 3.0))
 
 
 def example(name: str) -> ModuleType:
@@ -59,48 +51,42 @@ def example(name: str) -> ModuleType:
     return module
 
 
-def row_of(name: str, report: dict, contacts: np.ndarray) -> dict:
+def row_of(name: str, told: Row, contacts: np.ndarray) -> Row:
     """One line of the table; ``contacts`` (F,) in each step."""
     return {
         "example": name,
-        "nodes": report["cage"]["nodes"],
-        "tets": report["cage"]["tets"],
-        "fibres": report["muscles"]["fibres"],
-        "segments": report["muscles"]["segments"],
+        "nodes": told["cage"]["nodes"],
+        "tets": told["cage"]["tets"],
+        "fibres": told["muscles"]["fibres"],
+        "segments": told["muscles"]["segments"],
         "contacts_mean": float(contacts[contacts > 0].mean()) if contacts.any() else 0.0,
         "contacts_most": int(contacts.max(initial=0)),
-        "qps_a_frame": report["qp"]["mean_per_frame"],
-        "qps_worst": report["qp"]["worst_per_frame"],
-        "milliseconds": {stage: values["mean"] for stage, values in report["timing"].items()},
-        "motions": report["motion"],
-        "audit": report["audit"],
+        "qps_a_frame": told["qp"]["mean_per_frame"],
+        "qps_worst": told["qp"]["worst_per_frame"],
+        "milliseconds": {stage: values["mean"] for stage, values in told["timing"].items()},
+        "motions": told["motion"],
+        "audit": told["audit"],
     }
 
 
-def table(rows: list[dict]) -> str:
-    """As text."""
+def print_rows(rows: list[Row]) -> None:
+    """The table: in brackets the most in a step or frame; stages in milliseconds a frame."""
     stages = list(rows[0]["milliseconds"])
-    head = ["example", "nodes", "tets", "fibres", "segments", "contacts", "QPs", *stages]
-    lines = ["".join(f"{word:>11}" for word in head)]
+    columns = {"example": "<8", "nodes": "d", "tets": "d", "fibres": "d", "segments": "d"}
+    table = Table(**columns, contacts="10s", QPs="10s", **dict.fromkeys(stages, "8.1f"))
     for row in rows:
-        values = [row["example"], row["nodes"], row["tets"], row["fibres"], row["segments"]]
-        values += [
+        table.row(
+            *(row[name] for name in columns),
             f"{row['contacts_mean']:.0f} ({row['contacts_most']})",
             f"{row['qps_a_frame']:.1f} ({row['qps_worst']})",
-        ]
-        values += [f"{row['milliseconds'][stage]:.1f}" for stage in stages]
-        lines.append("".join(f"{value!s:>11}" for value in values))
-    return "\n".join([*lines, "in brackets the most in a step or frame; stages in ms a frame"])
+            *(row["milliseconds"][stage] for stage in stages),
+        )
+    print("in brackets the most in a step or frame; stages in ms a frame")
 
 
-def plot(rows: list[dict], path: Path) -> None:
+def draw(figure: Figure, rows: list[Row]) -> None:
     """Milliseconds a frame by stage, one bar an example."""
-    import matplotlib
-
-    matplotlib.use("agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(7, 3))
+    axes = figure.subplots()
     left = np.zeros(len(rows))
     for stage in rows[0]["milliseconds"]:
         width = np.array([row["milliseconds"][stage] for row in rows])
@@ -108,8 +94,6 @@ def plot(rows: list[dict], path: Path) -> None:
         left += width
     axes.set(xlabel="ms a frame")
     axes.legend(fontsize=7, ncols=2)
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
 
 
 if __name__ == "__main__":

@@ -7,37 +7,25 @@ trained on, so that this stays small. Aim: ``spikes_down_5x`` (splitting makes i
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import warp as wp
 
-sys.path.insert(0, str(Path(__file__).parent))
 import mesh_scenes as scenes
-
 from egs_warp.deformation.peers import CarryMethod, carry
-from egs_warp.io.video import write_png
 from egs_warp.render import render
 from egs_warp.training.likeness import psnr
+from harness import Table, flags, report
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    wp.init()
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--device", default="cuda:0" if wp.is_cuda_available() else "cpu")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--plot", type=Path)
+    parser = flags(__doc__, quick="pictures half as large, fewer views and training steps")
     parser.add_argument("--gaussians", type=int, default=1500, help="few, as on flat walls of real captures")
     parser.add_argument("--degrees", type=float, default=720.0, help="twist at the top")
     parser.add_argument("--growth", type=float, default=20.0, help="at most this many times as many Gaussians")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     size = 128 if options.quick else 256
     mesh = scenes.bar()
     cloud = scenes.trained(
@@ -52,6 +40,7 @@ def main() -> None:
     cage = scenes.box_cage(mesh.vertices, 24)
     rows: list[dict[str, Any]] = []
     strips = []
+    table = Table(degrees=".0f", method="<24", spikes=".4%", dB=".2f", Gaussians="9d")
     for degrees in (0.0, options.degrees / 2, options.degrees):
         nodes = scenes.twist_by(degrees)(cage.nodes)
         vertices = scenes.carried_vertices(mesh, cage, nodes, options.device)
@@ -75,27 +64,18 @@ def main() -> None:
                 }
             )
             row = rows[-1]
-            print(
-                f"{degrees:5.0f} degrees  {method.value:24} spikes {100 * row['outside_silhouette']:.4f} %  "
-                f"{row['psnr']:.2f} dB  {row['gaussians']} Gaussians",
-                flush=True,
-            )
+            table.row(degrees, method.value, row["outside_silhouette"], row["psnr"], row["gaussians"])
         strips.append(np.concatenate(strip, axis=1))
     spikes = {row["method"]: row["outside_silhouette"] for row in rows if row["twist_degrees"] == options.degrees}
     whole, split = spikes[CarryMethod.BIDIRECTIONAL_NO_SPLIT.value], spikes[CarryMethod.BIDIRECTIONAL.value]
-    aims = {"spikes_down_5x": bool(whole >= 5.0 * split)}
-    result = {
-        "rows": rows,
-        "environment": scenes.environment(options.device, options.seed),
-        "aims": aims,
-        "why_null": {},
-    }
     print(f"spikes fall by {whole / split if split else float('inf'):.1f} times")
-    print(json.dumps({"aims": aims}))
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=1))
-    if options.plot:
-        write_png(options.plot, (np.concatenate(strips, axis=0) * 255).astype(np.uint8))
+    report(
+        options,
+        rows,
+        aims={"spikes_down_5x": whole >= 5.0 * split},
+        packages=["torch"],
+        picture=np.concatenate(strips, axis=0),
+    )
 
 
 if __name__ == "__main__":

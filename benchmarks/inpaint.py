@@ -2,8 +2,8 @@
 
 Cases: the three built-in scenes (floor under the object taken out, dark haze put in its place, as a capture has it) and
 holes cut into uncovered floor of real captures. Unseen cameras compare the hole's pixels with the untouched floor.
-Rows: this package; ``cv2.inpaint`` in every picture (the better of its two methods); training without the plane: as many
-Gaussians, scattered where the object stood, against the same one inpainted picture.
+Rows: this package; ``cv2.inpaint`` in every picture (the better of its two methods); training without the plane: as
+many Gaussians, scattered where the object stood, against the same one inpainted picture.
 
 Aims: ``beats_cv2_by_3db``, ``beats_no_prior_by_3db`` (mean PSNR over the cases), ``seconds_on_gpu`` (every case at most
 20 s), ``hole_size_independent`` (seconds vary at most 1.5 times over a fourfold area of the hole).
@@ -13,31 +13,27 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import warp as wp
 
 from egs_warp.assets import scene
-from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.holes import Hole, disc, footprint
 from egs_warp.inpainting.inpaint import InpaintOptions, InpaintResult, inpaint
 from egs_warp.inpainting.picture import depth_colours
 from egs_warp.io import read_capture
-from egs_warp.io.video import contact_sheet, write_png
+from egs_warp.io.video import contact_sheet
 from egs_warp.render import render
 from egs_warp.segmentation.plane_fit import plane_depth
 from egs_warp.training.finetune import FinetuneOptions, TrainingView, finetune
 from egs_warp.training.likeness import psnr
+from harness import Row, Table, data_folder, flags, report, timed
 
 AIMS = ("beats_cv2_by_3db", "beats_no_prior_by_3db", "seconds_on_gpu", "hole_size_independent")
 OURS, CV2, NO_PRIOR = "ours", "cv2 in the picture", "no plane prior"
@@ -70,9 +66,7 @@ def built_in(name: str, device: str) -> Case:
 def real(name: str, device: str) -> Case | None:
     """A hole in uncovered floor; None where the capture is not on this machine."""
     file, coefficients, centre, radius = REAL[name]
-    path = (
-        Path(os.environ.get("EGS_WARP_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "scenes" / file
-    )
+    path = data_folder() / "scenes" / file
     if not path.exists():
         return None
     hole = disc(Plane.from_coefficients(*coefficients), np.array(centre), radius)
@@ -122,9 +116,7 @@ def cameras_around(hole: Hole, size: int) -> list[Camera]:
 def hole_pixels(result: InpaintResult, camera: Camera) -> np.ndarray:
     """(H, W) bool: pixels whose ray meets the plane inside the hole."""
     depth = plane_depth(result.window.plane, camera)
-    v, u = np.mgrid[: camera.height, : camera.width] + 0.5
-    seen = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
-    points = camera.centre + depth[..., None] * (seen @ camera.rotation)
+    points = camera.centre + depth[..., None] * camera_rays(camera)
     return (result.window.sample(result.hole, points.reshape(-1, 3)).reshape(depth.shape)) & (depth > 0.0)
 
 
@@ -149,13 +141,12 @@ def similarity(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     ).mean(axis=2)
 
 
-def by_opencv(image: np.ndarray, mask: np.ndarray) -> list[np.ndarray]:
-    """Both methods of OpenCV on one picture."""
+def best_by_opencv(image: np.ndarray, mask: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """``image`` filled by the method of OpenCV that is nearer to the ``truth`` there, all (H, W, 3)."""
     wide = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
     coded = np.rint(255 * image).astype(np.uint8)
-    return [
-        cv2.inpaint(coded, wide, 5, flag).astype(np.float32) / 255.0 for flag in (cv2.INPAINT_TELEA, cv2.INPAINT_NS)
-    ]
+    filled = (cv2.inpaint(coded, wide, 5, flag) / np.float32(255.0) for flag in (cv2.INPAINT_TELEA, cv2.INPAINT_NS))
+    return max(filled, key=lambda one: psnr(one[mask], truth[mask]))
 
 
 def without_plane(
@@ -190,7 +181,7 @@ def without_plane(
     ).cloud
 
 
-def judge_case(case: Case, options: argparse.Namespace) -> tuple[list[dict[str, Any]], np.ndarray]:
+def judge_case(case: Case, options: argparse.Namespace, table: Table) -> tuple[list[Row], np.ndarray]:
     """Rows of the three methods, and a strip of pictures: colour above depth."""
     runs = [inpaint(case.damaged, case.hole, options=InpaintOptions(seed=options.seed)) for _ in range(options.repeat)]
     # The first run also compiles kernels.
@@ -199,9 +190,7 @@ def judge_case(case: Case, options: argparse.Namespace) -> tuple[list[dict[str, 
     cameras = cameras_around(case.hole, options.size)
     empty = result.cloud.subset(~result.is_new)
     target, _ = picture(result.cloud, cameras[0])
-    started = time.perf_counter()
-    unguided = without_plane(case, result, cameras[0], target, options.baseline_steps, options.seed)
-    unguided_seconds = time.perf_counter() - started
+    unguided, unguided_ms = timed(without_plane, case, result, cameras[0], target, options.baseline_steps, options.seed)
     scores: dict[str, list[tuple[float, ...]]] = {OURS: [], CV2: [], NO_PRIOR: []}
     cv2_seconds = []
     strip = np.zeros(0)
@@ -213,9 +202,8 @@ def judge_case(case: Case, options: argparse.Namespace) -> tuple[list[dict[str, 
         if mask.sum() < 100:
             continue
         hollow, hollow_depth = picture(empty, camera)
-        started = time.perf_counter()
-        smooth = max(by_opencv(hollow, mask), key=lambda image: psnr(image[mask], truth[mask]))
-        cv2_seconds.append(time.perf_counter() - started)
+        smooth, cv2_ms = timed(best_by_opencv, hollow, mask, truth)
+        cv2_seconds.append(1e-3 * cv2_ms)
         ours, unprior = picture(result.cloud, camera), picture(unguided, camera)
         if strip.size == 0:
             strip = shown(
@@ -229,7 +217,7 @@ def judge_case(case: Case, options: argparse.Namespace) -> tuple[list[dict[str, 
                 (psnr(image[mask], truth[mask]), float(similarity(truth, image)[mask].mean()), float(off))
             )
     rows = []
-    spent = {OURS: float(np.median(seconds)), CV2: float(np.median(cv2_seconds)), NO_PRIOR: unguided_seconds}
+    spent = {OURS: float(np.median(seconds)), CV2: float(np.median(cv2_seconds)), NO_PRIOR: 1e-3 * unguided_ms}
     for method, values in scores.items():
         mean = np.mean(values, axis=0)
         rows.append(
@@ -246,11 +234,8 @@ def judge_case(case: Case, options: argparse.Namespace) -> tuple[list[dict[str, 
                 "hole_texels": int(result.hole.sum()),
             }
         )
-        depth = "" if np.isnan(mean[2]) else f"depth {100 * mean[2]:6.2f} % of side"
-        print(
-            f"{case.name:13} {method:19} {mean[0]:6.2f} dB  SSIM {mean[1]:.3f}  {spent[method]:7.2f} s  {depth}",
-            flush=True,
-        )
+        depth = rows[-1]["depth_error_of_hole_side"]
+        table.row(case.name, method, mean[0], mean[1], spent[method], depth)
     return rows, strip
 
 
@@ -267,7 +252,7 @@ def shown(colours: list[np.ndarray], depths: list[np.ndarray | None], name: str)
     return contact_sheet(tiles, 5, labels + ["depth", "no depth", "depth", "depth", "depth"])
 
 
-def size_rows(options: argparse.Namespace) -> list[dict[str, Any]]:
+def size_rows(options: argparse.Namespace) -> list[Row]:
     """Seconds for a round hole in the table cloth and for one of four times its area, interleaved."""
     made = scene("figurine", device=options.device)
     holes = {radius: disc(made.plane, np.array([0.1, 0.2, 0.0]), radius) for radius in (0.16, 0.32)}
@@ -286,7 +271,7 @@ def size_rows(options: argparse.Namespace) -> list[dict[str, Any]]:
     return rows
 
 
-def judge(rows: list[dict[str, Any]], *, on_gpu: bool) -> tuple[dict[str, bool | None], dict[str, str]]:
+def judge(rows: list[Row], *, on_gpu: bool) -> tuple[dict[str, bool | None], dict[str, str]]:
     """The aims, from the rows."""
 
     def mean(method: str) -> float:
@@ -304,34 +289,29 @@ def judge(rows: list[dict[str, Any]], *, on_gpu: bool) -> tuple[dict[str, bool |
     return aims, why
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    wp.init()
-    parser.add_argument("--quick", action="store_true", help="256 x 256, 150 steps without the plane, one run each")
-    parser.add_argument("--device", default="cuda:0" if wp.is_cuda_available() else "cpu")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--plot", type=Path)
+    parser = flags(__doc__, quick="256 x 256, 150 steps without the plane, one run each")
     parser.add_argument("--cases", nargs="+", default=["pawn", "stool", "figurine", *REAL])
     parser.add_argument("--size", type=int, help="pixels, both sides (400)")
     parser.add_argument("--baseline-steps", type=int, help="of training without the plane (5000)")
     parser.add_argument("--join", type=Path, help="JSON of an earlier run with other cases, judged together with this")
     parser.add_argument("--repeat", type=int, help="timed runs (4, the first not counted)")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     options.size = options.size or (256 if options.quick else 400)
     options.baseline_steps = options.baseline_steps or (150 if options.quick else 5000)
     options.repeat = options.repeat or (1 if options.quick else 4)
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     strips: list[np.ndarray] = []
     missing = []
+    table = Table(case="<13", method="<18", dB=".2f", SSIM=".3f", seconds=".2f", depth_off_by_of_side=".2%")
     for name in options.cases:
         make: Callable[[str, str], Case | None] = real if name in REAL else built_in
         case = make(name, options.device)
         if case is None:
             missing.append(name)
             continue
-        part, strip = judge_case(case, options)
+        part, strip = judge_case(case, options, table)
         rows += part
         strips.append(strip)
     if options.join:
@@ -340,34 +320,19 @@ def main() -> None:
     aims, why_null = judge(rows, on_gpu=options.device.startswith("cuda"))
     if missing:
         print(f"not on this machine: {', '.join(missing)}")
+    table = Table(mean_of_all="<18", dB=".2f", SSIM=".3f")
     for method in (OURS, CV2, NO_PRIOR):
         chosen = [row for row in rows if row["method"] == method and row["case"] != "size"]
-        print(
-            f"mean {method:20} {np.mean([r['psnr'] for r in chosen]):.2f} dB"
-            f"  SSIM {np.mean([r['ssim'] for r in chosen]):.3f}"
-        )
-    print(json.dumps({"aims": aims, "why_null": why_null}, indent=1))
-    result = {
-        "rows": rows,
-        "environment": {
-            "device": str(wp.get_device(options.device)),
-            "name": wp.get_device(options.device).name,
-            "python": platform.python_version(),
-            "warp": wp.config.version,
-            "opencv": cv2.__version__,
-            "threads": os.cpu_count(),
-            "seed": options.seed,
-            "size": options.size,
-            "baseline_steps": options.baseline_steps,
-            "missing": missing,
-        },
-        "aims": aims,
-        "why_null": why_null,
-    }
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=1))
-    if options.plot:
-        write_png(options.plot, np.concatenate(strips, axis=0))
+        table.row(method, np.mean([row["psnr"] for row in chosen]), np.mean([row["ssim"] for row in chosen]))
+    report(
+        options,
+        rows,
+        aims=aims,
+        why_null=why_null,
+        packages=["opencv-python-headless", "torch"],
+        conditions={"size": options.size, "baseline_steps": options.baseline_steps, "missing": missing},
+        picture=np.concatenate(strips, axis=0) if strips else None,
+    )
 
 
 if __name__ == "__main__":

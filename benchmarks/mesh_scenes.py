@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import platform
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -20,6 +17,8 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.precision import Vec3
 from egs_warp.training.finetune import Densification, FinetuneOptions, TrainingView, finetune
+from harness import data_folder
+from kernels import trace_kernel
 
 Paint = Callable[[np.ndarray], np.ndarray]
 """Colour (P, 3), 0 to 1, of points (P, 3) of the rest shape: a texture that goes through the solid."""
@@ -41,11 +40,6 @@ class PaintedMesh:
     faces: np.ndarray
     """(F, 3) int32."""
     paint: Paint
-
-
-def data_folder() -> Path:
-    """Where the meshes are."""
-    return Path(os.environ.get("EGS_WARP_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 
 def checkers(cell: float, colours: tuple[tuple[float, ...], ...]) -> Paint:
@@ -77,7 +71,9 @@ def _standing(vertices: np.ndarray) -> np.ndarray:
 
 
 def _subdivided(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges are halved until none is longer than ``LONGEST_EDGE``: a deformed mesh is the truth, and a long straight edge is not."""
+    """Edges are halved until none is longer than ``LONGEST_EDGE``:
+    a deformed mesh is the truth, and a long straight edge is not.
+    """
     while True:
         sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2)
         long = np.linalg.norm(vertices[sides[..., 0]] - vertices[sides[..., 1]], axis=2) > LONGEST_EDGE
@@ -159,7 +155,9 @@ def stool() -> PaintedMesh:
 
 
 def bar() -> PaintedMesh:
-    """The checkered bar of Figure 8: a quarter as thick as it is high, in bricks of long sides, as long Gaussians want."""
+    """The checkered bar of Figure 8: a quarter as thick as it is high, in bricks of long sides,
+    as long Gaussians want.
+    """
     corners = np.array([[x, y, z] for x in (-0.125, 0.125) for y in (-0.125, 0.125) for z in (0.0, 1.0)])
     faces = np.array(
         [[0, 1, 3], [0, 3, 2], [4, 7, 5], [4, 6, 7], [0, 5, 1], [0, 4, 5], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4]]
@@ -232,34 +230,6 @@ def ring(
     return cameras
 
 
-@wp.kernel(enable_backward=False)
-def _trace_kernel(
-    # In:
-    mesh: wp.uint64,
-    rest: wp.array[wp.vec3],
-    world_from_camera: wp.mat33,
-    eye: wp.vec3,
-    focal: wp.vec2,
-    centre: wp.vec2,
-    width: wp.int32,
-    samples: wp.int32,
-    # Out:
-    rest_out: wp.array2d[wp.vec3],
-    hit_out: wp.array2d[wp.bool],
-):
-    pixel, sample = wp.tid()
-    x = float(pixel % width) + (float(sample % samples) + 0.5) / float(samples)
-    y = float(pixel // width) + (float(sample // samples) + 0.5) / float(samples)
-    ray = wp.normalize(world_from_camera * wp.vec3((x - centre[0]) / focal[0], (y - centre[1]) / focal[1], 1.0))
-    hit = wp.mesh_query_ray(mesh, eye, ray, 1.0e6)
-    hit_out[pixel, sample] = hit.result
-    if hit.result:
-        a = wp.mesh_get_index(mesh, 3 * hit.face)
-        b = wp.mesh_get_index(mesh, 3 * hit.face + 1)
-        c = wp.mesh_get_index(mesh, 3 * hit.face + 2)
-        rest_out[pixel, sample] = hit.u * rest[a] + hit.v * rest[b] + (1.0 - hit.u - hit.v) * rest[c]
-
-
 def photograph(
     mesh: PaintedMesh, vertices: np.ndarray, cameras: list[Camera], device: str, *, samples: int = 3
 ) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -273,7 +243,7 @@ def photograph(
             where = wp.zeros((count, samples**2), dtype=wp.vec3)
             hit = wp.zeros((count, samples**2), dtype=wp.bool)
             wp.launch(
-                _trace_kernel,
+                trace_kernel,
                 dim=(count, samples**2),
                 inputs=[
                     solid.id,
@@ -287,7 +257,7 @@ def photograph(
                 ],
                 outputs=[where, hit],
             )
-            covered = hit.numpy()
+            covered = np.asarray(hit.numpy(), dtype=bool)
             colour = np.ones((count, samples**2, 3))
             colour[covered] = mesh.paint(where.numpy()[covered].astype(np.float64))
             shape = (camera.height, camera.width)
@@ -361,17 +331,5 @@ def trained(
 
 def outside(alpha: np.ndarray, coverage: np.ndarray, threshold: float = 0.1) -> float:
     """Share of pixels that are drawn outside the silhouette dilated by one pixel."""
-    allowed = ndimage.binary_dilation(coverage > 0, structure=np.ones((3, 3)))
+    allowed = np.asarray(ndimage.binary_dilation(coverage > 0, structure=np.ones((3, 3))), dtype=bool)
     return float(np.mean((alpha > threshold) & ~allowed))
-
-
-def environment(device: str, seed: int) -> dict[str, Any]:
-    """Where the numbers were measured."""
-    return {
-        "device": wp.get_device(device).name,
-        "threads": os.cpu_count(),
-        "python": platform.python_version(),
-        "warp": wp.__version__,
-        "numpy": np.__version__,
-        "seed": seed,
-    }

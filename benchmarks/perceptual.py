@@ -1,4 +1,6 @@
-"""LPIPS (Zhang et al. 2018, AlexNet) where the ``lpips`` package and the network's weights are on this machine; nothing is fetched."""
+"""LPIPS (Zhang et al. 2018, AlexNet) where the ``lpips`` package and the network's weights are on this machine;
+nothing is fetched.
+"""
 
 from __future__ import annotations
 

@@ -1,23 +1,20 @@
 """How well is the plane found? 100 synthetic depth pictures with outliers and noise, and real captures view by view.
 
 A synthetic picture is one view, 240 x 180 pixels, of a random plane with a ball that stands on it (about half of the
-outliers) and scattered wrong depths (the rest): 30 % of the masked pixels are wrong, all have 1 % noise. The extent is the
-diagonal of what is seen of the plane. Real captures: each of eight views alone against all views together.
+outliers) and scattered wrong depths (the rest): 30 % of the masked pixels are wrong, all have 1 % noise. The extent is
+the diagonal of what is seen of the plane. Real captures: each of eight views alone against all views together.
 
-Aims: ``normal`` (within 0.1 degree in every scene), ``offset`` (within 0.1 % of the extent in every scene), ``paper_start``
-(the paper's start leads to the same planes), ``real_views_agree`` (each view alone within 0.5 degree of all together).
+Aims: ``normal`` (within 0.1 degree in every scene), ``offset`` (within 0.1 % of the extent in every scene),
+``paper_start`` (the paper's start leads to the same planes), ``real_views_agree`` (each view alone within 0.5 degree of
+all together).
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import time
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from mesh_scenes import data_folder, environment
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera, camera_rays
@@ -28,6 +25,10 @@ from egs_warp.segmentation.base_plane import guess_up
 from egs_warp.segmentation.object_mask import ObjectSpec, segment
 from egs_warp.segmentation.plane_fit import PlaneView, fit_plane, plane_depth
 from egs_warp.segmentation.plane_search import find_planes, plane_views
+from harness import Row, Table, data_folder, flags, report, timed
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 WRONG, NOISE = 0.30, 0.01
 CAPTURES = {
@@ -83,15 +84,13 @@ def degrees(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
-def synthetic_rows(count: int, seed: int) -> list[dict[str, Any]]:
+def synthetic_rows(count: int, seed: int) -> list[Row]:
     """One row a scene."""
     random = np.random.default_rng(seed)
     rows = []
     for number in range(count):
         plane, view, extent = synthetic_view(random)
-        started = time.perf_counter()
-        fit = fit_plane([view])
-        seconds = time.perf_counter() - started
+        fit, milliseconds = timed(fit_plane, [view])
         other = fit_plane([view], start=Plane(view.camera.rotation[2], 0.0))
         points = (view.camera.centre + plane_depth(plane, view.camera)[..., None] * camera_rays(view.camera))[view.mask]
         middle = points.mean(axis=0)
@@ -102,13 +101,13 @@ def synthetic_rows(count: int, seed: int) -> list[dict[str, Any]]:
                 "offset_percent": 100.0 * abs(float(fit.plane.heights(middle))) / extent,
                 "paper_start_degrees": degrees(other.plane.normal, fit.plane.normal),
                 "noise": fit.noise,
-                "seconds": seconds,
+                "seconds": 1e-3 * milliseconds,
             }
         )
     return rows
 
 
-def real_row(name: str, click: tuple[float, float, float], radius: float, device: str) -> dict[str, Any]:
+def real_row(name: str, click: tuple[float, float, float], radius: float, device: str) -> Row:
     """Each of eight ring views alone against the fit to all of them, within ``radius`` of the ``click``."""
     cloud = read_capture(data_folder() / name, device=device).cloud
     coarse = find_planes(cloud, guess_up(cloud)[0])[0].plane
@@ -132,62 +131,49 @@ def real_row(name: str, click: tuple[float, float, float], radius: float, device
     }
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--quick", action="store_true", help="the same: it takes a minute or two")
-    parser.add_argument("--device", default="cpu", help="renders the real captures; the fit runs on the host")
-    parser.add_argument("--seed", type=int, default=0)
+    parser = flags(__doc__, quick="the same: it takes a minute or two", device="cpu")
     parser.add_argument("--scenes", type=int, default=100)
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--plot", type=Path)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     rows = synthetic_rows(options.scenes, options.seed)
-    print(f"{len(rows)} scenes       median     worst")
+    table = Table(**{f"{len(rows)}_scenes": "<20", "median": "8.4f", "worst": "8.4f"})
     for key in ("normal_degrees", "offset_percent", "paper_start_degrees", "seconds"):
         values = [row[key] for row in rows]
-        print(f"{key:20s} {np.median(values):8.4f} {max(values):8.4f}")
+        table.row(key, np.median(values), max(values))
     why_null: dict[str, str] = {}
-    real: list[dict[str, Any]] = []
+    real: list[Row] = []
+    table = Table(capture="<20", worst_view_degrees=".3f", median=".3f")
     for name, (click, radius) in CAPTURES.items():
         if not (data_folder() / name).exists():
             why_null["real_views_agree"] = f"{name} is not here; set EGS_WARP_DATA"
             continue
         real.append(real_row(name, click, radius, options.device))
-        print(
-            f"{name}: worst view {real[-1]['worst_view_degrees']:.3f}, median {real[-1]['median_view_degrees']:.3f} degree"
-        )
+        table.row(name, real[-1]["worst_view_degrees"], real[-1]["median_view_degrees"])
     agree = all(row["worst_view_degrees"] <= 0.5 for row in real)
-    aims = {
-        "normal": all(row["normal_degrees"] <= 0.1 for row in rows),
-        "offset": all(row["offset_percent"] <= 0.1 for row in rows),
-        "paper_start": all(row["paper_start_degrees"] <= 0.1 for row in rows),
-        "real_views_agree": None if why_null else agree,
-    }
-    print(json.dumps({"aims": aims}))
-    if options.json:
-        result = {
-            "rows": {"synthetic": rows, "real": real},
-            "environment": environment(options.device, options.seed),
-            "aims": aims,
-            "why_null": why_null,
-        }
-        options.json.write_text(json.dumps(result, indent=1))
-    if options.plot:
-        import matplotlib
 
-        matplotlib.use("Agg")
-        from matplotlib import pyplot
-
-        figure, axes = pyplot.subplots(figsize=(5, 3))
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
         axes.loglog(
             [row["normal_degrees"] for row in rows], [max(row["offset_percent"], 1e-5) for row in rows], ".", alpha=0.7
         )
         axes.axvline(0.1, color="grey")
         axes.axhline(0.1, color="grey")
         axes.set(xlabel="normal, degrees", ylabel="offset, % of extent")
-        figure.tight_layout()
-        figure.savefig(options.plot)
+
+    report(
+        options,
+        {"synthetic": rows, "real": real},
+        aims={
+            "normal": all(row["normal_degrees"] <= 0.1 for row in rows),
+            "offset": all(row["offset_percent"] <= 0.1 for row in rows),
+            "paper_start": all(row["paper_start_degrees"] <= 0.1 for row in rows),
+            "real_views_agree": None if why_null else agree,
+        },
+        why_null=why_null,
+        draw=draw,
+        size=(5.0, 3.0),
+    )
 
 
 if __name__ == "__main__":

@@ -1,29 +1,26 @@
 """Does a split pop? Frame-to-frame difference after motion compensation, over an animation that bends and twists.
 
-Every frame is drawn together with how far each pixel moves to the next one; the next frame, moved back by that, is compared
-with this one. What is left is smooth over time unless something pops. Three clouds: unsplit; split once for the whole
-motion, as the engine does; and, as a control that must be caught, split in each frame by what that frame bends.
+Every frame is drawn together with how far each pixel moves to the next one; the next frame, moved back by that, is
+compared with this one. What is left is smooth over time unless something pops. Three clouds: unsplit; split once for
+the whole motion, as the engine does; and, as a control that must be caught, split in each frame by what that frame
+bends.
 
-A frame pops where the difference exceeds 1.3 times that of the frames around it. Aims: ``no_popping`` (split for the motion, no
-frame pops), ``control_pops`` (the measure sees what it is meant to see).
+A frame pops where the difference exceeds 1.3 times that of the frames around it. Aims: ``no_popping`` (split for the
+motion, no frame pops), ``control_pops`` (the measure sees what it is meant to see).
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
 from scipy import ndimage
 
-sys.path.insert(0, str(Path(__file__).parent))
 import mesh_scenes as scenes
-
 from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.embedding import CageLocator, embed_gaussians
 from egs_warp.deformation.splitting import split_bent, split_for_motion
@@ -31,6 +28,10 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.capture import read_capture
 from egs_warp.render import render
+from harness import Row, Table, data_folder, flags, report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 POP = 1.3
 
@@ -75,17 +76,11 @@ def pops(values: np.ndarray) -> np.ndarray:
     return values[3:-3] / np.median(around, axis=0)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    wp.init()
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--device", default="cuda:0" if wp.is_cuda_available() else "cpu")
-    parser.add_argument("--seed", type=int, default=0, help="not used: nothing here is random")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--plot", type=Path)
-    parser.add_argument("--capture", type=Path, default=scenes.data_folder() / "objects" / "plush_dog.ply")
-    options = parser.parse_args()
+    parser = flags(__doc__, quick="200 pixels and 40 frames", seed="not used: nothing here is random")
+    parser.add_argument("--capture", type=Path, default=data_folder() / "objects" / "plush_dog.ply")
+    options = parser.parse_args(arguments)
     size, count = (200, 40) if options.quick else (400, 90)
     cloud = read_capture(options.capture, device=options.device).cloud
     means = cloud.means.numpy().astype(float)
@@ -129,7 +124,8 @@ def main() -> None:
             )
         assert state is not None
         each.append(Deformer(state.cloud, state.embedding).deform(nodes).cloud)
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
+    table = Table(cloud="<21", Gaussians="7d", at_the_end="7d", difference=".3e", worst_frame=".2f", that_pop="d")
     for name, clouds in (("unsplit", unsplit), ("split for the motion", ahead), ("split in each frame", each)):
         values = differences(camera, clouds, flows)
         ratios = pops(values)
@@ -142,31 +138,29 @@ def main() -> None:
                 "frames_that_pop": int((ratios > POP).sum()),
             }
         )
-        print(
-            f"{name:22} {clouds[0].count:6} to {clouds[-1].count:6} Gaussians, difference {1e3 * np.median(values):.3f}e-3 "
-            f"(median), worst frame {ratios.max():.2f} times its neighbours, {rows[-1]['frames_that_pop']} pop",
-            flush=True,
+        table.row(
+            name,
+            clouds[0].count,
+            clouds[-1].count,
+            np.median(values),
+            rows[-1]["worst_ratio"],
+            rows[-1]["frames_that_pop"],
         )
-    aims = {"no_popping": rows[1]["frames_that_pop"] == 0, "control_pops": rows[2]["frames_that_pop"] > 0}
-    print(json.dumps({"aims": aims}))
-    if options.json:
-        environment = scenes.environment(options.device, options.seed)
-        options.json.write_text(
-            json.dumps({"rows": rows, "environment": environment, "aims": aims, "why_null": {}}, indent=1)
-        )
-    if options.plot:
-        import matplotlib
 
-        matplotlib.use("Agg")
-        from matplotlib import pyplot
-
-        figure, axes = pyplot.subplots(figsize=(7, 3))
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
         for row in rows:
             axes.plot(row["difference"], label=row["cloud"])
         axes.set(xlabel="frame", ylabel="difference after motion compensation", yscale="log")
         axes.legend()
-        figure.tight_layout()
-        figure.savefig(options.plot)
+
+    report(
+        options,
+        rows,
+        aims={"no_popping": rows[1]["frames_that_pop"] == 0, "control_pops": rows[2]["frames_that_pop"] > 0},
+        draw=draw,
+        size=(7.0, 3.0),
+    )
 
 
 if __name__ == "__main__":

@@ -2,46 +2,35 @@
 
 python benchmarks/qp_solvers.py [--quick] [--device cpu] [--seed 0] [--body pawn] [--json PATH] [--plot PATH]
 
-The programs are steps of an animation (Eq. 13) with 40 muscle groups, 4 friction directions and 1 to 32 contacts. ``first`` is
-set-up and solve, ``again`` a re-solve for other contact states by a change of bounds alone, ``search`` the whole two-stage
-search of a step. Both solvers get the same programs in turn. ``breach`` is the worst violation of a bound (forces in body
-weights, speeds in sqrt(g H)); ``objective`` is relative to DAQP's. No aim is named for this benchmark.
+The programs are steps of an animation (Eq. 13) with 40 muscle groups, 4 friction directions and 1 to 32 contacts.
+``first`` is set-up and solve, ``again`` a re-solve for other contact states by a change of bounds alone, ``search`` the
+whole two-stage search of a step. Both solvers get the same programs in turn. ``breach`` is the worst violation of a
+bound (forces in body weights, speeds in sqrt(g H)); ``objective`` is relative to DAQP's. No aim is named for this
+benchmark.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
-import time
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import warp as wp
 
-sys.path.insert(0, str(Path(__file__).parent))
 from contact_frames import Frame, animation_frames, body_named
-
 from egs_warp.locomotion.complementarity import SEPARATE, states_of_pairs
 from egs_warp.locomotion.solvers import QpSolution, QpSolver, quadratic_program
 from egs_warp.locomotion.strategies import Strategy, contact_under, find_states
-from egs_warp.pipelines.report import versions
+from harness import Row, Table, flags, report, timed
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 CONTACTS = (1, 2, 4, 8, 16, 32)
 GROUPS = 40
 QP_LIMIT = 6
 
 
-def timed(action: Callable[[], Any]) -> tuple[Any, float]:
-    """Result and milliseconds."""
-    started = time.perf_counter()
-    result = action()
-    return result, 1e3 * (time.perf_counter() - started)
-
-
-def frame_figures(frame: Frame, solver: QpSolver) -> dict[str, Any]:
+def frame_figures(frame: Frame, solver: QpSolver) -> Row:
     """Figures of one program."""
     program = frame.program
     y = contact_under(program, frame.previous)
@@ -56,11 +45,9 @@ def frame_figures(frame: Frame, solver: QpSolver) -> dict[str, Any]:
         return qp, qp.solve(*program.bounds(states))
 
     (qp, solution), first_time = timed(first)
-    again, again_time = timed(lambda: qp.solve(*program.bounds(changed)))
+    again, again_time = timed(qp.solve, *program.bounds(changed))
     found, search_time = timed(
-        lambda: find_states(
-            program, Strategy.TWO_STAGE, frame.predicted, frame.previous, qp_limit=QP_LIMIT, solver=solver
-        )
+        find_states, program, Strategy.TWO_STAGE, frame.predicted, frame.previous, qp_limit=QP_LIMIT, solver=solver
     )
     breach = 0.0
     for result, chosen in ((solution, states), (again, changed)):
@@ -79,23 +66,25 @@ def frame_figures(frame: Frame, solver: QpSolver) -> dict[str, Any]:
     }
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="10 frames a contact count in place of 40")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--seed", type=int, default=0)
+    parser = flags(__doc__, quick="10 frames a contact count in place of 40", device="cpu")
     parser.add_argument("--body", default="pawn")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--plot", type=Path)
-    arguments = parser.parse_args()
-    wp.config.log_level = wp.LOG_WARNING
-    bench = body_named(arguments.body, arguments.device)
-    frames = 10 if arguments.quick else 40
+    options = parser.parse_args(arguments)
+    bench = body_named(options.body, options.device)
+    frames = 10 if options.quick else 40
     rows = []
-    print(
-        f"{'contacts':>8}{'variables':>10}{'solver':>8}{'first ms':>10}{'again ms':>10}{'search ms':>11}{'QPs':>6}"
-        f"{'breach':>10}{'objective':>11}{'lost':>6}"
+    table = Table(
+        contacts="d",
+        variables="d",
+        solver="4s",
+        first_ms="8.2f",
+        again_ms="8.2f",
+        search_ms="8.2f",
+        QPs="5.2f",
+        breach=".1e",
+        objective=".4f",
+        lost="d",
     )
     for contacts in CONTACTS:
         made = animation_frames(
@@ -105,9 +94,9 @@ def main() -> None:
             contacts=contacts,
             directions=4,
             strength=0.2,
-            seed=arguments.seed,
+            seed=options.seed,
         )[4:]
-        figures: dict[QpSolver, list[dict[str, Any]]] = {solver: [] for solver in QpSolver}
+        figures: dict[QpSolver, list[Row]] = {solver: [] for solver in QpSolver}
         for frame in made:
             for solver in QpSolver:
                 figures[solver].append(frame_figures(frame, solver))
@@ -125,36 +114,21 @@ def main() -> None:
                 "lost": int(column["lost"].sum()),
             }
             rows.append(row)
-            print(
-                f"{contacts:>8}{row['variables']:>10}{row['solver']:>8}{row['first']:>10.2f}{row['again']:>10.2f}"
-                f"{row['search']:>11.2f}{row['qps']:>6.2f}{row['breach']:>10.1e}{row['objective']:>11.4f}{row['lost']:>6}",
-                flush=True,
-            )
-    result = {
-        "rows": rows,
-        "environment": {
-            "device": arguments.device,
-            "body": arguments.body,
-            "seed": arguments.seed,
-            "frames": frames,
-            **versions(),
-        },
-        "aims": {},
-        "why_null": {},
-    }
-    if arguments.json:
-        arguments.json.write_text(json.dumps(result, indent=2) + "\n")
-    if arguments.plot:
-        _plot(rows, arguments.plot)
+            table.row(*row.values())
+    report(
+        options,
+        rows,
+        aims={},
+        packages=["daqp"],
+        conditions={"body": options.body, "frames": frames},
+        draw=lambda figure: draw(figure, rows),
+        size=(9.0, 3.6),
+    )
 
 
-def _plot(rows: list[dict[str, Any]], path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6))
+def draw(figure: Figure, rows: list[Row]) -> None:
+    """Milliseconds, and the worst violation of a bound, over the number of contacts."""
+    left, right = figure.subplots(1, 2)
     for solver, colour in ((QpSolver.OSQP, "tab:orange"), (QpSolver.DAQP, "tab:blue")):
         own = [row for row in rows if row["solver"] == solver.value]
         contacts = [row["contacts"] for row in own]
@@ -170,8 +144,6 @@ def _plot(rows: list[dict[str, Any]], path: Path) -> None:
         axes.legend(fontsize=8)
     left.set_ylabel("milliseconds, median")
     right.set_ylabel("worst violation of a bound")
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
 
 
 if __name__ == "__main__":

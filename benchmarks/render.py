@@ -9,24 +9,15 @@ No peer that claims a CPU runs on one: ``render_peers.cpu_peers`` tries and says
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import platform
-import sys
-import time
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 import warp as wp
 
-sys.path.insert(0, str(Path(__file__).parent))
 import render_peers as peers
-from render_roofline import arithmetic_by_threads, median_ms, stage_rows
-
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.launching import available_threads
@@ -34,6 +25,11 @@ from egs_warp.render import render
 from egs_warp.render.compositing import Background, composite
 from egs_warp.render.projection import project, view_from_camera
 from egs_warp.render.tiles import build_tile_lists
+from harness import Row, Table, data_folder, flags, median_ms, report, timed
+from render_roofline import arithmetic_by_threads, stage_rows
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 CELLS = ((1, 648, 420), (1, 1944, 1260), (5, 648, 420), (5, 1944, 1260), (11, 648, 420))
 AIMS = ("cuda_beats_gswarp", "cuda_within_1_3_of_gsplat", "same_picture", "cpu_vs_twin", "cpu_two_threads")
@@ -56,7 +52,7 @@ def cloud_of(scene: peers.Scene) -> GaussianCloud:
     )
 
 
-def cuda_rows(points: dict[str, np.ndarray], *, cells: tuple, seed: int, repeats: int) -> list[dict[str, Any]]:
+def cuda_rows(points: dict[str, np.ndarray], *, cells: tuple, seed: int, repeats: int, table: Table) -> list[Row]:
     """One row for each cell: forward, and forward with backward, of every renderer that is installed."""
     renderers: dict[str, peers.Renderer] = {"ours": peers.ours}
     for name, make in (("gsplat", peers.gsplat_renderer), ("gswarp", peers.gswarp_renderer)):
@@ -81,11 +77,12 @@ def cuda_rows(points: dict[str, np.ndarray], *, cells: tuple, seed: int, repeats
                 tensor.grad = None
             renderers[name](scenes[name], camera).backward(weight)
 
-        row: dict[str, Any] = {"kind": "cuda", "gaussians": len(plain.means), "width": width, "height": height}
+        row: Row = {"kind": "cuda", "gaussians": len(plain.means), "width": width, "height": height}
         for label, call in (("forward", forward), ("forward_backward", both)):
             calls = {name: (lambda call=call, name=name: call(name)) for name in renderers}
             row[label] = median_ms(calls, repeats=repeats, synchronise=torch.cuda.synchronize)
-        # Matching settings: gswarp stops every splat at three sigma and at an alpha of 0.99, which below 0.35 do nothing.
+        # Matching settings: gswarp stops every splat at three sigma and at an alpha of 0.99, which below 0.35 do
+        # nothing.
         fainter = replace(plain, opacities=plain.opacities.detach() * 0.35)
         faint = {name: peers.ours_scene(fainter) if name == "ours" else fainter for name in renderers}
         with torch.no_grad():
@@ -98,7 +95,9 @@ def cuda_rows(points: dict[str, np.ndarray], *, cells: tuple, seed: int, repeats
         row["gradient_difference"] = _gradient_differences(scenes)
         row["stages"] = stage_rows(cloud_of(own), camera, repeats=repeats, threads=1)
         rows.append(row)
-        print(json.dumps(row))
+        for label in ("forward", "forward_backward"):
+            for name, ms in row[label].items():
+                table.row(row["gaussians"], f"{width}x{height}", label, name, ms)
         torch.cuda.empty_cache()
     return rows
 
@@ -120,7 +119,7 @@ def _gradient_differences(scenes: dict[str, peers.Scene]) -> dict[str, float]:
     return {name: float((one - two).norm() / two.norm()) for name, (one, two) in pairs.items()}
 
 
-def memory_row(*, seed: int) -> dict[str, Any]:
+def memory_row(*, seed: int) -> Row:
     """Peak GPU memory of one 1920 x 1080 picture of five million Gaussians with SH of degree 3, capture included."""
     device, count = wp.get_device("cuda:0"), 5_000_000
     random = torch.Generator(device="cuda").manual_seed(seed)
@@ -152,7 +151,7 @@ def memory_row(*, seed: int) -> dict[str, Any]:
     }
 
 
-def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> dict[str, Any]:
+def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
     """112k Gaussians at 640 x 480: one thread, two threads, the PyTorch twin from the same lists on as many."""
     scene = peers.ours_scene(peers.garden_scene(points, grid=1, seed=seed, device="cpu"))
     camera = peers.garden_camera(points, width=640, height=480)
@@ -171,7 +170,6 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> dict[s
             "arithmetic_two_threads": lambda: arithmetic_by_threads(2, probe),
         },
         repeats=repeats,
-        synchronise=lambda: None,
     )
     background = Background(wp.vec3())
     stages = {
@@ -186,7 +184,6 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> dict[s
             for count in sorted({1, 2, threads})
         },
         repeats=repeats,
-        synchronise=lambda: None,
     )
     project_and_list = by_stage[f"project {threads}"] + by_stage[f"lists {threads}"]
     twin_times: dict[int, float] = {}
@@ -195,9 +192,7 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> dict[s
     with torch.no_grad():
         for count in sorted({1, threads}):
             torch.set_num_threads(count)
-            start = time.perf_counter()
-            twin = peers.composite_in_torch(projected, lists, camera)
-            twin_times[count] = (time.perf_counter() - start) * 1e3
+            twin, twin_times[count] = timed(peers.composite_in_torch, projected, lists, camera)
     picture = wp.to_torch(render(cloud, camera, background=(0, 0, 0), threads=threads).colour)
     return {
         "kind": "cpu",
@@ -214,7 +209,7 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> dict[s
     }
 
 
-def judge(rows: list[dict[str, Any]]) -> tuple[dict[str, bool | None], dict[str, str]]:
+def judge(rows: list[Row]) -> tuple[dict[str, bool | None], dict[str, str]]:
     """The aims from the rows alone; None, with the reason, where this run could not measure one."""
     aims: dict[str, bool | None] = dict.fromkeys(AIMS)
     why: dict[str, str] = {}
@@ -229,8 +224,8 @@ def judge(rows: list[dict[str, Any]]) -> tuple[dict[str, bool | None], dict[str,
     differences = [d for row in cuda for d in row["difference"].values()] + [
         row["difference"] for row in rows if row["kind"] == "cpu"
     ]
-    # A splat at its alpha cut, worth at most 1/255, may come or go with the last bit: that shows above 1e-3 in fewer than
-    # one pixel in a thousand, and never as more than two such splats.
+    # A splat at its alpha cut, worth at most 1/255, may come or go with the last bit: that shows above 1e-3 in fewer
+    # than one pixel in a thousand, and never as more than two such splats.
     aims["same_picture"] = all(
         d["mean"] < 1e-5 and d["above_1e-3"] < 1e-3 and d["largest"] < 2 / 255 for d in differences
     )
@@ -247,19 +242,14 @@ def judge(rows: list[dict[str, Any]]) -> tuple[dict[str, bool | None], dict[str,
             aims["cpu_two_threads"] = reached
         else:
             why["cpu_two_threads"] = (
-                f"in the same run this machine's two threads did plain arithmetic only {machine:.2f} times as fast as one:"
-                " its cores are busy or are halves of one core"
+                f"in the same run this machine's two threads did plain arithmetic only {machine:.2f} times as fast as"
+                " one: its cores are busy or are halves of one core"
             )
     return aims, why
 
 
-def plot(rows: list[dict[str, Any]], path: Path) -> None:
+def draw(figure: Figure, rows: list[Row]) -> None:
     """Bars of milliseconds by cell and renderer; below them, on a GPU, each stage's share of the device's limit."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     bars: list[tuple[str, dict[str, float]]] = []
     for row in rows:
         size = f"{row['gaussians'] / 1e3:.0f}k\n{row['width']}x{row['height']}"
@@ -268,9 +258,8 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
         elif row["kind"] == "cpu":
             bars.append((f"{size}\nCPU", {k: row[k] for k in ("one_thread", "two_threads", "twin")}))
     roofs = [row for row in rows if "stages" in row]
-    figure, panels = plt.subplots(
-        1 + bool(roofs), squeeze=False, figsize=(max(6.0, 1.6 * len(bars)), 9.0 if roofs else 5.0)
-    )
+    figure.set_size_inches(max(6.0, 1.6 * len(bars)), 9.0 if roofs else 5.0)
+    panels = figure.subplots(1 + bool(roofs), squeeze=False)
     axes = panels[0, 0]
     names = sorted({name for _, values in bars for name in values})
     for index, name in enumerate(names):
@@ -282,11 +271,9 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
     axes.legend()
     if roofs:
         plot_roofline(roofs, panels[1, 0])
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
 
 
-def plot_roofline(rows: list[dict[str, Any]], axes: Any) -> None:
+def plot_roofline(rows: list[Row], axes: Any) -> None:
     """Percent of the limit that each stage reaches, by cell; the letter says which: bandwidth or arithmetic."""
     names = ("project", "lists", "composite", "backward")
     for index, name in enumerate(names):
@@ -306,7 +293,7 @@ def plot_roofline(rows: list[dict[str, Any]], axes: Any) -> None:
     axes.legend()
 
 
-def against_gsplat(rows: list[dict[str, Any]]) -> dict[str, Any] | None:
+def against_gsplat(rows: list[Row]) -> Row | None:
     """The real aim, beside the ones judged: faster than gsplat in every cell."""
     ratios = {
         f"{row['gaussians']} {row['width']}x{row['height']} {label}": row[label]["ours"] / row[label]["gsplat"]
@@ -324,59 +311,41 @@ def against_gsplat(rows: list[dict[str, Any]]) -> dict[str, Any] | None:
     }
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    wp.init()
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--device", default="cuda:0" if wp.is_cuda_available() else "cpu")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--plot", type=Path)
-    options = parser.parse_args()
-    data = Path(os.environ.get("EGS_WARP_DATA", Path(__file__).parents[2] / "shared" / "data"))
-    points = dict(np.load(data / "points" / "garden.npz"))
+    options = flags(__doc__, quick="four cells in place of five on a GPU, fewer repeats").parse_args(arguments)
+    points = dict(np.load(data_folder() / "points" / "garden.npz"))
     repeats = 10 if options.quick else 30
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
+    table = Table(gaussians="9d", size="9s", what="<16", renderer="<12", ms="9.3f")
     if options.device.startswith("cuda"):
         cells = CELLS[:4] if options.quick else CELLS
         # First, because the memory pool only knows the highest mark since the process began.
         rows.append(memory_row(seed=options.seed))
-        print(json.dumps(rows[-1]))
-        rows += cuda_rows(points, cells=cells, seed=options.seed, repeats=repeats)
+        rows += cuda_rows(points, cells=cells, seed=options.seed, repeats=repeats, table=table)
+        print(f"working memory of five million Gaussians: {rows[0]['working_gib']:.2f} GiB")
     else:
-        rows.append(cpu_row(points, seed=options.seed, repeats=5 if options.quick else 15))
+        row = cpu_row(points, seed=options.seed, repeats=5 if options.quick else 15)
+        rows.append(row)
+        for name in ("one_thread", "two_threads", "all_threads", "twin"):
+            table.row(row["gaussians"], f"{row['width']}x{row['height']}", "cpu", name, row[name])
+        for name, peer in row["peers"].items():
+            print(f"{name}: {peer['ms'] or peer['outcome']}")
     aims, why_null = judge(rows)
-    result = {
-        "rows": rows,
-        "environment": {
-            "device": options.device,
-            "gpu": torch.cuda.get_device_name() if options.device.startswith("cuda") else None,
-            "threads": available_threads(),
-            "python": platform.python_version(),
-            "warp": wp.__version__,
-            "torch": torch.__version__,
-            "seed": options.seed,
-        },
-        "aims": aims,
-        "why_null": why_null,
-        "against_gsplat": against_gsplat(rows),
-    }
-    for row in rows:
-        if row["kind"] == "cuda":
-            for label in ("forward", "forward_backward"):
-                figures = "  ".join(f"{name} {ms:8.3f}" for name, ms in row[label].items())
-                print(f"{row['gaussians']:>9} {row['width']}x{row['height']} {label:17} {figures} ms")
-        elif row["kind"] == "cpu":
-            figures = "  ".join(f"{k} {row[k]:.1f}" for k in ("one_thread", "two_threads", "twin"))
-            print(f"{row['gaussians']:>9} {row['width']}x{row['height']} cpu               {figures} ms")
-            for name, peer in row["peers"].items():
-                print(f"{name}: {peer['ms'] or peer['outcome']}")
-    print(json.dumps({name: result[name] for name in ("aims", "why_null", "against_gsplat")}, indent=1))
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=1))
-    if options.plot:
-        plot(rows, options.plot)
+    beside = against_gsplat(rows)
+    if beside is not None:
+        print(
+            f"over gsplat's time: {beside['geometric_mean']:.2f} (geometric mean), faster in {beside['cells_faster']}"
+        )
+    report(
+        options,
+        rows,
+        against_gsplat=beside,
+        aims=aims,
+        why_null=why_null,
+        packages=["torch"],
+        draw=lambda figure: draw(figure, rows),
+    )
 
 
 if __name__ == "__main__":

@@ -1,13 +1,9 @@
-"""What limits each stage of the renderer: bytes that must move, operations that must be done, and the machine's speed at both."""
-
-# Kernel bodies are not Python to a type checker.
-# pyright: reportIndexIssue=false, reportOperatorIssue=false
+"""What limits each stage of the renderer:
+bytes that must move, operations that must be done, and the machine's speed at both.
+"""
 
 from __future__ import annotations
 
-import statistics
-import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,94 +11,14 @@ import warp as wp
 
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.kernels.render.ellipse import ALPHA_CUT, TILE_PIXELS, TRANSMITTANCE_STOP, pixel_of_thread, splat_alpha
-from egs_warp.launching import launch_rows
+from egs_warp.kernels.render.ellipse import TILE_PIXELS
+from egs_warp.launching import device_of, launch_rows
 from egs_warp.render.backward import backward
 from egs_warp.render.compositing import Background, composite
 from egs_warp.render.projection import ProjectedGaussians, project, view_from_camera
 from egs_warp.render.tiles import TileLists, build_tile_lists
-
-wp.set_module_options({"enable_backward": False})
-
-_PROBE_STEPS = wp.constant(2048)
-
-
-@wp.kernel
-def hits_kernel(
-    # In:
-    width: wp.int32,
-    height: wp.int32,
-    tile_start: wp.array[wp.int32],
-    gaussian_from_intersection: wp.array[wp.int32],
-    ellipse: wp.array[wp.vec4],
-    falloff: wp.array[wp.vec2],
-    # Out:
-    hits_out: wp.array[wp.int32],
-):
-    """Splats that each pixel blends: what no renderer of the same picture can leave out."""
-    thread = wp.tid()
-    pixel = pixel_of_thread(thread, width)
-    if pixel[0] >= width or pixel[1] >= height:
-        return
-    tile = thread / TILE_PIXELS
-    passing = wp.float32(1.0)
-    hits = wp.int32(0)
-    intersection = tile_start[tile]
-    end = tile_start[tile + 1]
-    while intersection < end:
-        g = gaussian_from_intersection[intersection]
-        intersection += 1
-        alpha = splat_alpha(ellipse[g], falloff[g], pixel)
-        if alpha >= ALPHA_CUT:
-            passing = passing * (1.0 - alpha)
-            hits += 1
-            if passing <= TRANSMITTANCE_STOP:
-                intersection = end
-    hits_out[pixel[1] * width + pixel[0]] = hits
-
-
-@wp.kernel
-def arithmetic_kernel(
-    first: wp.int32,
-    # In:
-    factor: wp.float32,
-    # Out:
-    sum_out: wp.array[wp.float32],
-):
-    """Eight independent chains of multiply and add: the most operations that this device can be brought to do."""
-    i = wp.tid() + first
-    a = wp.float32(i)
-    b = a + 1.0
-    c = a + 2.0
-    d = a + 3.0
-    e = a + 4.0
-    f = a + 5.0
-    g = a + 6.0
-    h = a + 7.0
-    for _step in range(_PROBE_STEPS):
-        a = a * factor + 1.0
-        b = b * factor + 1.0
-        c = c * factor + 1.0
-        d = d * factor + 1.0
-        e = e * factor + 1.0
-        f = f * factor + 1.0
-        g = g * factor + 1.0
-        h = h * factor + 1.0
-    sum_out[i] = a + b + c + d + e + f + g + h
-
-
-def median_ms(calls: dict[str, Callable[[], Any]], *, repeats: int, synchronise: Callable[[], Any]) -> dict[str, float]:
-    """Median milliseconds of each call; the calls take turns, so that a drift of the machine hits all alike."""
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for turn in range(repeats + 3):
-        for name, call in calls.items():
-            synchronise()
-            start = time.perf_counter()
-            call()
-            synchronise()
-            if turn >= 3:
-                times[name].append((time.perf_counter() - start) * 1e3)
-    return {name: statistics.median(values) for name, values in times.items()}
+from harness import median_ms
+from kernels import PROBE_STEPS, arithmetic_kernel, hits_kernel
 
 
 def stage_rows(cloud: GaussianCloud, camera: Camera, *, repeats: int, threads: int) -> dict[str, dict[str, Any]]:
@@ -111,7 +27,7 @@ def stage_rows(cloud: GaussianCloud, camera: Camera, *, repeats: int, threads: i
     The share is the time that the scarcer of bandwidth and arithmetic needs at full speed, over the time taken, which
     includes the calls from Python. Both speeds are measured here: a copy of 1 GiB, and chains of multiply and add.
     """
-    device: Any = cloud.device
+    device = cloud.device
     view, background = view_from_camera(camera), Background(wp.vec3())
     shape = (camera.height, camera.width)
     gradient = [wp.ones(shape, dtype=t, device=device) for t in (wp.vec3, wp.float32, wp.float32)]
@@ -157,7 +73,7 @@ def stage_rows(cloud: GaussianCloud, camera: Camera, *, repeats: int, threads: i
     }
 
 
-def device_limits(device: Any) -> tuple[float, float]:
+def device_limits(device: wp.Device) -> tuple[float, float]:
     """Bytes a second of a long copy, read and write together, and single-precision operations a second."""
     size = 2**30 if device.is_cuda else 2**27
     source = wp.zeros(size // 4, dtype=wp.int32, device=device)
@@ -173,7 +89,7 @@ def device_limits(device: Any) -> tuple[float, float]:
         synchronise=lambda: wp.synchronize_device(device),
     )
     # Eight chains, two operations a step.
-    operations = lanes * 2048 * 8 * 2
+    operations = lanes * int(PROBE_STEPS) * 8 * 2
     return 2 * size / (times["copy"] * 1e-3), operations / (times["arithmetic"] * 1e-3)
 
 
@@ -184,14 +100,14 @@ def arithmetic_by_threads(threads: int, sums: wp.array) -> None:
         len(sums),
         inputs=[0.999],
         outputs=[sums],
-        device=sums.device,
+        device=device_of(sums),
         threads=threads,
         work=np.ones(len(sums)),
     )
 
 
 def _counts(projected: ProjectedGaussians, lists: TileLists, view: Any) -> dict[str, float]:
-    device: Any = projected.ellipse.device
+    device = device_of(projected.ellipse)
     hits = wp.zeros(int(view.width * view.height), dtype=wp.int32, device=device)
     wp.launch(
         hits_kernel,

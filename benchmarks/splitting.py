@@ -1,8 +1,10 @@
-"""How visible is a split? Image error of every rule, over opacity and viewing direction, and the opacities of least error.
+"""How visible is a split? Image error of every rule, over opacity and viewing direction, and the opacities of least
+error.
 
-A round needle (thickness 0.3 of its length) is drawn whole and as children, from seven directions spread over the sphere;
-the error is root mean square over directions and pixels, in percent of the opacity. The last columns are the opacities of
-the outer and the middle child of the MEASURED rule that minimise it: the table in egs_warp/deformation/splitting.py.
+A round needle (thickness 0.3 of its length) is drawn whole and as children, from seven directions spread over the
+sphere; the error is root mean square over directions and pixels, in percent of the opacity. The last columns are the
+opacities of the outer and the middle child of the MEASURED rule that minimise it: the table in
+egs_warp/deformation/splitting.py.
 
 Aims: ``table_is_optimal`` (no opacity of the table is more than 0.002 from the optimum found here),
 ``measured_beats_paper`` (at every opacity).
@@ -10,16 +12,17 @@ Aims: ``table_is_optimal`` (no opacity of the table is more than 0.002 from the 
 
 from __future__ import annotations
 
-import argparse
-import json
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
-from mesh_scenes import environment
 from scipy.optimize import least_squares
 
 from egs_warp.deformation.splitting import SplitRule, child_layout, child_opacities
+from harness import Row, Table, flags, report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 THICKNESS = 0.3
 TILTS = np.radians([90.0, 75.0, 60.0, 45.0, 30.0, 15.0, 4.0])
@@ -27,7 +30,9 @@ ALONG, ACROSS = np.linspace(-4.0, 4.0, 81), np.linspace(0.0, 3.0, 16)
 
 
 def image_error(opacity: float, rule: SplitRule, peaks: np.ndarray, tilt: float) -> np.ndarray:
-    """Children minus parent over the opacity, on a grid (16, 81); ``tilt`` is the angle of the axis to the line of sight."""
+    """Children minus parent over the opacity, on a grid (16, 81);
+    ``tilt`` is the angle of the axis to the line of sight.
+    """
     offsets, shrink = child_layout(rule)
 
     def width(length: float) -> float:
@@ -42,7 +47,9 @@ def image_error(opacity: float, rule: SplitRule, peaks: np.ndarray, tilt: float)
 
 
 def all_errors(opacity: float, rule: SplitRule, peaks: np.ndarray) -> np.ndarray:
-    """Errors of all directions, weighted by their share of the sphere; the root of the sum of squares is the measure."""
+    """Errors of all directions, weighted by their share of the sphere;
+    the root of the sum of squares is the measure.
+    """
     shares = np.sin(TILTS) / np.sin(TILTS).sum()
     parts = [image_error(opacity, rule, peaks, tilt).ravel() for tilt in TILTS]
     return np.concatenate([np.sqrt(share / part.size) * part for share, part in zip(shares, parts, strict=True)])
@@ -59,19 +66,19 @@ def best_opacities(opacity: float) -> np.ndarray:
     return 1.0 / (1.0 + np.exp(-least_squares(residuals, np.log(start / (1.0 - start))).x))
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--quick", action="store_true", help="the same: it takes seconds")
-    parser.add_argument("--device", default="cpu", help="not used: nothing here runs on a device")
-    parser.add_argument("--seed", type=int, default=0, help="not used: nothing here is random")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--plot", type=Path)
-    options = parser.parse_args()
-    rows: list[dict[str, Any]] = []
-    print("opacity  measured: rms  side-on  end-on   paper: rms  side-on  end-on   best outer, middle")
+    options = flags(
+        __doc__,
+        quick="the same: it takes seconds",
+        device="cpu",
+        seed="not used: nothing here is random, nor runs on a device",
+    ).parse_args(arguments)
+    rows: list[Row] = []
+    columns = {f"{rule.value}_{what}": "8.2%" for rule in SplitRule for what in ("rms", "side-on", "end-on")}
+    table = Table(opacity=".2f", **columns, best_outer=".5f", middle=".5f")
     for opacity in (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99):
-        row: dict[str, Any] = {"opacity": opacity, "best": best_opacities(opacity).tolist()}
+        row: Row = {"opacity": opacity, "best": best_opacities(opacity).tolist()}
         for rule in SplitRule:
             peaks = child_opacities(np.array([opacity]), rule)[0]
             row[rule.value] = {
@@ -81,32 +88,27 @@ def main() -> None:
                 "opacities": peaks.tolist(),
             }
         rows.append(row)
-        figures = "   ".join(
-            "{:8.2f} %{:7.1f} %{:7.1f} %".format(*(100 * row[rule.value][k] for k in ("rms", "side_on", "end_on")))
-            for rule in SplitRule
-        )
-        print(f"{opacity:7.2f} {figures}   {row['best'][0]:.5f}, {row['best'][1]:.5f}")
-    aims = {
-        "table_is_optimal": all(np.allclose(row["best"], row["measured"]["opacities"][:2], atol=2e-3) for row in rows),
-        "measured_beats_paper": all(row["measured"]["rms"] < row["paper"]["rms"] for row in rows),
-    }
-    print(json.dumps({"aims": aims}))
-    if options.json:
-        result = {"rows": rows, "environment": environment("cpu", options.seed), "aims": aims, "why_null": {}}
-        options.json.write_text(json.dumps(result, indent=1))
-    if options.plot:
-        import matplotlib
+        errors = (row[rule.value][what] for rule in SplitRule for what in ("rms", "side_on", "end_on"))
+        table.row(opacity, *errors, *row["best"])
 
-        matplotlib.use("Agg")
-        from matplotlib import pyplot
-
-        figure, axes = pyplot.subplots(figsize=(5, 3))
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
         for rule in SplitRule:
             axes.plot([r["opacity"] for r in rows], [100 * r[rule.value]["rms"] for r in rows], label=rule.value)
         axes.set(xlabel="opacity", ylabel="image error, % of opacity")
         axes.legend()
-        figure.tight_layout()
-        figure.savefig(options.plot)
+
+    best = [np.allclose(row["best"], row["measured"]["opacities"][:2], atol=2e-3) for row in rows]
+    report(
+        options,
+        rows,
+        aims={
+            "table_is_optimal": all(best),
+            "measured_beats_paper": all(row["measured"]["rms"] < row["paper"]["rms"] for row in rows),
+        },
+        draw=draw,
+        size=(5.0, 3.0),
+    )
 
 
 if __name__ == "__main__":

@@ -1,26 +1,44 @@
-"""Robustness: bodies x motions x friction x sag x solver step, each run judged by its targets and by every bound of the audit.
+"""Robustness: bodies x motions x friction x sag x solver step, each run judged by its targets and by every bound of the
+audit.
 
 python benchmarks/sweep.py [--quick] [--workers 2] [--device cpu] [--seed 0] [--json PATH] [--join PATH] [--plot PATH]
 
-A run succeeds if the motion reaches what was asked (distance and height within 15 %, a twist's heading within 10 degrees and
-its drift within 0.1 body heights, a walk's distance within 10 % and its feet slipping less than 2 % of a stride), the body
-ends upright (tilt under 10 degrees) and the audit holds. Each failure has its reason. Captures take part where they are found
-(``EGS_WARP_DATA``, else ../shared/data).
+A run succeeds if the motion reaches what was asked (distance and height within 15 %, a twist's heading within 10
+degrees and its drift within 0.1 body heights, a walk's distance within 10 % and its feet slipping less than 2 % of a
+stride), the body ends upright (tilt under 10 degrees) and the audit holds. Each failure has its reason. Captures take
+part where they are found (``EGS_WARP_DATA``, else ../shared/data).
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
 import os
-import time
 from collections import Counter
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from egs_warp.assets import figurine, pawn, stool
+from egs_warp.errors import UserError
+from egs_warp.io import read_capture
+from egs_warp.locomotion.rollout import simulate
+from egs_warp.locomotion.trajectory import Trajectory, audit, measure
+from egs_warp.motions.repertoire import also_reached, longest, parts_of
+from egs_warp.motions.script import parse_script
+from egs_warp.motions.sequence import MotionSequence
+from egs_warp.pipelines.creature import first_place, make_creature
+from harness import Row, Table, data_folder, flags, record, report, timed
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FRICTIONS = (0.3, 0.6, 1.0)
 SAGS = (0.01, 0.03, 0.08)
@@ -50,16 +68,11 @@ class Case:
     """Seconds."""
 
 
-def data_folder() -> Path:
-    """Where the captures are looked for."""
-    return Path(os.environ.get("EGS_WARP_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "objects"
-
-
 def cases(quick: bool) -> list[Case]:
     """All runs; ``quick`` gives three."""
     if quick:
         return [Case("pawn", "jump", friction, 0.05, 1 / 60) for friction in FRICTIONS]
-    captures = [name for name, (file, _) in CAPTURES.items() if (data_folder() / file).exists()]
+    captures = [name for name, (file, _) in CAPTURES.items() if (data_folder() / "objects" / file).exists()]
     bodies = ["pawn", "figurine", "stool", *captures]
     runs = [Case(body, "jump", *rest) for body in bodies[:2] for rest in product(FRICTIONS, SAGS, STEPS)]
     runs += [
@@ -72,27 +85,18 @@ def cases(quick: bool) -> list[Case]:
     return runs
 
 
-def run(case: Case, *, device: str, seed: int, frames: int | None = None) -> dict:
+def run(case: Case, *, device: str, seed: int, frames: int | None = None) -> Row:
     """Simulate one case, ``frames`` of it, and judge it; ``seed`` is of the built-in bodies' Gaussians."""
-    os.environ["OMP_NUM_THREADS"] = "1"
-    import numpy as np
-    import warp as wp
-
     wp.config.log_level = wp.LOG_WARNING
-    from egs_warp.assets import figurine, pawn, stool
-    from egs_warp.errors import UserError
-    from egs_warp.io import read_capture
-    from egs_warp.locomotion.rollout import simulate
-    from egs_warp.locomotion.trajectory import audit, measure
-    from egs_warp.motions.repertoire import also_reached, longest, parts_of
-    from egs_warp.motions.script import parse_script
-    from egs_warp.motions.sequence import MotionSequence
-    from egs_warp.pipelines.creature import first_place, make_creature
+    judged, milliseconds = timed(_run, case, device=device, seed=seed, frames=frames)
+    return {**asdict(case), **judged, "seconds": 1e-3 * milliseconds}
 
-    started = time.perf_counter()
+
+def _run(case: Case, *, device: str, seed: int, frames: int | None) -> Row:
+    subject: dict[str, Any]
     if case.body in CAPTURES:
         file, up = CAPTURES[case.body]
-        subject = {"cloud": read_capture(data_folder() / file, device=device).cloud, "up": np.array(up)}
+        subject = {"cloud": read_capture(data_folder() / "objects" / file, device=device).cloud, "up": np.array(up)}
     else:
         built_in = {"pawn": pawn, "figurine": figurine, "stool": stool}[case.body](seed=seed, device=device)
         subject = {"cloud": built_in.cloud, "plane": built_in.plane}
@@ -111,8 +115,7 @@ def run(case: Case, *, device: str, seed: int, frames: int | None = None) -> dic
             finished=lambda: sequence.finished,
         )
     except (UserError, ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
-        seconds = time.perf_counter() - started
-        return {**asdict(case), "success": False, "reason": f"stopped: {error}", "seconds": seconds}
+        return {"success": False, "reason": f"stopped: {error}"}
     checked = asdict(audit(simulation.trajectory, newton_unconverged=sum(not r.converged for r in simulation.reports)))
     reached = asdict(measure(simulation.trajectory))
     reached |= also_reached(sequence.done[0].motion, simulation.trajectory, 0, -1)
@@ -121,7 +124,6 @@ def run(case: Case, *, device: str, seed: int, frames: int | None = None) -> dic
     if reason and friction_spent(simulation.trajectory) > 0.5:
         reason += "; friction was spent for over half of the time on the ground"
     return {
-        **asdict(case),
         "success": reason is None,
         "reason": reason,
         "asked": asked,
@@ -129,7 +131,6 @@ def run(case: Case, *, device: str, seed: int, frames: int | None = None) -> dic
         "audit": {name: float(value) for name, value in checked.items()},
         "young_modulus": float(creature.body.young_modulus),
         "notes": [note for done in sequence.done for note in done.motion.notes()],
-        "seconds": time.perf_counter() - started,
     }
 
 
@@ -159,10 +160,8 @@ def judge(motion: str, asked: dict[str, float], reached: dict[str, float], check
     return None
 
 
-def friction_spent(trajectory) -> float:
+def friction_spent(trajectory: Trajectory) -> float:
     """Share of the steps with contact in which the whole friction force is within 1 % of its limit."""
-    import numpy as np
-
     normal = np.einsum("ci,ci->c", trajectory.contact_force, trajectory.contact_normal)
     tangential = np.linalg.norm(trajectory.contact_force - normal[:, None] * trajectory.contact_normal, axis=1)
     steps = len(trajectory.time) - 1
@@ -172,43 +171,36 @@ def friction_spent(trajectory) -> float:
     return float(np.mean(used[pressed] > 0.99 * limit[pressed])) if pressed.any() else 0.0
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run the sweep."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="three runs")
+    parser = flags(__doc__, quick="three runs", device="cpu", seed="of the Gaussians of the built-in bodies")
     parser.add_argument("--workers", type=int, default=os.cpu_count())
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--seed", type=int, default=0, help="of the Gaussians of the built-in bodies")
-    parser.add_argument("--json", type=Path)
     parser.add_argument("--join", type=Path, help="JSON of an earlier run of the same code: its rows are not run again")
-    parser.add_argument("--plot", type=Path)
-    arguments = parser.parse_args()
-    rows = json.loads(arguments.join.read_text())["rows"] if arguments.join else []
+    options = parser.parse_args(arguments)
+    rows = json.loads(options.join.read_text())["rows"] if options.join else []
     known = [Case(**{name: row[name] for name in Case.__dataclass_fields__}) for row in rows]
-    runs = [case for case in cases(arguments.quick) if case not in known]
+    runs = [case for case in cases(options.quick) if case not in known]
     # Kernels compile once, here, not in every worker.
-    one = partial(run, device=arguments.device, seed=arguments.seed)
+    one = partial(run, device=options.device, seed=options.seed)
     one(Case("pawn", "jump", 0.6, 0.05, 1 / 60), frames=3)
+    # Workers share the cores between them.
+    os.environ["OMP_NUM_THREADS"] = "1"
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(arguments.workers, mp_context=context) as pool:
+    print(f"{len(runs) + len(known)} runs, {len(known)} of them known")
+    table = Table(run="d", body="<8", motion="<9", friction="g", sag="g", step_rate=".0f", seconds=".0f", outcome="<7")
+    with ProcessPoolExecutor(options.workers, mp_context=context) as pool:
         for future in as_completed([pool.submit(one, case) for case in runs]):
-            rows.append(future.result())
-            row = rows[-1]
-            what = f"{row['body']} {row['motion']} mu {row['friction']} sag {row['sag']} step 1/{1 / row['step']:.0f}"
-            print(
-                f"{len(rows):>4}/{len(runs) + len(known)} {what}: {row['reason'] or 'success'} ({row['seconds']:.0f} s)",
-                flush=True,
-            )
-            result = summary(rows, device=arguments.device, seed=arguments.seed)
-            if arguments.json:
-                arguments.json.write_text(json.dumps(result, indent=2) + "\n")
-    print(table(result))
-    if arguments.plot:
-        plot(rows, arguments.plot)
+            rows.append(row := future.result())
+            case = [row[name] for name in ("body", "motion", "friction", "sag")]
+            table.row(len(rows), *case, 1 / row["step"], row["seconds"], row["reason"] or "success")
+            record(options, **summary(rows))
+    result = summary(rows)
+    print_summary(result)
+    report(options, **result, draw=lambda figure: draw(figure, rows), size=(7.0, 4.0))
 
 
-def summary(rows: list[dict], *, device: str, seed: int) -> dict:
-    """Rates of success by every factor, worst audits of the successes, and the aims."""
+def summary(rows: list[Row]) -> dict[str, Any]:
+    """Rates of success by every factor, worst audits of the successes, and the aims: what ``report`` takes."""
     good = [row for row in rows if row["success"]]
     rates = {
         factor: {
@@ -217,8 +209,6 @@ def summary(rows: list[dict], *, device: str, seed: int) -> dict:
         }
         for factor in ("body", "motion", "friction", "sag", "step")
     }
-    from egs_warp.pipelines.report import versions
-
     rate = len(good) / len(rows)
     enough = len(rows) >= 100
     return {
@@ -238,40 +228,29 @@ def summary(rows: list[dict], *, device: str, seed: int) -> dict:
             ),
         },
         "why_null": {} if enough else {"ninety_percent_succeed": f"{len(rows)} runs, not 100"},
-        "environment": {"device": device, "seed": seed, **versions()},
     }
 
 
-def table(result: dict) -> str:
+def print_summary(result: dict[str, Any]) -> None:
     """As text."""
-    lines = [f"{result['success_rate']:.0%} of {len(result['rows'])} runs succeed"]
+    print(f"{result['success_rate']:.0%} of {len(result['rows'])} runs succeed")
     for factor, values in result["successes_of_runs"].items():
-        lines.append(
-            f"  {factor:<9}" + "  ".join(f"{value}: {good}/{count}" for value, (good, count) in values.items())
-        )
-    lines.append("worst audit of a success:")
-    lines += [
-        f"  {name:<28}{value:.2g}" for name, value in result["worst_audit_of_successes"].items() if value is not None
-    ]
-    return "\n".join(lines)
+        shares = "  ".join(f"{value}: {good}/{count}" for value, (good, count) in values.items())
+        print(f"  {factor:<9}{shares}")
+    table = Table(worst_audit_of_a_success="<28", value=".2g")
+    for name, value in result["worst_audit_of_successes"].items():
+        table.row(name, value)
 
 
-def plot(rows: list[dict], path: Path) -> None:
+def draw(figure: Figure, rows: list[Row]) -> None:
     """Tilt against distance, successes and failures."""
-    import matplotlib
-
-    matplotlib.use("agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(7, 4))
+    axes = figure.subplots()
     for success, colour in ((True, "tab:green"), (False, "tab:red")):
         chosen = [row for row in rows if row["success"] is success and "reached" in row]
         x, y = ([row["reached"][name] for row in chosen] for name in ("distance", "tilt_degrees"))
         axes.scatter(x, y, s=14, color=colour, label=f"{'success' if success else 'failure'} ({len(chosen)})")
     axes.set(xlabel="distance reached / H", ylabel="tilt at the end, degrees", title=f"{len(rows)} runs")
     axes.legend()
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
 
 
 if __name__ == "__main__":

@@ -1,45 +1,41 @@
 """Table 1: five ways of carrying Gaussians with a cage, against the truth of a deformed mesh.
 
 Three objects with true meshes are photographed at rest by a ray caster, trained to Gaussians by the project's own
-trainer, and then bent, twisted and dropped on the floor: one displacement of the cage nodes, known or simulated, carries the
-mesh's vertices and the Gaussians alike. Unseen cameras compare the two. Two more objects (``--held-out``) had no part in
-choosing any setting.
+trainer, and then bent, twisted and dropped on the floor: one displacement of the cage nodes, known or simulated,
+carries the mesh's vertices and the Gaussians alike. Unseen cameras compare the two. Two more objects (``--held-out``)
+had no part in choosing any setting.
 
 Aims: ``best_psnr_every_deformation`` and ``best_ssim_every_deformation`` (ours is best in the mean over objects),
-``margin_over_vrgs`` (by at least the paper's margins over the local-tetrahedron row), ``split_helps`` (splitting beats no
-splitting in PSNR and SSIM, every deformation).
+``margin_over_vrgs`` (by at least the paper's margins over the local-tetrahedron row), ``split_helps`` (splitting beats
+no splitting in PSNR and SSIM, every deformation).
 
-Splitting is finer here than the library's default (``--misfit 7e-4 --depth 3 --growth 4``), which keeps fuzzy captures at rest as they are.
+Splitting is finer here than the library's default (``--misfit 7e-4 --depth 3 --growth 4``), which keeps fuzzy captures
+at rest as they are.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
-import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-import warp as wp
 
-sys.path.insert(0, str(Path(__file__).parent))
 import mesh_scenes as scenes
 from drop import Drop, simulated_drop
-from perceptual import lpips_distance
-
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.deformation.peers import CarryMethod, carry
 from egs_warp.deformation.splitting import SPLIT_DEGREES, SplitRule
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
-from egs_warp.io.video import write_png
 from egs_warp.meshing.cage import build_cage
 from egs_warp.render import render
 from egs_warp.training.likeness import psnr, ssim
+from harness import Row, Table, flags, report, timed
+from perceptual import lpips_distance
 
 MOTIONS = ("bend", "twist", "fall")
 OBJECTS = ("chair", "plant", "microphone")
@@ -58,17 +54,20 @@ OURS, UNSPLIT, VRGS = CarryMethod.BIDIRECTIONAL, CarryMethod.BIDIRECTIONAL_NO_SP
 
 
 def motions_of(mesh: scenes.PaintedMesh, cloud: GaussianCloud, folder: Path | None) -> dict[str, scenes.Motion]:
-    """What is done to one object. The drop is simulated with a coarse cage; ``cloud`` tells where it touches the floor."""
+    """What is done to one object. The drop is simulated with a coarse cage;
+    ``cloud`` tells where it touches the floor.
+    """
     kept = folder / f"{mesh.name}_drop.npz" if folder else None
     if kept is not None and kept.exists():
         with np.load(kept) as arrays:
             dropped = Drop(**arrays)
     else:
-        started = time.perf_counter()
         coarse = build_cage(cloud, FLOOR, target_nodes=250).mesh
         sag, height, tilt = DROPS[mesh.name]
-        dropped = simulated_drop(coarse, cloud, sag=sag, height=height, tilt_degrees=tilt, seconds=0.3)
-        print(f"  drop: {len(coarse.nodes)} nodes, simulated in {time.perf_counter() - started:.0f} s", flush=True)
+        dropped, milliseconds = timed(
+            simulated_drop, coarse, cloud, sag=sag, height=height, tilt_degrees=tilt, seconds=0.3
+        )
+        print(f"  drop: {len(coarse.nodes)} nodes, simulated in {1e-3 * milliseconds:.0f} s", flush=True)
         if kept is not None:
             np.savez_compressed(kept, frames=dropped.frames, energies=dropped.energies, rest=dropped.rest)
     return {"bend": scenes.bend, "twist": scenes.twist_by(150.0), "fall": dropped.at_impact}
@@ -80,9 +79,9 @@ def trained(mesh: scenes.PaintedMesh, options: argparse.Namespace) -> GaussianCl
     if kept is not None and kept.exists():
         with np.load(kept) as arrays:
             return GaussianCloud.from_numpy(**arrays, device=options.device)
-    started = time.perf_counter()
     full = not options.quick
-    cloud = scenes.trained(
+    cloud, milliseconds = timed(
+        scenes.trained,
         mesh,
         size=800 if full else 128,
         views=60 if full else 24,
@@ -91,7 +90,7 @@ def trained(mesh: scenes.PaintedMesh, options: argparse.Namespace) -> GaussianCl
         seed=options.seed,
         device=options.device,
     )
-    print(f"{mesh.name}: {cloud.count} Gaussians trained in {time.perf_counter() - started:.0f} s", flush=True)
+    print(f"{mesh.name}: {cloud.count} Gaussians trained in {1e-3 * milliseconds:.0f} s", flush=True)
     if kept is not None:
         arrays = {
             field: getattr(cloud, field).numpy() for field in ("means", "rotations", "log_scales", "opacity_logits")
@@ -100,7 +99,7 @@ def trained(mesh: scenes.PaintedMesh, options: argparse.Namespace) -> GaussianCl
     return cloud
 
 
-def object_rows(mesh: scenes.PaintedMesh, options: argparse.Namespace) -> tuple[list[dict[str, Any]], list[np.ndarray]]:
+def object_rows(mesh: scenes.PaintedMesh, options: argparse.Namespace) -> tuple[list[Row], list[np.ndarray]]:
     """Scores of every method and motion for one object, and a strip of pictures for each motion."""
     full = not options.quick
     cloud = trained(mesh, options)
@@ -113,7 +112,7 @@ def object_rows(mesh: scenes.PaintedMesh, options: argparse.Namespace) -> tuple[
     def cameras_around(vertices: np.ndarray) -> list[Camera]:
         return scenes.ring(vertices, 12 if full else 6, 800 if full else 128, elevations=(10.0, 40.0), phase=0.37)
 
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     strips = []
     cameras = cameras_around(mesh.vertices)
     rest_truth = scenes.photograph(mesh, mesh.vertices, cameras, options.device)
@@ -126,6 +125,7 @@ def object_rows(mesh: scenes.PaintedMesh, options: argparse.Namespace) -> tuple[
         flush=True,
     )
     distance, _ = lpips_distance()
+    table = Table(motion="<6", method="<24", dB=".2f", SSIM=".4f", Gaussians="7d")
     for motion_name in MOTIONS:
         nodes = motions[motion_name](cage.nodes)
         vertices = scenes.carried_vertices(mesh, cage, nodes, options.device)
@@ -168,26 +168,27 @@ def object_rows(mesh: scenes.PaintedMesh, options: argparse.Namespace) -> tuple[
                     "psnr_at_rest": float(np.mean(at_rest)),
                 }
             )
-            print(f"  {motion_name:6} {method.value:24} {mean[0]:6.2f} dB  {mean[1]:.4f}  {carried.count}", flush=True)
+            table.row(motion_name, method.value, mean[0], mean[1], carried.count)
         # 400 pixels show what there is to see.
         coarser = max(1, strip[0].shape[0] // 400)
         strips.append(np.concatenate([p[::coarser, ::coarser] for p in strip], axis=1))
     return rows, strips
 
 
-def means(rows: list[dict[str, Any]]) -> dict[tuple[str, CarryMethod], tuple[float, float]]:
+def means(rows: list[Row]) -> dict[tuple[str, CarryMethod], tuple[float, float]]:
     """(PSNR, SSIM) over the objects for each motion and method."""
+
+    def mean(key: str, motion: str, method: CarryMethod) -> float:
+        return float(np.mean([row[key] for row in rows if row["motion"] == motion and row["method"] == method.value]))
+
     return {
-        (motion, method): tuple(
-            float(np.mean([r[key] for r in rows if r["motion"] == motion and r["method"] == method.value]))
-            for key in ("psnr", "ssim")
-        )
+        (motion, method): (mean("psnr", motion, method), mean("ssim", motion, method))
         for motion in MOTIONS
         for method in CarryMethod
     }
 
 
-def judge(rows: list[dict[str, Any]], *, quick: bool) -> tuple[dict[str, bool | None], dict[str, str]]:
+def judge(rows: list[Row], *, quick: bool) -> tuple[dict[str, bool | None], dict[str, str]]:
     """The aims, from the rows."""
     table = means(rows)
 
@@ -216,15 +217,9 @@ def judge(rows: list[dict[str, Any]], *, quick: bool) -> tuple[dict[str, bool | 
     return aims, why
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    wp.init()
-    parser.add_argument("--quick", action="store_true", help="128 x 128, few training steps")
-    parser.add_argument("--device", default="cuda:0" if wp.is_cuda_available() else "cpu")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--plot", type=Path)
+    parser = flags(__doc__, quick="128 x 128, few training steps")
     parser.add_argument("--objects", nargs="+", choices=[*OBJECTS, *HELD_OUT], default=OBJECTS)
     parser.add_argument("--held-out", dest="objects", action="store_const", const=HELD_OUT, help=f"{HELD_OUT} instead")
     parser.add_argument("--gaussians", type=int)
@@ -239,10 +234,10 @@ def main() -> None:
     parser.add_argument("--misfit", type=float, default=2e-4, help="least misfit that splits, over the cage's diagonal")
     parser.add_argument("--depth", type=int, default=4)
     parser.add_argument("--growth", type=float, default=20.0, help="at most this many times as many Gaussians")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     options.gaussians = options.gaussians or (2000 if options.quick else 4000)
     options.iterations = options.iterations or (400 if options.quick else 7000)
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     strips: list[np.ndarray] = []
     for path in options.rows or []:
         rows += json.loads(path.read_text())["rows"]
@@ -251,24 +246,22 @@ def main() -> None:
         rows += object_part
         strips += pictures
     aims, why_null = judge(rows, quick=options.quick)
-    print(f"\n{'mean over objects':26}" + "".join(f"{motion:>18}" for motion in MOTIONS) + "   (PSNR dB / SSIM)")
-    table = means(rows)
+    print("\nmean over objects: PSNR, SSIM")
+    table = Table(
+        method="<24",
+        **{f"{motion}_{what}": form for motion in MOTIONS for what, form in (("dB", ".2f"), ("SSIM", ".4f"))},
+    )
     for method in CarryMethod:
-        print(
-            f"{method.value:26}" + "".join(f"{table[m, method][0]:10.2f} /{table[m, method][1]:.4f}" for m in MOTIONS)
-        )
-    print(json.dumps({"aims": aims, "why_null": why_null}, indent=1))
+        table.row(method.value, *(value for motion in MOTIONS for value in means(rows)[motion, method]))
     _, no_lpips = lpips_distance()
-    result = {
-        "rows": rows,
-        "environment": {**scenes.environment(options.device, options.seed), "torch": torch.__version__},
-        "aims": aims,
-        "why_null": {**why_null, **({"lpips": no_lpips} if no_lpips else {})},
-    }
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=1))
-    if options.plot and strips:
-        write_png(options.plot, (np.clip(np.concatenate(strips, axis=0), 0, 1) * 255).astype(np.uint8))
+    report(
+        options,
+        rows,
+        aims=aims,
+        why_null={**why_null, **({"lpips": no_lpips} if no_lpips else {})},
+        packages=["torch"],
+        picture=np.concatenate(strips, axis=0) if strips else None,
+    )
 
 
 if __name__ == "__main__":

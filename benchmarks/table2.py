@@ -1,40 +1,40 @@
 """Table 2: quadratic programs and objective of every strategy for the contact states, frame by frame.
 
-python benchmarks/table2.py [--quick] [--device cpu] [--seed 0] [--solver daqp] [--bodies pawn stool monkey] [--json PATH] [--plot PATH]
+python benchmarks/table2.py [--quick] [--device cpu] [--seed 0] [--solver daqp] [--bodies pawn stool monkey]
+    [--json PATH] [--plot PATH]
 
-The paper's protocol: 50 frames made with known activations, 10 muscle groups and 5 contacts of 8 friction directions, that is
-60 variables and 50 complementarity pairs a frame. Each frame is one program (Eq. 13) that asks for the animation's own motion;
-every strategy gets the same programs. A second table holds smaller problems of the same bodies, and random ones, against the
-true optimum over all contact states (branch and bound).
+The paper's protocol: 50 frames made with known activations, 10 muscle groups and 5 contacts of 8 friction directions,
+that is 60 variables and 50 complementarity pairs a frame. Each frame is one program (Eq. 13) that asks for the
+animation's own motion; every strategy gets the same programs. A second table holds smaller problems of the same bodies,
+and random ones, against the true optimum over all contact states (branch and bound).
 
-``qpcc`` starts from all-static and moves one contact at a time as its own multipliers say; where all-static has no solution it is
-given the states that follow from the last activations. ``qpcc-our-moves`` differs from it only in our rules for the moves, so
-that rules and start can be judged apart.
+``qpcc`` starts from all-static and moves one contact at a time as its own multipliers say; where all-static has no
+solution it is given the states that follow from the last activations. ``qpcc-our-moves`` differs from it only in our
+rules for the moves, so that rules and start can be judged apart.
 
-Aims, over all frames together: ``qps_vs_qpcc`` (two-stage takes at most 0.37 of qpcc's QPs) and ``objective_vs_qpcc`` (its
-mean objective is at most 0.64 of qpcc's): the paper's own ratios.
+Aims, over all frames together: ``qps_vs_qpcc`` (two-stage takes at most 0.37 of qpcc's QPs) and ``objective_vs_qpcc``
+(its mean objective is at most 0.64 of qpcc's): the paper's own ratios.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
-import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import warp as wp
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-sys.path.insert(0, str(Path(__file__).parent))
-from contact_frames import CAPTURES, BenchBody, Frame, animation_frames, body_named, data_folder
+from contact_frames import CAPTURES, BenchBody, Frame, animation_frames, body_named
+from harness import Row, Table, data_folder, flags, report, timed
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.strategies import Strategy, find_states
-from egs_warp.pipelines.report import versions
 from tests.support.contact_programs import small_problem
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PAPER_QPS, PAPER_OBJECTIVE = 17.01 / 46.19, 0.83 / 1.29
 """Two-stage over QPCC in the paper's Table 2: 0.37 and 0.64."""
@@ -47,17 +47,24 @@ def solve_all(frames: list[Frame], solver: QpSolver) -> dict[Strategy, np.ndarra
     for strategy in Strategy:
         figures = []
         for frame in frames:
-            started = time.perf_counter()
-            found = find_states(
-                frame.program, strategy, frame.predicted, frame.previous, qp_limit=QP_LIMIT, solver=solver
+            found, milliseconds = timed(
+                find_states,
+                frame.program,
+                strategy,
+                frame.predicted,
+                frame.previous,
+                qp_limit=QP_LIMIT,
+                solver=solver,
             )
-            figures.append((found.qp_count, found.objective, 1e3 * (time.perf_counter() - started)))
+            figures.append((found.qp_count, found.objective, milliseconds))
         results[strategy] = np.array(figures)
     return results
 
 
 def lively_frames(bench: BenchBody, strength: float, **options: Any) -> tuple[list[Frame], float]:
-    """Frames of an animation, as strong as the body bears: halved from ``strength`` until every step of it converges."""
+    """Frames of an animation, as strong as the body bears:
+    halved from ``strength`` until every step of it converges.
+    """
     while True:
         try:
             return animation_frames(bench, strength=strength, **options), strength
@@ -65,7 +72,7 @@ def lively_frames(bench: BenchBody, strength: float, **options: Any) -> tuple[li
             strength *= 0.5
 
 
-def table_rows(table: str, body: str, results: dict[Strategy, np.ndarray], **more: Any) -> list[dict[str, Any]]:
+def table_rows(table: str, body: str, results: dict[Strategy, np.ndarray], **more: Any) -> list[Row]:
     """One row a strategy."""
     best = results[Strategy.EXACT][:, 1]
     rows = []
@@ -97,19 +104,20 @@ def table_rows(table: str, body: str, results: dict[Strategy, np.ndarray], **mor
     return rows
 
 
-def print_rows(rows: list[dict[str, Any]]) -> None:
-    """As text."""
-    print(
-        f"{'body':<14}{'strategy':<16}{'frames':>7}{'QPs avg':>9}{'best':>6}{'worst':>6}"
-        f"{'objective avg':>15}{'best':>10}{'worst':>10}{'ms':>7}{'median/exact':>13}{'within 2 %':>11}"
+def print_rows(rows: list[Row]) -> None:
+    """QPs and objectives: average, best, worst; then milliseconds and the objective over the exact optimum's."""
+    table = Table(
+        **{"body": "<12", "strategy": "<14", "frames": "d"},
+        **{"QPs_avg": ".2f", "QPs_best": "d", "QPs_worst": "d"},
+        **{"objective": "10.3e", "its_best": "8.1e", "its_worst": "8.1e"},
+        **{"ms": "6.1f", "median/exact": ".3f", "within_2_%": ".0%"},
     )
     for row in rows:
-        qps, objective = row["qps"], row["objective"]
-        print(
-            f"{row['body']:<14}{row['strategy']:<16}{row['frames']:>7}{qps['average']:>9.2f}{qps['best']:>6}{qps['worst']:>6}"
-            f"{objective['average']:>15.3e}{objective['best']:>10.1e}{objective['worst']:>10.1e}"
-            f"{row['milliseconds']:>7.1f}{row['over_exact']['median']:>13.3f}{row['within_two_percent']:>11.0%}",
-            flush=True,
+        table.row(
+            *(row["body"], row["strategy"], row["frames"]),
+            *row["qps"].values(),
+            *row["objective"].values(),
+            *(row["milliseconds"], row["over_exact"]["median"], row["within_two_percent"]),
         )
 
 
@@ -128,42 +136,36 @@ def random_frames(count: int, seed: int) -> list[Frame]:
     return frames
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="one animation a body in place of two")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--seed", type=int, default=0)
+    parser = flags(__doc__, quick="one animation a body in place of two", device="cpu")
     parser.add_argument("--solver", default="daqp", choices=[solver.value for solver in QpSolver])
     parser.add_argument("--bodies", nargs="+", default=["pawn", "stool", "monkey"])
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--plot", type=Path)
-    arguments = parser.parse_args()
-    wp.config.log_level = wp.LOG_WARNING
-    solver = QpSolver(arguments.solver)
-    strengths = (0.2,) if arguments.quick else (0.2, 0.4)
+    options = parser.parse_args(arguments)
+    solver = QpSolver(options.solver)
+    strengths = (0.2,) if options.quick else (0.2, 0.4)
     large: list[dict[Strategy, np.ndarray]] = []
     small: list[dict[Strategy, np.ndarray]] = []
     rows, skipped = [], []
-    for name in arguments.bodies:
+    for name in options.bodies:
         if name in CAPTURES and not data_folder().is_dir():
             skipped.append(name)
             continue
-        bench = body_named(name, arguments.device)
+        bench = body_named(name, options.device)
         for wanted in strengths:
-            frames, strength = lively_frames(bench, wanted, seed=arguments.seed)
+            frames, strength = lively_frames(bench, wanted, seed=options.seed)
             large.append(solve_all(frames, solver))
             made = table_rows("frames", f"{name} {strength:g}", large[-1], strength=strength)
             rows += made
             print_rows(made)
         frames, strength = lively_frames(
-            bench, strengths[0], activations=4, contacts=3, directions=4, seed=arguments.seed + 1
+            bench, strengths[0], activations=4, contacts=3, directions=4, seed=options.seed + 1
         )
         small.append(solve_all(frames, solver))
         rows += table_rows("small", f"{name} {strength:g}", small[-1], strength=strength)
     rows += table_rows("frames", "all", pooled(large))
     rows += table_rows("small", "all", pooled(small))
-    rows += table_rows("random", "random", solve_all(random_frames(60, arguments.seed), solver))
+    rows += table_rows("random", "random", solve_all(random_frames(60, options.seed), solver))
     print("\nFrames of 60 variables and 50 pairs, all bodies")
     print_rows([row for row in rows if row["table"] == "frames" and row["body"] == "all"])
     print("\nSmall problems (4 muscle groups, 3 contacts of 4 directions) and random ones against the exact optimum")
@@ -176,31 +178,23 @@ def main() -> None:
     within = float((near[Strategy.TWO_STAGE][:, 1] <= 1.02 * near[Strategy.EXACT][:, 1] + 1e-12).mean())
     print(f"\nTwo-stage over qpcc: QPs {qps:.2f} (paper 0.37), objective {objective:.2f} (paper 0.64)")
     print(f"Two-stage: {ours[:, 0].mean():.2f} QPs a frame; within 2 % of exact in {within:.0%} of the small problems")
-    result = {
-        "rows": rows,
-        "ratios": {"qps_vs_qpcc": qps, "objective_vs_qpcc": objective},
-        "beyond": {"qps_a_frame": float(ours[:, 0].mean()), "small_within_two_percent": within},
-        "skipped_bodies": skipped,
-        "environment": {"device": arguments.device, "qp_solver": solver.value, "seed": arguments.seed, **versions()},
-        "aims": {
-            "qps_vs_qpcc": qps <= round(PAPER_QPS, 2),
-            "objective_vs_qpcc": objective <= round(PAPER_OBJECTIVE, 2),
-        },
-        "why_null": {},
-    }
-    if arguments.json:
-        arguments.json.write_text(json.dumps(result, indent=2) + "\n")
-    if arguments.plot:
-        _plot(total, near, arguments.plot)
+    report(
+        options,
+        rows,
+        ratios={"qps_vs_qpcc": qps, "objective_vs_qpcc": objective},
+        beyond={"qps_a_frame": float(ours[:, 0].mean()), "small_within_two_percent": within},
+        skipped_bodies=skipped,
+        aims={"qps_vs_qpcc": qps <= round(PAPER_QPS, 2), "objective_vs_qpcc": objective <= round(PAPER_OBJECTIVE, 2)},
+        packages=["daqp"],
+        conditions={"qp_solver": solver.value},
+        draw=lambda figure: draw(figure, total, near),
+        size=(13.0, 3.8),
+    )
 
 
-def _plot(total: dict[Strategy, np.ndarray], near: dict[Strategy, np.ndarray], path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, (left, *others) = plt.subplots(1, 3, figsize=(13, 3.8))
+def draw(figure: Figure, total: dict[Strategy, np.ndarray], near: dict[Strategy, np.ndarray]) -> None:
+    """QPs a frame; and how near to the exact optimum each strategy comes, over the share of frames."""
+    left, *others = figure.subplots(1, 3)
     shown = [strategy for strategy in Strategy if strategy is not Strategy.EXACT]
     colours = dict(zip(shown, ("tab:gray", "tab:orange", "tab:olive", "tab:blue"), strict=True))
     counts = [total[strategy][:, 0] for strategy in shown]
@@ -226,8 +220,6 @@ def _plot(total: dict[Strategy, np.ndarray], near: dict[Strategy, np.ndarray], p
         axes.set_title(title, fontsize=10)
     others[0].set_ylabel("share of frames")
     others[1].legend(loc="lower right", fontsize=8)
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
 
 
 if __name__ == "__main__":

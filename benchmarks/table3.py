@@ -1,9 +1,10 @@
 """Table 3 of the paper: an object cut off at its plane, seen from within the plane. Also writes its figure 9.
 
-Scenes are taken apart as ``egs-warp segment`` does, from masks in 18 views: of the true object in the built-in scenes, and
-in real captures of what a click finds. ``mask only`` is everything that the masks claim, the plane left aside. Four cameras
-of 800 x 800 pixels lie in the plane, so that its horizon is the middle row. PSNR and SSIM compare the upper halves with
-those of ``mask only``, on black; the residual is the sum of the pixels of the lower half over that of the upper half.
+Scenes are taken apart as ``egs-warp segment`` does, from masks in 18 views: of the true object in the built-in scenes,
+and in real captures of what a click finds. ``mask only`` is everything that the masks claim, the plane left aside. Four
+cameras of 800 x 800 pixels lie in the plane, so that its horizon is the middle row. PSNR and SSIM compare the upper
+halves with those of ``mask only``, on black; the residual is the sum of the pixels of the lower half over that of the
+upper half.
 
 Aims: ``residual`` (L_seg: at most 0.002 in every scene), ``psnr`` (L_seg: at least 35.3 dB in every scene). ``L_seg, no
 subdivision`` is the paper's own way; ours splits straddling Gaussians twice before it trains.
@@ -11,16 +12,10 @@ subdivision`` is the paper's own way; ours splits straddling Gaussians twice bef
 
 from __future__ import annotations
 
-import argparse
-import json
-import time
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import torch
-from mesh_scenes import data_folder, environment
-from perceptual import lpips_distance
 
 from egs_warp.assets import scene
 from egs_warp.geometry.camera import Camera
@@ -28,13 +23,14 @@ from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io import read_capture
-from egs_warp.io.video import write_png
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane
 from egs_warp.render import render
 from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane
 from egs_warp.segmentation.object_mask import ObjectSpec, masks_from_selection
 from egs_warp.segmentation.votes import blending_votes
 from egs_warp.training.likeness import psnr, ssim
+from harness import Row, Table, data_folder, flags, report, timed
+from perceptual import lpips_distance
 
 BUILT_IN = ("pawn", "stool", "figurine")
 CAPTURES = {"koala.ply": (0.1, -0.7, 0.15), "narcissus.sog": (0.0, -0.8, 0.0)}
@@ -80,7 +76,7 @@ def picture(cloud: GaussianCloud, camera: Camera) -> np.ndarray:
     return np.clip(render(cloud, camera, background=BLACK).colour.numpy(), 0.0, 1.0)
 
 
-def rows_of(name: str, device: str, side: int, seed: int) -> tuple[list[dict[str, Any]], np.ndarray]:
+def rows_of(name: str, device: str, side: int, seed: int, table: Table) -> tuple[list[Row], np.ndarray]:
     """One row a method, and their pictures from one camera side by side."""
     masked, untouched, located = taken_apart(name, device)
     plane = located.plane
@@ -90,10 +86,10 @@ def rows_of(name: str, device: str, side: int, seed: int) -> tuple[list[dict[str
     rows, shown = [], []
     distance, _ = lpips_distance()
     for method, (clearing, chosen) in METHODS.items():
-        started = time.perf_counter()
         options = ClearingOptions(seed=seed) if chosen is None else chosen
-        cloud = masked if clearing is Clearing.NONE else clear_plane(untouched, plane, clearing, options=options)
-        seconds = time.perf_counter() - started
+        cloud, milliseconds = masked, 0.0
+        if clearing is not Clearing.NONE:
+            cloud, milliseconds = timed(clear_plane, untouched, plane, clearing, options=options)
         pictures = [picture(cloud, camera) for camera in cameras]
         upper = [one[:half] for one in pictures]
         exact = clearing is Clearing.NONE
@@ -112,54 +108,48 @@ def rows_of(name: str, device: str, side: int, seed: int) -> tuple[list[dict[str
                 if exact or not distance
                 else float(np.mean([distance(a, b) for a, b in zip(upper, wanted, strict=True)])),
                 "residual": float(np.mean([one[half:].sum() / one[:half].sum() for one in pictures])),
-                "seconds": seconds,
+                "seconds": 1e-3 * milliseconds,
             }
         )
         row = rows[-1]
-        figures = "        -       -" if exact else f"{row['psnr']:9.3f} {row['ssim']:7.4f}"
-        print(f"{name:14s} {method:22s} {figures} {row['residual']:9.5f} {seconds:7.1f} s", flush=True)
+        table.row(name, method, row["psnr"], row["ssim"], row["residual"], row["seconds"])
         shown.append(pictures[1][int(0.55 * half) : int(1.3 * half), side // 5 : side - side // 5])
     return rows, np.concatenate(shown, axis=1)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--quick", action="store_true", help="the pawn, the stool and the koala only")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--plot", type=Path, help="figure 9: a row a scene; columns in the table's order")
-    options = parser.parse_args()
+    options = flags(
+        __doc__,
+        quick="the pawn, the stool and the koala only",
+        device="cpu",
+        plot="figure 9: a row a scene; columns in the table's order",
+    ).parse_args(arguments)
     names = ["pawn", "stool", "koala.ply"] if options.quick else [*BUILT_IN, *CAPTURES]
     _, no_lpips = lpips_distance()
     why_null = {"lpips": no_lpips} if no_lpips else {}
-    rows: list[dict[str, Any]] = []
+    rows: list[Row] = []
     figure: list[np.ndarray] = []
-    print("scene          method                     PSNR    SSIM  residual")
+    table = Table(scene="<14", method="<22", PSNR=".3f", SSIM=".4f", residual=".5f", seconds="6.1f")
     for name in names:
         if name in CAPTURES and not (data_folder() / "scenes" / name).exists():
             print(f"{name}: not here; set EGS_WARP_DATA")
             continue
-        more, shown = rows_of(name, options.device, 800, options.seed)
+        more, shown = rows_of(name, options.device, 800, options.seed, table)
         rows += more
         figure.append(shown)
     ours = [row for row in rows if row["method"] == "L_seg"]
-    aims = {
-        "residual": all(row["residual"] <= 0.002 for row in ours),
-        "psnr": all(row["psnr"] >= 35.3 for row in ours),
-    }
-    print(json.dumps({"aims": aims}))
-    if options.json:
-        result = {
-            "rows": rows,
-            "environment": environment(options.device, options.seed),
-            "aims": aims,
-            "why_null": why_null,
-        }
-        options.json.write_text(json.dumps(result, indent=1))
-    if options.plot:
-        write_png(options.plot, np.rint(np.concatenate(figure) * 255.0).astype(np.uint8))
+    report(
+        options,
+        rows,
+        aims={
+            "residual": all(row["residual"] <= 0.002 for row in ours),
+            "psnr": all(row["psnr"] >= 35.3 for row in ours),
+        },
+        why_null=why_null,
+        packages=["torch"],
+        picture=np.concatenate(figure),
+    )
 
 
 if __name__ == "__main__":

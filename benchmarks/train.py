@@ -8,42 +8,37 @@ held-out photo, the usual way to remove exposure. The means count every held-out
 from __future__ import annotations
 
 import argparse
-import json
-import os
-import platform
 import time
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
-import torch
-import warp as wp
 
-from benchmarks.train_peers import has_gsplat, train_with_gsplat
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.cameras import read_points
-from egs_warp.io.video import contact_sheet, write_png
+from egs_warp.io.video import contact_sheet
 from egs_warp.pipelines.train_capture import TrainResult, score_photo, train
 from egs_warp.render import render
+from harness import Row, Table, data_folder, flags, report
+from train_peers import has_gsplat, train_with_gsplat
 
 OURS, GSPLAT = "egs_warp", "gsplat MCMC"
 CASES = ("bonsai", "mouse", "plush_dog", "lego")
+_SHOWN = (
+    *("case", "method", "gaussians", "seconds", "held_out_psnr", "held_out_ssim"),
+    *("held_out_plain_psnr", "held_out_plain_ssim", "trained_on_psnr", "trained_on_ssim"),
+)
+"""Columns of the table, by their names in the rows."""
 _WARM_UP = 20
 """Steps of both before the first timed case, so that kernels are compiled."""
 
 
-def data_folder() -> Path:
-    """Of the posed photos."""
-    return Path(os.environ.get("EGS_WARP_DATA", Path(__file__).parents[2] / "shared" / "data")) / "posed"
-
-
-def row_of(case: str, method: str, cloud: GaussianCloud, seconds: float, result: TrainResult) -> dict[str, Any]:
+def row_of(case: str, method: str, cloud: GaussianCloud, seconds: float, result: TrainResult) -> Row:
     """Scores of one cloud on the photos of ``result``."""
     scores = [
         score_photo(cloud, view, result.background, held_out=score.held_out)
         for view, score in zip(result.views, result.scores, strict=True)
     ]
-    row: dict[str, Any] = {"case": case, "method": method, "gaussians": cloud.count, "seconds": seconds}
+    row: Row = {"case": case, "method": method, "gaussians": cloud.count, "seconds": seconds}
     for which, out in (("held_out", True), ("trained_on", False)):
         chosen = [score for score in scores if score.held_out is out]
         for name in ("psnr", "ssim", "plain_psnr", "plain_ssim"):
@@ -52,9 +47,9 @@ def row_of(case: str, method: str, cloud: GaussianCloud, seconds: float, result:
     return row
 
 
-def run_case(case: str, options: argparse.Namespace) -> tuple[list[dict[str, Any]], np.ndarray]:
+def run_case(case: str, options: argparse.Namespace, table: Table) -> tuple[list[Row], np.ndarray]:
     """Rows of both methods, and a strip of photo and renders."""
-    folder = data_folder() / case
+    folder = data_folder() / "posed" / case
     marks: dict[str, float] = {}
     has_peer = options.device.startswith("cuda") and has_gsplat()
 
@@ -90,13 +85,7 @@ def run_case(case: str, options: argparse.Namespace) -> tuple[list[dict[str, Any
         clouds[GSPLAT] = peer.cloud
         rows.append(row_of(case, GSPLAT, peer.cloud, peer.seconds, result))
     for row in rows:
-        print(
-            f"{row['case']:10} {row['method']:12} {row['gaussians']:8d} {row['seconds']:7.1f} s"
-            f"  held out {row['held_out_psnr']:.2f} dB / {row['held_out_ssim']:.3f}"
-            f"  as it is {row['held_out_plain_psnr']:.2f} / {row['held_out_plain_ssim']:.3f}"
-            f"  trained on {row['trained_on_psnr']:.2f} / {row['trained_on_ssim']:.3f}",
-            flush=True,
-        )
+        table.row(*(row[name] for name in _SHOWN))
     shown = next(number for number, score in enumerate(result.scores) if score.held_out)
     view = result.views[shown]
     frames = [np.rint(view.image * 255).astype(np.uint8)]
@@ -106,7 +95,7 @@ def run_case(case: str, options: argparse.Namespace) -> tuple[list[dict[str, Any
 
 def warm_up(options: argparse.Namespace) -> None:
     """Compile every kernel outside of the timed runs."""
-    folder = data_folder() / options.cases[0]
+    folder = data_folder() / "posed" / options.cases[0]
     result = train(folder, iterations=_WARM_UP, max_gaussians=1000, max_side=120, device=options.device)
     if options.device.startswith("cuda") and has_gsplat():
         train_with_gsplat(
@@ -118,7 +107,7 @@ def warm_up(options: argparse.Namespace) -> None:
         )
 
 
-def judge(rows: list[dict[str, Any]]) -> tuple[dict[str, bool | None], dict[str, str]]:
+def judge(rows: list[Row]) -> tuple[dict[str, bool | None], dict[str, str]]:
     """The aims, from the rows."""
     aims: dict[str, bool | None] = {"psnr_vs_gsplat": None, "not_slower": None}
     cases = {row["case"] for row in rows if row["method"] == GSPLAT}
@@ -133,60 +122,47 @@ def judge(rows: list[dict[str, Any]]) -> tuple[dict[str, bool | None], dict[str,
     return aims, {}
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    wp.init()
-    parser.add_argument("--quick", action="store_true", help="300 iterations, 3,000 Gaussians, 120 pixels")
-    parser.add_argument("--device", default="cuda:0" if wp.is_cuda_available() else "cpu")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--plot", type=Path)
+    parser = flags(__doc__, quick="300 iterations, 3,000 Gaussians, 120 pixels", plot="file for photo beside renders")
     parser.add_argument("--cases", nargs="+", default=list(CASES))
     parser.add_argument("--iterations", type=int, help="7000")
     parser.add_argument("--gaussians", type=int, help="cap for both (200000)")
     parser.add_argument("--max-side", type=int, help="photos are reduced to this many pixels (as they are)")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     options.iterations = options.iterations or (300 if options.quick else 7000)
     options.gaussians = options.gaussians or (3000 if options.quick else 200_000)
     options.max_side = options.max_side or (120 if options.quick else None)
-    rows: list[dict[str, Any]] = []
-    strips = []
-    missing = [case for case in options.cases if not (data_folder() / case).is_dir()]
-    options.cases = [case for case in options.cases if case not in missing]
-    if options.cases:
-        warm_up(options)
-    for case in options.cases:
-        if case not in missing:
-            part, strip = run_case(case, options)
-            rows += part
-            strips.append(strip)
-    aims, why_null = judge(rows)
+    missing = [case for case in options.cases if not (data_folder() / "posed" / case).is_dir()]
     if missing:
         print(f"not on this machine: {', '.join(missing)}")
-    print(json.dumps({"aims": aims, "why_null": why_null}, indent=1))
-    result = {
-        "rows": rows,
-        "environment": {
-            "device": str(wp.get_device(options.device)),
-            "name": wp.get_device(options.device).name,
-            "python": platform.python_version(),
-            "warp": wp.config.version,
-            "torch": torch.__version__,
-            "threads": os.cpu_count(),
-            "seed": options.seed,
+    options.cases = [case for case in options.cases if case not in missing]
+    rows: list[Row] = []
+    strips = []
+    if options.cases:
+        warm_up(options)
+    formats = ("<10", "<12", "9d", "8.1f", "8.2f", "6.3f", "8.2f", "6.3f", "8.2f", "6.3f")
+    heads = ("case", "method", "Gaussians", "seconds", "held_out", "SSIM", "as_it_is", "SSIM_", "trained_on", "SSIM__")
+    table = Table(**dict(zip(heads, formats, strict=True)))
+    for case in options.cases:
+        part, strip = run_case(case, options, table)
+        rows += part
+        strips.append(strip)
+    aims, why_null = judge(rows)
+    report(
+        options,
+        rows,
+        picture=contact_sheet(strips, 1, [""] * len(strips)) if strips else None,
+        aims=aims,
+        why_null=why_null,
+        packages=("torch", "gsplat") if has_gsplat() else ("torch",),
+        conditions={
             "iterations": options.iterations,
             "gaussians": options.gaussians,
             "max_side": options.max_side,
             "missing": missing,
         },
-        "aims": aims,
-        "why_null": why_null,
-    }
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=1))
-    if options.plot:
-        write_png(options.plot, contact_sheet(strips, 1, [""] * len(strips)))
+    )
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import warp as wp
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io.colmap import SparsePoints
@@ -53,9 +53,11 @@ def train_with_gsplat(
     seed: int = 0,
     device: str = "cuda:0",
 ) -> PeerResult:
-    """gsplat 1.5.3 as its ``simple_trainer.py mcmc`` sets it up: world scaled to the cameras, triangulated points or a
-    random cube, SH one degree more each 1,000 steps, MCMC strategy untouched but for the cap. Photos with alpha are laid
-    over a random colour each step, as ours are; SSIM is the function that ours uses, for fused_ssim is another package.
+    """gsplat 1.5.3 as its ``simple_trainer.py mcmc`` sets it up, MCMC strategy untouched but for the cap.
+
+    The world is scaled to the cameras; it begins with triangulated points or a random cube; SH gets one degree more
+    each 1,000 steps. Photos with alpha are laid over a random colour each step, as ours are; SSIM is ``likeness.ssim``,
+    for fused_ssim is another package.
     """
     from gsplat import rasterization  # type: ignore[import-not-found]
     from gsplat.strategy import MCMCStrategy  # type: ignore[import-not-found]
@@ -72,7 +74,7 @@ def train_with_gsplat(
         colours = random.uniform(size=(_RANDOM_POINTS, 3))
     else:
         positions, colours = (points.positions - middle) / unit, points.colours
-    near = cKDTree(positions).query(positions, k=4)[0][:, 1:]
+    near = KDTree(positions).query(positions, k=4)[0][:, 1:]
     size = np.log(np.maximum(np.sqrt(np.mean(near**2, axis=1)) * _FIRST_SCALE, 1e-9))
     sh = np.zeros((len(positions), (sh_degree + 1) ** 2, 3))
     sh[:, 0] = (colours - 0.5) / SH_BAND_0

@@ -18,6 +18,8 @@ import numpy as np
 import warp as wp
 
 Shape: TypeAlias = int | tuple[int, ...]
+Device: TypeAlias = wp.Device | str | None
+"""A device or its name; None is Warp's current one."""
 
 _MIN_ROWS_PER_CHUNK = 2048
 """Below this many light rows a launch's own cost (about 20 us) is no longer small against its work."""
@@ -35,9 +37,9 @@ def launch_rows(
     kernel: Any,
     row_count: int,
     *,
-    inputs: Sequence[Any],
-    outputs: Sequence[Any],
-    device: Any,
+    inputs: Sequence[object],
+    outputs: Sequence[object],
+    device: wp.Device,
     threads: int | None = None,
     work: np.ndarray | None = None,
 ) -> None:
@@ -92,7 +94,7 @@ class _Recorded(threading.local):
 _recorded = _Recorded()
 
 
-def launch_again(kernel: Any, dim: int, *, inputs: Sequence[Any], outputs: Sequence[Any], device: Any) -> None:
+def launch_again(kernel: Any, dim: int, *, inputs: Sequence[Any], outputs: Sequence[Any], device: wp.Device) -> None:
     """``wp.launch`` on a GPU at half its cost, for kernels that run many times a second.
 
     The first launch of a thread is kept; the next ones only put in their arguments, whose types are not checked again.
@@ -105,7 +107,7 @@ def launch_again(kernel: Any, dim: int, *, inputs: Sequence[Any], outputs: Seque
         if kept is None:
             return
         # What the launch keeps alive besides its packed arguments.
-        kept.fwd_args = None
+        kept.fwd_args = None  # pyright: ignore[reportAttributeAccessIssue]  # guessed from a list
     else:
         if dim != kept_dim:
             kept.set_dim(dim)
@@ -123,7 +125,9 @@ def launch_again(kernel: Any, dim: int, *, inputs: Sequence[Any], outputs: Seque
 
 
 def _chunk_edges(row_count: int, threads: int, work: np.ndarray | None) -> list[int]:
-    """Where chunks begin and end, whose effort shrinks towards the last: all threads then finish at about the same time."""
+    """Where chunks begin and end, whose effort shrinks towards the last:
+    all threads then finish at about the same time.
+    """
     least = 0.0 if work is not None else _MIN_ROWS_PER_CHUNK / max(row_count, 1)
     least = max(least, 1.0 / (_LAST_CHUNKS_PER_THREAD * threads))
     shares, taken = [], 0.0
@@ -143,11 +147,19 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=max(1, (os.cpu_count() or 1) - 1))
 
 
-def empty(shape: Shape, dtype: Any, device: Any) -> wp.array:
-    """Array of undefined contents. Warp's own stub admits only Python's ``float`` as a type."""
-    return wp.empty(shape, dtype=dtype, device=device)
+def device_of(array: wp.array) -> wp.Device:
+    """Where ``array`` is. Warp's own type leaves room for none, which only annotations have."""
+    device: Any = array.device
+    return device
 
 
-def zeros(shape: Shape, dtype: Any, device: Any) -> wp.array:
+def empty(shape: Shape, dtype: Any, device: Device, *, pinned: bool = False) -> wp.array:
+    """Array of undefined contents; ``pinned`` is page-locked, on a CPU. Warp's own stub admits only Python's ``float``
+    as a type.
+    """
+    return wp.empty(shape, dtype=dtype, device=device, pinned=pinned)
+
+
+def zeros(shape: Shape, dtype: Any, device: Device) -> wp.array:
     """Array of zeros."""
     return wp.zeros(shape, dtype=dtype, device=device)

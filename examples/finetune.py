@@ -1,4 +1,5 @@
-"""Torch interop: a pawn that lost its colours gets them back from pictures, pixels to Gaussians with gradients all the way.
+"""Torch interop: a pawn that lost its colours gets them back from pictures, pixels to Gaussians with gradients all the
+way.
 
 The renderer is an ordinary differentiable torch function (``render_torch``); ``finetune`` is the loop around it.
 """

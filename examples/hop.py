@@ -1,4 +1,6 @@
-"""The pawn hops across the chess board of its scene, a square at a time: video, contact sheet, report and trajectory."""
+"""The pawn hops across the chess board of its scene, a square at a time:
+video, contact sheet, report and trajectory.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""``docs/equations.md`` is complete: names exist, cited tests name their equation, no equation of a docstring is missing."""
+"""``docs/equations.md`` is complete: names exist, cited tests name their equation,
+no equation of a docstring is missing.
+"""
 
 from __future__ import annotations
 

@@ -136,7 +136,7 @@ def _level(
 ) -> SurfaceSamples:
     """Samples of a rectangle in z = 0, half a spacing off its edges."""
     counts = np.rint((high - low) / spacing).astype(int)
-    grid = np.indices(counts).reshape(2, -1).T + 0.5
+    grid = np.indices(tuple(counts)).reshape(2, -1).T + 0.5
     flat = low + (high - low) / counts * (grid + random.uniform(-jitter, jitter, grid.shape))
     return SurfaceSamples(
         np.column_stack([flat, np.zeros(len(flat))]), np.tile([0.0, 0.0, 1.0], (len(flat), 1)), spacing

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from skimage import measure
 
 from egs_warp.assets.surface import SurfaceSamples
@@ -46,7 +46,7 @@ def smooth_union(a: np.ndarray, b: np.ndarray, width: float) -> np.ndarray:
 def surface_mesh(distance: Distance, low: np.ndarray, high: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
     """Triangles of the surface inside the box, by marching cubes: vertices (v, 3), faces (f, 3)."""
     counts = np.ceil((high - low) / step).astype(int) + 1
-    lattice = low + step * np.indices(counts).reshape(3, -1).T
+    lattice = low + step * np.indices(tuple(counts)).reshape(3, -1).T
     values = distance(lattice).reshape(counts)
     vertices, faces, _, _ = measure.marching_cubes(values, 0.0)
     return low + step * vertices, faces
@@ -67,7 +67,7 @@ def even_samples(
     points = chosen[:, 0] + u[:, :1] * (chosen[:, 1] - chosen[:, 0]) + u[:, 1:] * (chosen[:, 2] - chosen[:, 0])
     normals = _gradient(distance, points, 0.25 * spacing)
     for _ in range(8):
-        gap, neighbour = cKDTree(points).query(points, k=7)
+        gap, neighbour = (np.asarray(found) for found in KDTree(points).query(points, k=7))
         away = points[:, None] - points[neighbour[:, 1:]]
         gap = np.maximum(gap[:, 1:], 1e-3 * spacing)
         push = (away / gap[:, :, None] * np.clip(1.2 * spacing - gap, 0.0, None)[:, :, None]).sum(axis=1)

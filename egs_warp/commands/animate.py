@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from egs_warp.commands.flags import check_device, guessed_up, parse_direction, parse_up
+from egs_warp.commands.flags import Commands, check_device, guessed_up, parse_direction, parse_up
 from egs_warp.commands.scene_flags import SceneInput, add_object_flags, plane_of, read_scene, say
 from egs_warp.commands.segment import add_straddling_flag, clearing_of
 from egs_warp.errors import UserError
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.prepare_scene import PreparedScene
 
 
-def add_parser(commands) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     animate = commands.add_parser("animate", help="bring a capture to life")
     animate.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog or an unbundled SOG folder")
@@ -131,7 +131,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[dict, str]:
     folder = writable_folder(chosen.out)
     scene = prepare_scene(
         given.cloud,
-        given.spec,
+        given.object,
         cameras=given.cameras,
         photographs=photographs_in_colours_of(given.cloud, given.posed),
         up=given.up,
@@ -176,7 +176,9 @@ def _write_pictures(folder: Path, given: SceneInput, scene: PreparedScene) -> li
 
 
 def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
-    """What the flags say of the motion, as arguments of ``animate``. Raises ``UserError`` for what can be told at once."""
+    """What the flags say of the motion, as arguments of ``animate``.
+    Raises ``UserError`` for what can be told at once.
+    """
     from egs_warp.contact.terrain import read_terrain
     from egs_warp.io.text import parse_json, read_text
     from egs_warp.motions.repertoire import longest

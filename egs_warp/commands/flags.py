@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+import argparse
+from typing import TYPE_CHECKING, Any, TypeAlias
+
 import numpy as np
 
 from egs_warp.errors import UserError
+
+if TYPE_CHECKING:
+    from egs_warp.geometry.plane import Plane
+    from egs_warp.io.capture import Capture
+
+Commands: TypeAlias = "argparse._SubParsersAction[Any]"
+"""What a command adds its parser to."""
 
 _AXES = {"x": 0, "y": 1, "z": 2}
 
@@ -33,7 +43,7 @@ def parse_direction(flag: str, text: str) -> np.ndarray:
     return direction / length
 
 
-def parse_plane(text: str):
+def parse_plane(text: str) -> Plane:
     """Plane from ``nx,ny,nz,d``. Raises ``UserError`` otherwise."""
     from egs_warp.geometry.plane import Plane
 
@@ -52,7 +62,7 @@ def check_device(name: str) -> None:
         raise UserError(f"--device {name}: this machine has {', '.join(devices)}")
 
 
-def guessed_up(capture) -> tuple[np.ndarray, str]:
+def guessed_up(capture: Capture) -> tuple[np.ndarray, str]:
     """(3,) up of a ``Capture`` whose file cannot tell, and what to say about it."""
     from egs_warp.segmentation.base_plane import guess_up
 

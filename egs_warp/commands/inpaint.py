@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from egs_warp.commands.flags import check_device, parse_plane
+from egs_warp.commands.flags import Commands, check_device, parse_plane
 from egs_warp.errors import UserError
 
 
-def add_parser(commands) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     inpaint = commands.add_parser("inpaint", help="close the hole in the floor that an object leaves")
     inpaint.add_argument("background", help="capture without the object, as segment writes it; any format")

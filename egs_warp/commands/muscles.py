@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from egs_warp.commands.flags import guessed_up, parse_up
+from egs_warp.commands.flags import Commands, guessed_up, parse_up
 from egs_warp.commands.scene_flags import plane_of, say
 
 
-def add_parser(commands) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     muscles = commands.add_parser("muscles", help="draw the muscles of a capture's body, automatic ones or your own")
     muscles.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog or an unbundled SOG folder")

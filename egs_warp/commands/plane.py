@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 
+from egs_warp.commands.flags import Commands
 from egs_warp.commands.scene_flags import add_scene_flags, read_scene, say
 
 
-def add_parser(commands) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     plane = commands.add_parser("plane", help="find the plane that an object of a scene rests on")
     add_scene_flags(plane)

@@ -7,13 +7,14 @@ import sys
 import time
 from pathlib import Path
 
+from egs_warp.commands.flags import Commands
 from egs_warp.errors import UserError
 
 _NAMED = 5
 """Photos without a pose that are named; the rest is counted."""
 
 
-def add_parser(commands) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     pose = commands.add_parser("pose", help="find where photos were taken from")
     pose.add_argument("photos", help="folder of photos, or a video")

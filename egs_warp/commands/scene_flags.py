@@ -12,6 +12,7 @@ import numpy as np
 
 from egs_warp.commands.flags import check_device, parse_plane, parse_up
 from egs_warp.commands.object_flag import read_object
+from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
@@ -31,6 +32,13 @@ class SceneInput:
     up: np.ndarray | None
     plane: Plane | None
     notes: tuple[str, ...]
+
+    @property
+    def object(self) -> ObjectSpec:
+        """What was said about it. Raises ``UserError`` if nothing was."""
+        if self.spec is None:
+            raise UserError("--object: nothing is given; say where the object is")
+        return self.spec
 
     @property
     def cameras(self) -> list[Camera]:

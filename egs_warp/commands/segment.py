@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from egs_warp.commands.flags import Commands
 from egs_warp.commands.scene_flags import add_scene_flags, read_scene, say
 
 if TYPE_CHECKING:
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
 METHODS = {"finetune": "FINETUNE", "split": "SPLIT", "remove": "REMOVE", "none": "NONE"}
 
 
-def add_parser(commands) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     segment = commands.add_parser("segment", help="take an object out of a scene")
     add_scene_flags(segment)
@@ -57,7 +58,7 @@ def _segment(chosen: argparse.Namespace) -> int:
     folder = writable_folder(chosen.out)
     scene = prepare_scene(
         given.cloud,
-        given.spec,
+        given.object,
         cameras=given.cameras,
         photographs=photographs_in_colours_of(given.cloud, given.posed),
         up=given.up,

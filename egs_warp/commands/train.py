@@ -5,20 +5,26 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from egs_warp.commands.flags import check_device
+from egs_warp.commands.flags import Commands, check_device
 from egs_warp.errors import UserError
+
+if TYPE_CHECKING:
+    from egs_warp.geometry.gaussians import GaussianCloud
+    from egs_warp.pipelines.train_capture import TrainResult
 
 _SHEET_PHOTOS = 6
 _DEFAULTS = {"cpu": (2000, 20_000, 360), "cuda": (7000, None, 1600)}
-"""Iterations, Gaussians, longer side in pixels: a preview in ten minutes on two cores, a capture in about two on a GPU."""
+"""Iterations, Gaussians, longer side in pixels: a preview on two cores, a capture on a GPU."""
 
 
-def add_parser(commands) -> None:
+def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     train = commands.add_parser("train", help="make a capture from posed photos")
     train.add_argument("posed", help="COLMAP model, transforms.json or cameras.json, or a folder that holds one")
@@ -87,9 +93,8 @@ def _train(chosen: argparse.Namespace) -> int:
     _write_sheet(folder / f"{stem}.sheet.png", result)
     for which, scores in report["mean"].items():
         if scores:
-            print(
-                f"{which.replace('_', ' ')}: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f} in each photo's exposure"
-            )
+            values = f"{scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f}"
+            print(f"{which.replace('_', ' ')}: {values} in each photo's exposure")
     print(f"wrote {chosen.out} ({result.cloud.count} Gaussians), {stem}.sheet.png, {stem}.report.json")
     return 0
 
@@ -140,7 +145,7 @@ def _colour(text: str) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def _writer(out: Path):
+def _writer(out: Path) -> Callable[[Path, GaussianCloud], None]:
     """The function that writes a capture to ``out``; refused now rather than after training."""
     from egs_warp import io
 
@@ -154,7 +159,7 @@ def _writer(out: Path):
     raise UserError(f"--out {out}: give a name that ends in {', '.join(writers)}")
 
 
-def _report(chosen: argparse.Namespace, result, progress: _Progress, seconds: float) -> dict:
+def _report(chosen: argparse.Namespace, result: TrainResult, progress: _Progress, seconds: float) -> dict:
     from egs_warp.pipelines.report import versions
 
     photo = result.views[0].camera
@@ -184,7 +189,7 @@ def _report(chosen: argparse.Namespace, result, progress: _Progress, seconds: fl
     }
 
 
-def _write_sheet(path: Path, result) -> None:
+def _write_sheet(path: Path, result: TrainResult) -> None:
     """Photo beside render, of photos held out where there are any."""
     from egs_warp.io.video import contact_sheet, write_png
     from egs_warp.render import render

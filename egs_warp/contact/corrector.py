@@ -47,10 +47,12 @@ def contact_step(
     outer_limit: int = 40,
     round_limit: int = 6,
 ) -> ContactStepResult:
-    """Minimise Phi under ``force`` (N, 3), the muscles' ``tension`` and the contact forces of ``points`` (n,), found with it.
+    """Minimise Phi under ``force`` (N, 3), the muscles' ``tension`` and the contact forces of ``points`` (n,), found
+    with it.
 
-    The forces are corrected with the Delassus operator of the current tangent until the end velocity obeys contact and friction; points
-    of the body that would end deeper than ``penetration_tolerance`` metres join the set. ``start_forces`` (n, 3) newtons.
+    The forces are corrected with the Delassus operator of the current tangent until the end velocity obeys contact and
+    friction; points of the body that would end deeper than ``penetration_tolerance`` metres join the set.
+    ``start_forces`` (n, 3) newtons.
     """
     body, dt = step.body, step.dt
     scale = np.sqrt(float(np.linalg.norm(body.gravity)) * body.height)

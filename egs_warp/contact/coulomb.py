@@ -16,10 +16,12 @@ def coulomb_forces(
     tolerance: float = 1e-12,
     iteration_limit: int = 60,
 ) -> tuple[np.ndarray, float]:
-    """Forces f (n, 3) with 0 <= f_n, 0 <= u_n + shift, complementary, and exact Coulomb friction; u = free + G f (Eq. 8, 9).
+    """Forces f (n, 3) with 0 <= f_n, 0 <= u_n + shift, complementary, and exact Coulomb friction; u = free + G f
+    (Eq. 8, 9).
 
-    ``delassus`` G (3n, 3n) m/(N s); ``free_velocity`` (3n,) m/s; ``shift`` (n,) m/s; ``start`` (n, 3). Semismooth Newton on the
-    projection equations of Alart and Curnier, started from block Gauss-Seidel. Returns the residual (m/s) too.
+    ``delassus`` G (3n, 3n) m/(N s); ``free_velocity`` (3n,) m/s; ``shift`` (n,) m/s; ``start`` (n, 3). Semismooth
+    Newton on the projection equations of Alart and Curnier, started from block Gauss-Seidel. Returns the residual (m/s)
+    too.
     """
     count = len(shift)
     if count == 0:
@@ -89,7 +91,15 @@ def _project(force: np.ndarray, normal: np.ndarray, friction: float) -> np.ndarr
     return projected
 
 
-def _gauss_seidel_sweep(delassus, blocks, rate, free_velocity, shift, friction, force) -> np.ndarray:
+def _gauss_seidel_sweep(
+    delassus: np.ndarray,
+    blocks: np.ndarray,
+    rate: np.ndarray,
+    free_velocity: np.ndarray,
+    shift: np.ndarray,
+    friction: float,
+    force: np.ndarray,
+) -> np.ndarray:
     force = force.copy()
     for i in range(len(shift)):
         velocity = free_velocity[3 * i : 3 * i + 3] + delassus[3 * i : 3 * i + 3] @ force.ravel()
@@ -103,7 +113,9 @@ def _gauss_seidel_sweep(delassus, blocks, rate, free_velocity, shift, friction, 
     return force
 
 
-def _projection_jacobian(delassus, rate, force, velocity, friction) -> np.ndarray:
+def _projection_jacobian(
+    delassus: np.ndarray, rate: np.ndarray, force: np.ndarray, velocity: np.ndarray, friction: float
+) -> np.ndarray:
     count = len(force)
     trial = force - rate[:, None] * velocity
     moved = np.eye(3 * count) - np.repeat(rate, 3)[:, None] * delassus

@@ -99,8 +99,8 @@ def contact_geometry(
     """Points of all T+ and T- (Eq. 3); endpoints below a plane at rest are shortened to it (DESIGN 7).
 
     ``planes`` bound half spaces, the first of them the ground; ``solids`` stand on it.
-    Only vertices of the convex hull of each tetrahedron's points are kept: a deformation is affine inside a tetrahedron, so
-    the deepest point of it is always one of those.
+    Only vertices of the convex hull of each tetrahedron's points are kept: a deformation is affine inside a
+    tetrahedron, so the deepest point of it is always one of those.
 
     Raises ``UserError`` for a solid that holds the body.
     """
@@ -115,8 +115,8 @@ def contact_geometry(
         above &= np.any([face.heights(means) >= 0.0 for face in solid.faces], axis=0)
         if np.count_nonzero(above) < least:
             raise UserError(
-                f"--terrain, solid {number}: the body is inside it; inside is where n.x + d < 0 for every face [nx, ny, nz, d]:"
-                " turn the signs of a face, or move the solid"
+                f"--terrain, solid {number}: the body is inside it; inside is where n.x + d < 0 for every face"
+                " [nx, ny, nz, d]: turn the signs of a face, or move the solid"
             )
     opacities = cloud.opacities()
     points = [means[above]]
@@ -263,7 +263,9 @@ def independent_contacts(compliance: np.ndarray, kept: int, limit: int, toleranc
 
 
 def push_out_speeds(gaps: np.ndarray, dt: float, cap: float, factor: float = 0.5) -> np.ndarray:
-    """(n,) constant of the normal measure c = N^T u' + min(phi, 0) b / dt + max(phi, 0) / dt, the push-out capped (DESIGN 7)."""
+    """(n,) constant of the normal measure c = N^T u' + min(phi, 0) b / dt + max(phi, 0) / dt,
+    the push-out capped (DESIGN 7).
+    """
     return np.maximum(gaps, 0.0) / dt + np.maximum(np.minimum(gaps, 0.0) * factor / dt, -cap)
 
 

@@ -28,7 +28,9 @@ class Prediction:
 
 @dataclass(frozen=True)
 class PenaltyContact:
-    """Normal force -k_n min(0, c) and friction of Huber slope min(k_f |u_t|, cap); c is the normal measure of DESIGN 7."""
+    """Normal force -k_n min(0, c) and friction of Huber slope min(k_f |u_t|, cap);
+    c is the normal measure of DESIGN 7.
+    """
 
     contacts: ContactSet
     step: ImplicitStep
@@ -118,7 +120,13 @@ def predict(
     shift = push_out_speeds(contacts.gaps, step.dt, push_out_cap)
     share = body.weight / max(contacts.count, 1)
     penalty = PenaltyContact(contacts, step, stiffness, shift, friction * np.maximum(normal_forces, 0.5 * share))
-    result = step.minimise(force, start, penalty if contacts.count else None, tension=tension, tolerance=1e-3)
+    result = step.minimise(
+        force,
+        start,
+        penalty if contacts.count else None,  # pyright: ignore[reportArgumentType]  # the same three functions
+        tension=tension,
+        tolerance=1e-3,
+    )
     velocities = result.velocities
     forces = penalty.forces(velocities)
     tangent = (contacts.frame @ velocities.ravel()).reshape(-1, 3)[:, 1:]

@@ -1,4 +1,6 @@
-"""Solid things beside the ground that a body can touch: steps, walls, tilted floors, each an intersection of half spaces."""
+"""Solid things beside the ground that a body can touch:
+steps, walls, tilted floors, each an intersection of half spaces.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ class Solid:
         return Solid(tuple(face.scaled(factor) for face in self.faces))
 
     def top(self, point: np.ndarray, up: np.ndarray) -> float:
-        """How far along ``up`` (3,) from ``point`` (3,) the solid ends; -inf where it is not above or below the point."""
+        """How far along ``up`` (3,) from ``point`` (3,) the solid ends;
+        -inf where it is not above or below the point.
+        """
         low, high = -np.inf, np.inf
         for face in self.faces:
             height, slope = float(face.heights(point)), float(face.normal @ up)
@@ -50,7 +54,8 @@ def step(ground: Plane, edge: np.ndarray, forward: np.ndarray, height: float) ->
 def read_terrain(path: Path) -> tuple[Solid, ...]:
     """Solids from JSON, in the units of the capture: a list of solids, each a list of faces [nx, ny, nz, d].
 
-    A point is inside where n.x + d < 0 for every face. Raises ``UserError`` for the first malformed entry, with its place.
+    A point is inside where n.x + d < 0 for every face. Raises ``UserError`` for the first malformed entry, with its
+    place.
     """
     entries = parse_json(read_text(path), path)
     if not isinstance(entries, list) or not entries:

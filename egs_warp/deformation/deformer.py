@@ -16,14 +16,16 @@ from egs_warp.kernels.deformation import carried_cage
 from egs_warp.kernels.deformation import deformer as kernels
 from egs_warp.kernels.deformation import deformer_cuda as kernels_cuda
 from egs_warp.kernels.deformation.spherical_harmonics import rotate_sh_kernel
-from egs_warp.launching import launch_rows
+from egs_warp.launching import empty, launch_rows, zeros
 from egs_warp.precision import Vec3
 
 MAX_STRETCH = 1.5
 """An arm may be stretched this many times more than the matter at its two ends; beyond that it would be a spike."""
 
 LEAST_BRIDGE = 1e-3
-"""Arms shorter than this, over the cage's diagonal, are never carried by a difference of positions: float32 is too coarse."""
+"""Arms shorter than this, over the cage's diagonal, are never carried by a difference of positions:
+float32 is too coarse.
+"""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,9 @@ class DeformedGaussians:
     cloud: GaussianCloud
     """(n,) at their new places. ``opacity_logits`` is the rest cloud's own array."""
     turns: wp.array
-    """(n,) vec4, unit quaternions w, x, y, z: the rotation R_polar of F by which each Gaussian and its colour were turned."""
+    """(n,) vec4, unit quaternions w, x, y, z:
+    the rotation R_polar of F by which each Gaussian and its colour were turned.
+    """
 
 
 @dataclass(frozen=True)
@@ -54,15 +58,15 @@ class CageCarrier:
     def __init__(self, cage: CageLocator) -> None:
         self._cage = cage
         tet_count = len(cage.mesh.tets)
-        with wp.ScopedDevice(cage.tets.device):
+        with wp.ScopedDevice(cage.device):
             self._rest = wp.array(cage.mesh.nodes, dtype=Vec3)
             self._carried = carried_cage.CarriedCage()
-            self._carried.maps = wp.empty(3 * tet_count, dtype=wp.vec4)
-            self._carried.frames = wp.empty(2 * tet_count, dtype=wp.vec4)
+            self._carried.maps = empty(3 * tet_count, wp.vec4, cage.device)
+            self._carried.frames = empty(2 * tet_count, wp.vec4, cage.device)
 
     def carry(self, positions: wp.array | np.ndarray) -> Any:
         """A ``CarriedCage`` for node ``positions``, as for ``Deformer.deform``."""
-        cage, device = self._cage, self._cage.tets.device
+        cage, device = self._cage, self._cage.device
         launch_rows(
             carried_cage.carry_tets_kernel,
             len(cage.mesh.tets),
@@ -90,10 +94,10 @@ class Deformer:
         self._carrier = CageCarrier(embedding.cage)
         with wp.ScopedDevice(cloud.device):
             self._plan = carried_cage.ArmPlan()
-            self._plan.mean_tets = wp.empty(cloud.count, dtype=wp.int32)
-            self._plan.end_tets = wp.empty((6, cloud.count), dtype=wp.int32)
-            self._plan.shares = wp.empty((6, cloud.count), dtype=wp.float32)
-            self._plan.bulges = wp.empty((3, cloud.count), dtype=wp.float32)
+            self._plan.mean_tets = empty(cloud.count, wp.int32, cloud.device)
+            self._plan.end_tets = empty((6, cloud.count), wp.int32, cloud.device)
+            self._plan.shares = empty((6, cloud.count), wp.float32, cloud.device)
+            self._plan.bulges = empty((3, cloud.count), wp.float32, cloud.device)
             self._deformed = DeformedGaussians(
                 GaussianCloud(
                     means=wp.empty_like(cloud.means),
@@ -103,7 +107,7 @@ class Deformer:
                     # Band 0 never changes; without higher bands the colour is the rest cloud's own.
                     sh=wp.clone(cloud.sh) if self._degree else cloud.sh,
                 ),
-                turns=wp.empty(cloud.count, dtype=wp.vec4),
+                turns=empty(cloud.count, wp.vec4, cloud.device),
             )
         points, cage = embedding.points, embedding.cage
         launch_rows(
@@ -145,10 +149,8 @@ class Deformer:
     def measure_bend(self, frames: Iterable[wp.array | np.ndarray]) -> BendMeasure:
         """The most that any of ``frames``, each as ``positions`` of ``deform``, bends each Gaussian (Eq. 16)."""
         count = self.rest.count
-        with wp.ScopedDevice(self.rest.device):
-            bend = wp.zeros(count, dtype=wp.float32)
-            curl = wp.zeros(count, dtype=wp.vec3)
-            error = wp.zeros(count, dtype=wp.vec3)
+        bend = zeros(count, wp.float32, self.rest.device)
+        curl, error = (zeros(count, wp.vec3, self.rest.device) for _ in range(2))
         for positions in frames:
             launch_rows(
                 kernels.measure_bend_kernel,

@@ -11,7 +11,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.kernels.deformation import embedding as kernels
-from egs_warp.launching import launch_rows
+from egs_warp.launching import device_of, empty, launch_rows
 from egs_warp.precision import Mat33, Vec3, Vec4
 
 UNSCENTED_GAMMA = 3.0**0.5
@@ -41,13 +41,14 @@ class PointEmbedding:
 
     def interpolate(self, positions: wp.array) -> wp.array:
         """(P,) vec3d: the points for node positions (N,) vec3d (Eq. 2)."""
-        points = wp.empty(self.count, dtype=Vec3, device=self.tets.device)
+        device = device_of(self.tets)
+        points = empty(self.count, Vec3, device)
         launch_rows(
             kernels.interpolate_points_kernel,
             self.count,
             inputs=[self.nodes, self.weights, positions],
             outputs=[points],
-            device=self.tets.device,
+            device=device,
         )
         return points
 
@@ -96,7 +97,7 @@ class CageLocator:
     def locate_gaussians(self, cloud: GaussianCloud, gamma: float) -> tuple[PointEmbedding, wp.array]:
         """Embed the seven points of each Gaussian; see ``embed_gaussians``. Returns (7n rows, arm lengths (n, 6))."""
         embedding = self._empty_embedding(7 * cloud.count)
-        arms = wp.empty((cloud.count, 6), dtype=wp.float32, device=self.device)
+        arms = empty((cloud.count, 6), wp.float32, self.device)
         launch_rows(
             kernels.embed_gaussians_kernel,
             embedding.count,
@@ -115,7 +116,7 @@ class CageLocator:
 
     def nearest_faces(self, points: wp.array) -> wp.array:
         """(P,) int32, the row of ``mesh.boundary_faces()`` nearest to each of ``points`` (P,) vec3, in float32."""
-        faces = wp.empty(points.shape[0], dtype=wp.int32, device=self.device)
+        faces = empty(points.shape[0], wp.int32, self.device)
         launch_rows(
             kernels.nearest_face_kernel,
             points.shape[0],
@@ -126,13 +127,12 @@ class CageLocator:
         return faces
 
     def _empty_embedding(self, count: int) -> PointEmbedding:
-        with wp.ScopedDevice(self.device):
-            return PointEmbedding(
-                tets=wp.empty(count, dtype=wp.int32),
-                nodes=wp.empty(count, dtype=wp.vec4i),
-                weights=wp.empty(count, dtype=Vec4),
-                inside=wp.empty(count, dtype=wp.bool),
-            )
+        return PointEmbedding(
+            tets=empty(count, wp.int32, self.device),
+            nodes=empty(count, wp.vec4i, self.device),
+            weights=empty(count, Vec4, self.device),
+            inside=empty(count, wp.bool, self.device),
+        )
 
     def _search_inputs(self) -> list[object]:
         return [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import Enum
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -15,7 +16,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.kernels.deformation import peers as kernels
 from egs_warp.kernels.deformation.spherical_harmonics import rotate_sh_kernel
-from egs_warp.launching import launch_rows
+from egs_warp.launching import empty, launch_rows
 from egs_warp.precision import Vec3
 
 LOCAL_REACH = 3.0 / np.sqrt(3.0)
@@ -51,8 +52,8 @@ def carry(
 ) -> list[GaussianCloud]:
     """The cloud in each of ``frames``: node positions (N, 3) or (N,) vec3d, metres, of the cage ``mesh``.
 
-    ``rule``, ``threshold_degrees``, ``min_error``, ``max_depth`` and ``max_growth`` are those of ``split_for_motion`` and
-    matter to ``BIDIRECTIONAL``.
+    ``rule``, ``threshold_degrees``, ``min_error``, ``max_depth`` and ``max_growth`` are those of ``split_for_motion``
+    and matter to ``BIDIRECTIONAL``.
     """
     cage = mesh if isinstance(mesh, CageLocator) else CageLocator(mesh, device=cloud.device)
     if method in (CarryMethod.BIDIRECTIONAL, CarryMethod.BIDIRECTIONAL_NO_SPLIT):
@@ -86,7 +87,7 @@ class _Peer:
                 self._rest = wp.array(cage.mesh.nodes, dtype=Vec3)
                 self._face_from_gaussian = cage.nearest_faces(cloud.means)
             elif method is CarryMethod.LOCAL_TETRAHEDRON:
-                corners = wp.empty(4 * cloud.count, dtype=Vec3)
+                corners = empty(4 * cloud.count, Vec3, cloud.device)
                 self._launch(
                     kernels.local_tetrahedron_kernel,
                     [cloud.means, cloud.rotations, cloud.log_scales, LOCAL_REACH, self._least_length],
@@ -102,7 +103,7 @@ class _Peer:
     def _least_length(self) -> float:
         return 1e-6 * self._cage.extent
 
-    def _launch(self, kernel: wp.Kernel, inputs: list[object], outputs: list[object]) -> None:
+    def _launch(self, kernel: Any, inputs: Sequence[object], outputs: Sequence[object]) -> None:
         launch_rows(kernel, self._cloud.count, inputs=inputs, outputs=outputs, device=self._cloud.device)
 
     def deform(self, positions: wp.array | np.ndarray) -> DeformedGaussians:
@@ -116,7 +117,7 @@ class _Peer:
             opacity_logits=rest.opacity_logits,
             sh=wp.clone(rest.sh),
         )
-        turns = wp.empty(rest.count, dtype=wp.vec4, device=rest.device)
+        turns = empty(rest.count, wp.vec4, rest.device)
         outputs = [cloud.means, cloud.rotations, cloud.log_scales, turns]
         shape = [rest.rotations, rest.log_scales]
         if self._method is CarryMethod.SURFACE:

@@ -13,14 +13,15 @@ from egs_warp.deformation.deformer import BendMeasure, Deformer
 from egs_warp.deformation.embedding import GaussianEmbedding, embed_gaussians
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.kernels.deformation.splitting import split_kernel
-from egs_warp.launching import launch_rows
+from egs_warp.launching import empty, launch_rows
 
 MIN_OPACITY = 2.0 / 255.0
 """A Gaussian that never exceeds this cannot be seen to be wrong."""
 
 SPLIT_DEGREES = 4.0
-"""Ends of an axis turned against each other by less than this are left alone. With arms of sqrt 3 standard deviations; the
-paper's 15 degrees at 3 are 9 here, which gave 0.01 to 0.02 dB less on Table 1's chair, and more where finer misfits split."""
+"""Ends of an axis turned against each other by less than this are left alone. With arms of sqrt 3 standard deviations;
+the paper's 15 degrees at 3 are 9 here, which gave 0.01 to 0.02 dB less on Table 1's chair, and more where finer misfits
+split."""
 
 LEAST_MISFIT = 7e-4
 """Over the cage's diagonal: an affine motion that is wrong by less than this is good enough. Less would follow a motion
@@ -31,8 +32,8 @@ class SplitRule(Enum):
     """Which Gaussians split, along which axis, and into what. Every rule keeps mass, mean and covariance exactly."""
 
     MEASURED = "measured"
-    """Three children at -s, 0, s with standard deviation s/sqrt 2 (mixture weights 1/4, 1/2, 1/4), with the opacities of
-    least image error; along the axis whose misfit is largest, where that misfit can be seen."""
+    """Three children at -s, 0, s with standard deviation s/sqrt 2 (mixture weights 1/4, 1/2, 1/4), with the opacities
+    of least image error; along the axis whose misfit is largest, where that misfit can be seen."""
     PAPER = "paper"
     """Two children of half-normal mean and variance (Eq. 17 with kappa = gamma sqrt(pi/2)), across the longest axis."""
 
@@ -84,7 +85,9 @@ _OPACITIES = np.array(
 
 
 def child_layout(rule: SplitRule) -> tuple[np.ndarray, float]:
-    """Offsets (k,) of the children, and their standard deviation, both in standard deviations of the parent (Eq. 17)."""
+    """Offsets (k,) of the children, and their standard deviation,
+    both in standard deviations of the parent (Eq. 17).
+    """
     if rule is SplitRule.PAPER:
         return np.array([-1.0, 1.0]) * np.sqrt(2.0 / np.pi), float(np.sqrt(1.0 - 2.0 / np.pi))
     return np.array([-1.0, 0.0, 1.0]), float(np.sqrt(0.5))
@@ -116,11 +119,11 @@ def split_bent(
 ) -> SplitGaussians:
     """Replace each Gaussian that ``bend`` marks by its children, once (Eq. 17). Everything stays at rest.
 
-    ``MEASURED`` marks an axis whose ends are turned against each other by more than ``threshold_degrees``, if the affine
-    motion is wrong by more than ``min_error`` metres at one standard deviation (default: ``LEAST_MISFIT`` of the cage's
-    diagonal). ``PAPER`` marks theta of Eq. (16) alone. ``parents`` and ``depths``
-    (n,) are those of an earlier call; a Gaussian of ``max_depth`` is not split again. Where there would be more than
-    ``max_count`` Gaussians, those with the largest misfit are split.
+    ``MEASURED`` marks an axis whose ends are turned against each other by more than ``threshold_degrees``, if the
+    affine motion is wrong by more than ``min_error`` metres at one standard deviation (default: ``LEAST_MISFIT`` of the
+    cage's diagonal). ``PAPER`` marks theta of Eq. (16) alone. ``parents`` and ``depths`` (n,) are those of an earlier
+    call; a Gaussian of ``max_depth`` is not split again. Where there would be more than ``max_count`` Gaussians, those
+    with the largest misfit are split.
     """
     count = cloud.count
     parents = np.arange(count, dtype=np.int32) if parents is None else parents
@@ -210,11 +213,11 @@ def _gather(
     count = len(sources)
     with wp.ScopedDevice(cloud.device):
         result = GaussianCloud(
-            means=wp.empty(count, dtype=wp.vec3),
-            rotations=wp.empty(count, dtype=wp.vec4),
-            log_scales=wp.empty(count, dtype=wp.vec3),
+            means=empty(count, wp.vec3, cloud.device),
+            rotations=empty(count, wp.vec4, cloud.device),
+            log_scales=empty(count, wp.vec3, cloud.device),
             opacity_logits=wp.array(opacity_logits, dtype=wp.float32),
-            sh=wp.empty((count, cloud.sh.shape[1]), dtype=wp.vec3),
+            sh=empty((count, cloud.sh.shape[1]), wp.vec3, cloud.device),
         )
         plan = [wp.array(sources, dtype=wp.int32), wp.array(axes, dtype=wp.int32), wp.array(offsets, dtype=wp.float32)]
     launch_rows(

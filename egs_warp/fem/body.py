@@ -110,13 +110,13 @@ def make_body(
 ) -> SoftBody:
     """A body whose elasticity follows from its own height H: E = density g H / sag, that of a column (DESIGN 4).
 
-    A body on thin legs would sink further into them than a column does; it is stiffened until its centre of mass sinks by no
-    more than ``LARGEST_SINK`` H under its weight.
+    A body on thin legs would sink further into them than a column does; it is stiffened until its centre of mass sinks
+    by no more than ``LARGEST_SINK`` H under its weight.
 
     ``up`` (3,) is against gravity where the ground is a slope. Raises ``UserError`` for a height that no body has.
 
-    ``damping_ratio`` is that of the first mode of the body held at its base (nodes within 5 % of H above the plane); it sets the
-    Rayleigh coefficient beta.
+    ``damping_ratio`` is that of the first mode of the body held at its base (nodes within 5 % of H above the plane); it
+    sets the Rayleigh coefficient beta.
     """
     heights = plane.heights(mesh.nodes)
     height = float(heights.max() - heights.min())

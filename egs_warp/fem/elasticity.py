@@ -37,6 +37,19 @@ class Material:
         return self.young_modulus * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
 
 
+@dataclass(frozen=True)
+class Damping:
+    """What the damping of one step resists: the change of strain since the step's start (docs: body).
+
+    It is blind to rotations however large, so a spin is not damped.
+    """
+
+    dt: float
+    """Seconds of the step."""
+    start_gradients: wp.array
+    """(T,) deformation gradients at its start."""
+
+
 class ElasticAssembly:
     """Kernels, index maps and scratch memory for one mesh. Node arrays go in and out as (N, 3) float64 on the host."""
 
@@ -48,7 +61,7 @@ class ElasticAssembly:
         self._tets = wp.array(mesh.tets, dtype=wp.vec4i, device=device)
         self._rest_inverses = wp.array(np.linalg.inv(edges), dtype=Mat33, device=device)
         self._volumes = wp.array(mesh.volumes(), dtype=real, device=device)
-        self._start_gradients = wp.array(np.tile(np.eye(3), (tet_count, 1, 1)), dtype=Mat33, device=device)
+        self._no_gradients = wp.empty(0, dtype=Mat33, device=device)
         self._positions = wp.zeros(node_count, dtype=Vec3, device=device)
         self._energies = wp.zeros(tet_count, dtype=real, device=device)
         self._determinants = wp.zeros(tet_count, dtype=real, device=device)
@@ -98,7 +111,9 @@ class ElasticAssembly:
         self._entries = wp.zeros(pattern.nnz, dtype=real, device=self.device)
 
     def entries_of_node_pairs(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """(m, 9) indices into the upper matrix's entries of the 3x3 blocks of node pairs first <= second; -1 where absent."""
+        """(m, 9) indices into the upper matrix's entries of the 3x3 blocks of node pairs first <= second;
+        -1 where absent.
+        """
         keys = first.astype(np.int64) * len(self.mesh.nodes) + second
         return self._entry_from_block_host[np.searchsorted(self._block_keys, keys)]
 
@@ -110,15 +125,25 @@ class ElasticAssembly:
         material = self.material
         return [self._tets, self._rest_inverses, self._volumes, material.mu, material.lam, material.damping_time]
 
-    def begin_step(self, positions: np.ndarray) -> None:
-        """Remember the deformation gradients of the step's start: damping resists the change of strain from here (DESIGN 5)."""
+    def damping(self, positions: np.ndarray, dt: float) -> Damping:
+        """Of a step of ``dt`` seconds that starts at ``positions`` (N, 3)."""
+        gradients = wp.empty(len(self.mesh.tets), dtype=Mat33, device=self.device)
         self._upload(self._positions, positions)
         wp.launch(
             kernels.deformation_gradients_kernel,
             dim=len(self.mesh.tets),
             inputs=[self._tets, self._rest_inverses, self._positions],
-            outputs=[self._start_gradients],
+            outputs=[gradients],
             device=self.device,
+        )
+        return Damping(dt, gradients)
+
+    def _damping_inputs(self, damping: Damping | None) -> list:
+        # A kernel that is told no step does not read the gradients.
+        return (
+            [self._no_gradients, self._positions, 0.0]
+            if damping is None
+            else [damping.start_gradients, self._positions, damping.dt]
         )
 
     def determinants(self, positions: np.ndarray) -> np.ndarray:
@@ -126,29 +151,29 @@ class ElasticAssembly:
         self.energy(positions)
         return self._determinants.numpy().copy()
 
-    def energy(self, positions: np.ndarray, dt: float = 0.0) -> float:
+    def energy(self, positions: np.ndarray, damping: Damping | None = None) -> float:
         """Psi(positions), joules; infinite if an element is inverted.
 
-        With ``dt``, plus dt beta/2 sum V E':C:E', where E' = (F^T F - F0^T F0) / (2 dt) is the mean strain rate since
-        ``begin_step``. It is blind to rotations however large, so a spin is not damped (DESIGN 5).
+        With ``damping``, plus dt beta/2 sum V E':C:E', where E' = (F^T F - F0^T F0) / (2 dt) is the mean strain rate of
+        the step.
         """
         self._upload(self._positions, positions)
         wp.launch(
             kernels.element_energies_kernel,
             dim=len(self.mesh.tets),
-            inputs=[*self._model, self._start_gradients, self._positions, dt],
+            inputs=[*self._model, *self._damping_inputs(damping)],
             outputs=[self._energies, self._determinants],
             device=self.device,
         )
         return float(self._energies.numpy().sum())
 
-    def gradient(self, positions: np.ndarray, dt: float = 0.0) -> np.ndarray:
+    def gradient(self, positions: np.ndarray, damping: Damping | None = None) -> np.ndarray:
         """(N, 3) newtons: the derivative of ``energy`` by the positions, minus the internal force."""
         self._upload(self._positions, positions)
         wp.launch(
             kernels.element_gradients_kernel,
             dim=len(self.mesh.tets),
-            inputs=[*self._model, self._start_gradients, self._positions, dt],
+            inputs=[*self._model, *self._damping_inputs(damping)],
             outputs=[self._corner_gradients],
             device=self.device,
         )
@@ -162,7 +187,7 @@ class ElasticAssembly:
         return self._node_gradients.numpy().copy()
 
     def matrix_entries(
-        self, positions: np.ndarray, dt: float = 0.0, *, factor: float = 1.0, projected: bool = False
+        self, positions: np.ndarray, damping: Damping | None = None, *, factor: float = 1.0, projected: bool = False
     ) -> np.ndarray:
         """Entries of ``factor`` times the second derivative of ``energy`` in the order of ``upper_pattern``.
 
@@ -173,7 +198,7 @@ class ElasticAssembly:
         wp.launch(
             hessian,
             dim=len(self.mesh.tets),
-            inputs=[*self._model, self._start_gradients, self._positions, dt],
+            inputs=[*self._model, *self._damping_inputs(damping)],
             outputs=[self._blocks],
             device=self.device,
         )

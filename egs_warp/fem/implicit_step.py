@@ -50,10 +50,11 @@ class PenaltyTerms:
 
 @dataclass
 class ImplicitStep:
-    """The function Phi of one step (DESIGN 5) and its minimisation; forces and muscle tensions are constant over the step.
+    """The function Phi of one step (DESIGN 5) and its minimisation; forces and muscle tensions are constant over the
+    step.
 
-    Phi(v) = 1/2 (v-v0)^T M (v-v0) + Psi(p + dt v) + dt beta/2 sum V E':C:E' - dt v^T f, E' the mean strain rate of the step;
-    ``minimise`` adds the energy of the muscles, V(p + dt v).
+    Phi(v) = 1/2 (v-v0)^T M (v-v0) + Psi(p + dt v) + dt beta/2 sum V E':C:E' - dt v^T f, E' the mean strain rate of the
+    step; ``minimise`` adds the energy of the muscles, V(p + dt v).
     """
 
     body: SoftBody
@@ -69,7 +70,7 @@ class ImplicitStep:
     newton_iterations: int = field(default=0, init=False)
 
     def __post_init__(self) -> None:
-        self.body.assembly.begin_step(self.state.positions)
+        self._damping = self.body.assembly.damping(self.state.positions, self.dt)
         self._mass = self.body.node_mass[:, None]
 
     def end_positions(self, velocities: np.ndarray) -> np.ndarray:
@@ -79,22 +80,24 @@ class ImplicitStep:
     def energy(self, velocities: np.ndarray, force: np.ndarray) -> float:
         """Phi, joules; infinite where an element is inverted."""
         change = velocities - self.state.velocities
-        elastic = self.body.assembly.energy(self.end_positions(velocities), self.dt)
+        elastic = self.body.assembly.energy(self.end_positions(velocities), self._damping)
         inertia = 0.5 * float((self._mass * change**2).sum())
         drag = 0.5 * self.dt * self.drag * float((self._mass * velocities**2).sum())
         return inertia + elastic + drag - self.dt * float((velocities * force).sum())
 
     def gradient(self, velocities: np.ndarray, force: np.ndarray) -> np.ndarray:
         """(N, 3) dPhi/dv, N s."""
-        internal = self.body.assembly.gradient(self.end_positions(velocities), self.dt)
+        internal = self.body.assembly.gradient(self.end_positions(velocities), self._damping)
         inertia = self._mass * (velocities - self.state.velocities + self.dt * self.drag * velocities)
         return inertia + self.dt * (internal - force)
 
     def matrix_entries(self, velocities: np.ndarray, *, projected: bool) -> np.ndarray:
-        """Upper entries of S = (1 + dt alpha) M + dt C + dt^2 K, the second derivative of Phi, at the end positions of ``velocities``."""
+        """Upper entries of S = (1 + dt alpha) M + dt C + dt^2 K, the second derivative of Phi,
+        at the end positions of ``velocities``.
+        """
         assembly = self.body.assembly
         entries = assembly.matrix_entries(
-            self.end_positions(velocities), self.dt, factor=self.dt**2, projected=projected
+            self.end_positions(velocities), self._damping, factor=self.dt**2, projected=projected
         )
         entries[assembly.diagonal_entries] += (1.0 + self.dt * self.drag) * np.repeat(self.body.node_mass, 3)
         return entries
@@ -138,9 +141,9 @@ class ImplicitStep:
     def tangent(self, velocities: np.ndarray, tension: MuscleTension | None) -> Callable[[np.ndarray], np.ndarray]:
         """Inverse of the tangent S + dt^2 K at ``velocities``, K of the muscles: takes and gives columns (3N, m).
 
-        The elements that muscles compress lose of their stiffness what the tension adds, so S alone is often indefinite where the sum
-        is not; the sum is inverted from the indefinite factors (Woodbury). Where it is indefinite too, the projected S alone stands
-        for both.
+        The elements that muscles compress lose of their stiffness what the tension adds, so S alone is often indefinite
+        where the sum is not; the sum is inverted from the indefinite factors (Woodbury). Where it is indefinite too,
+        the projected S alone stands for both.
         """
         definite = self.factorisation.update(self.matrix_entries(velocities, projected=False))
         across, rates = np.zeros((0, 0)), np.zeros(0)
@@ -153,7 +156,8 @@ class ImplicitStep:
             small = across.T @ through
             small[np.diag_indices_from(small)] += 1.0 / (self.dt**2 * rates)
             small = 0.5 * (small + small.T)
-            # Haynsworth: negative eigenvalues of the sum = those of S + positive ones of the small matrix - pulling directions.
+            # Haynsworth: negative eigenvalues of the sum = those of S + positive ones of the small matrix - pulling
+            # directions.
             positive = int((np.linalg.eigvalsh(small) > 0.0).sum())
             if self.factorisation.negative_pivots + positive == int((rates > 0.0).sum()):
 
@@ -168,7 +172,8 @@ class ImplicitStep:
     def _conjugate_gradients(
         self, entries: np.ndarray, stiffness: TensionStiffness, right: np.ndarray
     ) -> np.ndarray | None:
-        """x of (S + dt^2 K) x = ``right`` (N, 3), K of the muscles, with the factored S for a preconditioner; None if not definite.
+        """x of (S + dt^2 K) x = ``right`` (N, 3), K of the muscles, with the factored S for a preconditioner; None if
+        not definite.
 
         K joins nodes far apart: added to the matrix it would fill the factor, so it is only ever multiplied with.
         """
@@ -209,7 +214,9 @@ class ImplicitStep:
         tension: MuscleTension | None = None,
         tolerance: float | None = None,
     ) -> NewtonResult:
-        """Newton with a line search that stays feasible (J > 0), from ``start`` (N, 3) under ``force`` (N, 3) newtons."""
+        """Newton with a line search that stays feasible (J > 0),
+        from ``start`` (N, 3) under ``force`` (N, 3) newtons.
+        """
         tolerance = self.tolerance if tolerance is None else tolerance
 
         def phi(v: np.ndarray) -> float:
@@ -267,7 +274,8 @@ def conserve_angular_momentum(
 ) -> tuple[np.ndarray, float]:
     """Velocities (N, 3) whose spin obeys L+ = L + dt sum (x - c) x f with the arms of the step's start (DESIGN 5).
 
-    ``external`` (N, 3) newtons: forces that carry torque (contact, drag). Also returns the size of the added spin, rad/s.
+    ``external`` (N, 3) newtons: forces that carry torque (contact, drag). Also returns the size of the added spin,
+    rad/s.
     """
     arms = before.positions - body.centre_of_mass(before.positions)
     target = body.angular_momentum(before.positions, before.velocities) + dt * np.cross(arms, external).sum(axis=0)

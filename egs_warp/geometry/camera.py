@@ -42,7 +42,9 @@ class Camera:
         near: float = 0.01,
         far: float = 1e6,
     ) -> Camera:
-        """Camera at ``eye`` that looks at ``target`` with ``up`` (not parallel to the view) pointing up in the image."""
+        """Camera at ``eye`` that looks at ``target`` with ``up`` (not parallel to the view)
+        pointing up in the image.
+        """
         forward = np.asarray(target, float) - np.asarray(eye, float)
         forward /= np.linalg.norm(forward)
         right = np.cross(forward, np.asarray(up, float))

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from egs_warp.errors import UserError
+from egs_warp.launching import device_of
 
 SH_BAND_0 = 0.28209479177387814
 """Spherical harmonic of band 0: a colour is 1/2 + SH_BAND_0 x its coefficient, higher bands apart."""
@@ -89,7 +90,7 @@ class GaussianCloud:
     @property
     def device(self) -> wp.Device:
         """The Warp device of every array."""
-        return self.means.device
+        return device_of(self.means)
 
     def opacities(self) -> np.ndarray:
         """(n,) float64 on the host, 0 to 1."""

@@ -106,7 +106,7 @@ class Straightening:
         return _straightening(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, lens)
 
     def picture(self, pixels: np.ndarray) -> np.ndarray:
-        """The ``pixels`` (H, W) or (H, W, 3) of a photo straightened, in their own type; zero where nothing is known."""
+        """The ``pixels`` (H, W) or (H, W, 3) of a photo straightened, in their type; zero where nothing is known."""
         return self._moved(pixels, cv2.INTER_LINEAR)
 
     def mask(self, mask: np.ndarray) -> np.ndarray:

@@ -21,7 +21,9 @@ class Plane:
 
     @classmethod
     def from_coefficients(cls, nx: float, ny: float, nz: float, d: float) -> Plane:
-        """Plane nx x + ny y + nz z + d = 0, scaled to a unit normal. Raises ``UserError`` for a zero or non-finite one."""
+        """Plane nx x + ny y + nz z + d = 0, scaled to a unit normal.
+        Raises ``UserError`` for a zero or non-finite one.
+        """
         normal = np.array([nx, ny, nz], dtype=np.float64)
         with np.errstate(over="ignore", invalid="ignore"):
             length = float(np.linalg.norm(normal))

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.bitmaps import depth_inside, distance_to
-from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.rectified import PlaneWindow, rectify
@@ -25,7 +25,9 @@ _TEXELS = 256
 _CONTACT = 0.05
 """Of the object's height: what of it lies lower hides the floor from every side."""
 _LOW = 0.08
-"""Of the object's size: under what it has below this height the floor is unseen, or seen so badly that it is smeared."""
+"""Of the object's size: under what it has below this height the floor is unseen,
+or seen so badly that it is smeared.
+"""
 _LOW_TEXELS = 200
 """Across the window of the hole under an object."""
 _BRIDGED = 0.1
@@ -62,7 +64,9 @@ class Hole:
         return self.window.points(middle)[0], float(side) * self.window.texel
 
     def facts(self) -> dict[str, Any]:
-        """What ``plane.json`` says of it: its outlines, in columns and rows of the window, whose middle is ``centre``."""
+        """What ``plane.json`` says of it: its outlines, in columns and rows of the window,
+        whose middle is ``centre``.
+        """
         outlines, _ = cv2.findContours(self.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
         return {
             "centre": self.window.centre.tolist(),
@@ -94,7 +98,9 @@ class Hole:
 
 
 def disc(plane: Plane, centre: np.ndarray, radius: float) -> Hole:
-    """A round hole about ``centre`` (3,), dropped onto the plane. Raises ``UserError`` unless the radius is positive."""
+    """A round hole about ``centre`` (3,), dropped onto the plane.
+    Raises ``UserError`` unless the radius is positive.
+    """
     if not (np.isfinite(radius) and radius > 0.0 and np.isfinite(centre).all()):
         raise UserError(f"inpaint: the hole's radius {radius:g} must be a positive number and its centre finite")
     window = _window(plane, np.asarray(centre, float), 2.0 * radius)
@@ -133,7 +139,9 @@ def footprint(thing: GaussianCloud, plane: Plane) -> Hole:
 
 
 def hole_under(cloud: GaussianCloud, plane: Plane, found: Segmentation) -> Hole:
-    """Where the floor is missing: the outline of the object's low part and of what was dropped from under it, filled."""
+    """Where the floor is missing: the outline of the object's low part and of what was dropped from under it,
+    filled.
+    """
     means = cloud.means.numpy().astype(np.float64)
     low = found.buried_mask | (found.object_mask & (plane.heights(means) < _LOW * found.size))
     middle = 0.5 * (means[low].min(axis=0) + means[low].max(axis=0))
@@ -188,9 +196,7 @@ def unseen(plane: Plane, views: Sequence[MaskedView]) -> Hole:
 
 def _on_plane(plane: Plane, camera: Camera, mask: np.ndarray) -> np.ndarray:
     """(n, 3) points of the plane behind the pixels of ``mask``; none for those that miss it."""
-    rows, columns = np.nonzero(mask)
-    rays = np.stack([(columns + 0.5 - camera.cx) / camera.fx, (rows + 0.5 - camera.cy) / camera.fy, np.ones(len(rows))])
-    rays = rays.T @ camera.rotation
+    rays = camera_rays(camera)[mask]
     slope = rays @ plane.normal
     height = float(plane.heights(camera.centre))
     meets = slope * height < 0.0

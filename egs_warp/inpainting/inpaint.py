@@ -26,8 +26,8 @@ from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, matte, re
 from egs_warp.segmentation.plane_search import near_plane
 
 _MARGIN = 0.01
-"""Of the hole's side: the floor at its very edge is stained by the object and by its shadow; gaps in the floor that touch
-the hole join it anyway. With 0.03 and more, a sheet under a plush toy lost part of its edge."""
+"""Of the hole's side: the floor at its very edge is stained by the object and by its shadow; gaps in the floor that
+touch the hole join it anyway. With 0.03 and more, a sheet under a plush toy lost part of its edge."""
 _THICKNESS = 0.15
 """Of the hole's side: what lies nearer to the plane is floor."""
 _HAZE = 0.25
@@ -201,8 +201,8 @@ def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _void(missing: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool: the part of ``missing`` floor that lies beyond the floor's edge. What hangs together with it
-    by a thin channel only is a gap."""
+    """(rows, columns) bool: the part of ``missing`` floor that lies beyond the floor's edge. What hangs together with
+    it by a thin channel only is a gap."""
     wide, _ = connected_parts(depth_inside(np.pad(missing, 1, mode="edge")) > _CHANNEL)
     edges = np.concatenate([wide[0], wide[-1], wide[:, 0], wide[:, -1]])
     outside = np.isin(wide, np.unique(edges[edges > 0]))[1:-1, 1:-1]
@@ -221,7 +221,16 @@ def _check(hole: np.ndarray, known: np.ndarray) -> None:
         )
 
 
-def _trained(kept, new, window, hole, painted, thickness, options, progress) -> GaussianCloud:
+def _trained(
+    kept: GaussianCloud,
+    new: GaussianCloud,
+    window: PlaneWindow,
+    hole: np.ndarray,
+    painted: np.ndarray,
+    thickness: float,
+    options: InpaintOptions,
+    progress: Callable[[int, float], None] | None,
+) -> GaussianCloud:
     """``new`` after training against the inpainted picture, between what lies around the hole; degree 0."""
     try:
         from egs_warp.training.finetune import FinetuneOptions, GaussianTensors, Rates, TrainingView, finetune

@@ -108,7 +108,9 @@ class TorchScriptInpainter:
 
 
 def inpainter_by_name(name: str, *, seed: int = 0, device: str = "cpu") -> Inpainter:
-    """``patch``, ``telea``, ``ns`` or the path of a TorchScript file, which is tried. Raises ``UserError`` for anything else."""
+    """``patch``, ``telea``, ``ns`` or the path of a TorchScript file, which is tried.
+    Raises ``UserError`` for anything else.
+    """
     if name == "patch":
         return PatchSynthesis(seed=seed, device=device)
     if name in (method.value for method in OpenCvMethod):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 from scipy import ndimage
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
@@ -62,9 +62,9 @@ def flat_gaussians(
     spacing: int,
     device: str | None = None,
 ) -> GaussianCloud:
-    """Gaussians of SH degree 0 every ``spacing`` texels over ``hole`` (rows, columns) and its ``known`` rim, in the colours of
-    ``painted`` (rows, columns, 3), at ``heights`` (rows, columns) above the plane; those of the rim a little lower,
-    where they only show through gaps."""
+    """Gaussians of SH degree 0 every ``spacing`` texels over ``hole`` (rows, columns) and its ``known`` rim, in the
+    colours of ``painted`` (rows, columns, 3), at ``heights`` (rows, columns) above the plane; those of the rim a little
+    lower, where they only show through gaps."""
     size = (np.array(hole.shape) // spacing) * spacing
 
     def blocks(values: np.ndarray) -> np.ndarray:
@@ -100,7 +100,7 @@ def with_gloss(new: GaussianCloud, floor: GaussianCloud, window: PlaneWindow) ->
     if coefficients == 1:
         return new
     neighbours = min(_NEIGHBOURS, floor.count)
-    distance, index = cKDTree(floor.means.numpy()).query(new.means.numpy(), k=neighbours)
+    distance, index = KDTree(floor.means.numpy()).query(new.means.numpy(), k=neighbours)
     weight = 1.0 / np.maximum(np.reshape(distance, (new.count, neighbours)), window.texel)
     weight /= weight.sum(axis=1, keepdims=True)
     sh = np.zeros((new.count, coefficients, 3), np.float32)

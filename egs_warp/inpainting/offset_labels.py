@@ -58,7 +58,7 @@ def labelled_sources(
     ``image`` (H, W, 3) float32 is known where ``known`` (H, W) and not ``hole`` (H, W); sources are taken from
     ``is_source`` (H, W). Other pixels, and holes around which nothing repeats, are given themselves.
     """
-    place = np.stack(np.indices(hole.shape), axis=-1)
+    place = np.moveaxis(np.indices(hole.shape), 0, -1)
     sources = place.copy()
     parts, count = connected_parts(ndimage.binary_dilation(hole, np.ones((3, 3)), iterations=_RIM), corners=True)
     for part in range(1, count + 1):
@@ -159,7 +159,7 @@ def _label(
     index[domain[:, 0], domain[:, 1]] = np.arange(len(domain))
     pairs = []
     for step in ((0, 1), (1, 0)):
-        there = domain + step
+        there = domain + np.array(step)
         inside = (there < hole.shape).all(axis=1)
         other = np.full(len(domain), -1)
         other[inside] = index[there[inside, 0], there[inside, 1]]
@@ -179,8 +179,8 @@ def _label(
 
 
 def _expanded(labels: np.ndarray, data: np.ndarray, colour: np.ndarray, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """``labels`` (n,) improved by expansion moves: ``data`` (n, k) is the price of each label, ``colour`` (n, k, 3) what it
-    paints; seams are between neighbours ``p`` and ``q`` (m,)."""
+    """``labels`` (n,) improved by expansion moves: ``data`` (n, k) is the price of each label, ``colour`` (n, k, 3)
+    what it paints; seams are between neighbours ``p`` and ``q`` (m,)."""
 
     def seam(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         cost = np.linalg.norm(colour[p, a] - colour[p, b], axis=-1) + np.linalg.norm(
@@ -213,7 +213,9 @@ def _expanded(labels: np.ndarray, data: np.ndarray, colour: np.ndarray, p: np.nd
 
 
 def _places(domain: np.ndarray, offsets: Offsets, is_source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n, k, 2) where each offset leads from each pixel, kept inside the picture; and (n, k) bool whether to a source."""
+    """(n, k, 2) where each offset leads from each pixel, kept inside the picture;
+    and (n, k) bool whether to a source.
+    """
     place = domain[:, None] + offsets.steps[None]
     bounded = np.clip(place, 0, np.array(is_source.shape) - 1)
     return bounded, (place == bounded).all(axis=-1) & is_source[bounded[..., 0], bounded[..., 1]]
@@ -229,7 +231,7 @@ def _surround_misfit(
     high = np.minimum(domain.max(axis=0) + margin + 1, hole.shape)
     window = (slice(low[0], high[0]), slice(low[1], high[1]))
     usable = known & ~hole
-    place = np.stack(np.indices(hole.shape), axis=-1)[window]
+    place = np.moveaxis(np.indices(hole.shape), 0, -1)[window]
     at = domain - low
     result = np.zeros((len(domain), len(offsets.steps)))
     for k, (step, shift) in enumerate(zip(offsets.steps, offsets.shifts, strict=True)):

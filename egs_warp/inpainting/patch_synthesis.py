@@ -147,7 +147,7 @@ def meld(picture: np.ndarray, hole: np.ndarray, known: np.ndarray, sources: np.n
     matrix_rows, matrix_columns, matrix_values = [np.arange(len(at))], [np.arange(len(at))], [np.full(len(at), _SCREEN)]
     right = _SCREEN * picture[hole].astype(np.float64)
     limit = np.array(hole.shape) - 1
-    for step in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+    for step in np.array([(0, 1), (1, 0), (0, -1), (-1, 0)]):
         there = np.clip(at + step, 0, limit)
         inside = (there == at + step).all(axis=1) & known[there[:, 0], there[:, 1]]
         ahead = np.clip(source + step, 0, limit)
@@ -203,7 +203,7 @@ class _Work:
 
     def copy(self) -> None:
         """Paint the hole with the colours of its sources."""
-        sources = self._sources.numpy()[self._holes_at[:, 0], self._holes_at[:, 1]]
+        sources: np.ndarray = self._sources.numpy()[self._holes_at[:, 0], self._holes_at[:, 1]]
         self.picture[self._holes_at[:, 0], self._holes_at[:, 1]] = self.picture[sources[:, 0], sources[:, 1]]
         self._image = wp.array(self.picture, dtype=wp.vec3, device=self._device)
 

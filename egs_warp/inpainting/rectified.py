@@ -11,6 +11,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.kernels.inpainting.rectified import mean_colour_kernel
+from egs_warp.launching import empty
 from egs_warp.render import render
 from egs_warp.segmentation.plane_search import near_plane
 
@@ -107,7 +108,7 @@ def mean_colours(cloud: GaussianCloud, plane: Plane) -> np.ndarray:
     level = np.cos(angle) * first + np.sin(angle) * second
     elevation = np.radians(_SEEN_FROM)
     directions = -(np.cos(elevation) * level + np.sin(elevation) * plane.normal)
-    colours = wp.empty(cloud.count, dtype=wp.vec3, device=cloud.device)
+    colours = empty(cloud.count, wp.vec3, cloud.device)
     wp.launch(
         mean_colour_kernel,
         dim=cloud.count,

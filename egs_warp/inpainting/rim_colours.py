@@ -25,8 +25,8 @@ _MOST_ADDED = 12
 
 
 class RimColours:
-    """The colours of a picture (H, W, 3) in shades, and how likely each shade is at the pixels ``domain`` (n, 2) of a hole:
-    as likely as a walker that sets out there at random ends on a rim of that shade."""
+    """The colours of a picture (H, W, 3) in shades, and how likely each shade is at the pixels ``domain`` (n, 2) of a
+    hole: as likely as a walker that sets out there at random ends on a rim of that shade."""
 
     def __init__(self, image: np.ndarray, usable: np.ndarray, domain: np.ndarray) -> None:
         """``usable`` (H, W) bool is where the picture is known."""
@@ -44,8 +44,8 @@ class RimColours:
         return np.take_along_axis(self._common, self._shade[place[..., 0], place[..., 1]], axis=1)
 
     def islands(self, place: np.ndarray) -> np.ndarray:
-        """(n,) bool: pixels of an unusual colour that are part of an island, or of a tongue longer than it is wide, if each
-        pixel of the domain is painted as ``place`` (n, 2). What reaches the rim in two places is none."""
+        """(n,) bool: pixels of an unusual colour that are part of an island, or of a tongue longer than it is wide, if
+        each pixel of the domain is painted as ``place`` (n, 2). What reaches the rim in two places is none."""
         rows, columns = self._domain.T
         painted = self._broad.copy()
         painted[rows, columns] = self._broad[place[:, 0], place[:, 1]]
@@ -68,8 +68,8 @@ class RimColours:
         return found[rows, columns]
 
     def offsets_for(self, uncovered: np.ndarray, is_source: np.ndarray) -> list[np.ndarray]:
-        """(2,) int offsets under which the ``uncovered`` (n,) bool pixels find common colours at ``is_source`` (H, W), in
-        pieces as large as can be."""
+        """(2,) int offsets under which the ``uncovered`` (n,) bool pixels find common colours at ``is_source`` (H, W),
+        in pieces as large as can be."""
         uncovered, found = uncovered.copy(), []
         while uncovered.any() and len(found) < _MOST_ADDED:
             at, common = self._domain[uncovered], self._common[uncovered]

@@ -28,5 +28,5 @@ def soap_film(values: np.ndarray, hole: np.ndarray) -> np.ndarray:
     row, column = np.concatenate(rows), np.concatenate(columns)
     matrix = sparse.diags(degree) - sparse.coo_array((np.ones(len(row)), (row, column)), shape=(len(at), len(at)))
     film = values.astype(np.float64).copy()
-    film[hole] = spsolve(sparse.csc_array(matrix), sums)
+    film[hole] = np.asarray(spsolve(sparse.csc_array(matrix), sums))
     return film

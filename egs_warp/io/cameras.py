@@ -72,8 +72,11 @@ def read_cameras(path: Path | str) -> list[PosedImage]:
 
 
 def read_points(path: Path | str) -> SparsePoints | None:
-    """The points triangulated from the photos of ``path``: COLMAP's, or the .ply that nerfstudio (``ply_file_path``) and
-    INRIA (``input.ply``) put beside theirs; None where there are none. Raises ``UserError`` for malformed files."""
+    """The points triangulated from the photos of ``path``; None where there are none.
+
+    COLMAP's, or the .ply that nerfstudio (``ply_file_path``) and INRIA (``input.ply``) put beside their poses. Raises
+    ``UserError`` for malformed files.
+    """
     source = _pose_file(Path(path))
     if source.is_dir():
         return read_colmap_points(source)

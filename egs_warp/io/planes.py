@@ -52,5 +52,6 @@ def read_planes_and_facts(path: Path | str) -> list[tuple[Plane, dict[str, Any]]
         except (TypeError, KeyError, ValueError) as error:
             raise UserError(f"{path}: plane {number} needs normal [x, y, z] and offset; make it again") from error
         facts = {name: value for name, value in entry.items() if name not in ("normal", "offset")}
-        read.append((Plane.from_coefficients(*normal, offset), facts))
+        nx, ny, nz = normal.tolist()
+        read.append((Plane.from_coefficients(nx, ny, nz, offset), facts))
     return read

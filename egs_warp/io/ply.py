@@ -142,7 +142,7 @@ def _read_text(data: bytes, header: PlyHeader, wanted: list[str], source: Path) 
             # numpy only warns of text that is not a number; newer ones raise ValueError.
             warnings.simplefilter("error", DeprecationWarning)
             try:
-                values = np.fromstring(b" ".join(rows), dtype=np.float64, sep=" ")  # type: ignore[call-overload]
+                values = np.fromstring(b" ".join(rows), dtype=np.float64, sep=" ")  # pyright: ignore[reportCallIssue, reportArgumentType]
             except (DeprecationWarning, ValueError):
                 values = np.empty(0)
         if len(values) != element.count * columns:

@@ -25,7 +25,9 @@ def read_text(path: Path | str) -> str:
 
 
 def whole_number(digits: str) -> int | float:
-    """The number that ``digits`` write; one of many digits as a float, infinite if need be, which every check of a range refuses."""
+    """The number that ``digits`` write; one of many digits as a float, infinite if need be,
+    which every check of a range refuses.
+    """
     return int(digits) if len(digits) <= _EXACT_DIGITS else float(digits)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import subprocess
 import tempfile
 from collections.abc import Sequence
@@ -13,25 +12,20 @@ from types import TracebackType
 import numpy as np
 
 from egs_warp.errors import UserError
+from egs_warp.io.atomic import atomic_write
 
 
 def write_png(path: Path | str, image: np.ndarray) -> None:
     """Write (H, W, 3) uint8 RGB, (H, W, 4) RGBA or (H, W) grey. Raises ``UserError`` if the place cannot be written."""
     import cv2
 
-    path = Path(path)
     swap = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}
     coded = image if image.ndim == 2 else cv2.cvtColor(np.ascontiguousarray(image), swap[image.shape[2]])
     ok, data = cv2.imencode(".png", coded)
     if not ok:
         raise UserError(f"{path}: the picture of shape {image.shape} could not be encoded as PNG")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(data.tobytes())
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise UserError(f"{path}: cannot write the picture ({error.strerror}); choose a writable folder") from error
 
 
 def contact_sheet(frames: Sequence[np.ndarray], columns: int, labels: Sequence[str]) -> np.ndarray:
@@ -76,6 +70,10 @@ def _in_the_middle(frame: np.ndarray, height: int, width: int) -> np.ndarray:
     return cell
 
 
+class _AbandonedError(Exception):
+    """Ends the writing of a video that failed."""
+
+
 class VideoWriter:
     """H.264 (yuv420p) mp4 through the ffmpeg program that imageio-ffmpeg brings.
 
@@ -85,7 +83,7 @@ class VideoWriter:
 
     def __init__(
         self, path: Path | str, width: int, height: int, *, frames_per_second: float = 60.0, quality: int = 16
-    ):
+    ) -> None:
         """``quality`` is x264's constant rate factor: 0 lossless, 16 hardly visible loss, 51 worst."""
         self._path = Path(path)
         self._size = (height, width)
@@ -100,19 +98,17 @@ class VideoWriter:
     def __enter__(self) -> VideoWriter:
         import imageio_ffmpeg
 
-        self._temporary = self._path.with_name(f".{self._path.name}.{os.getpid()}.part")
-        try:
-            self._temporary.write_bytes(b"")
-        except OSError as error:
-            raise UserError(
-                f"{self._path}: cannot write the video ({error.strerror}); choose a writable folder"
-            ) from error
-        self._log = tempfile.TemporaryFile()
+        with contextlib.ExitStack() as files:
+            temporary = files.enter_context(atomic_write(self._path))
+            # A place that cannot be written is told now, not after the last frame.
+            temporary.write_bytes(b"")
+            self._log = files.enter_context(tempfile.TemporaryFile())
+            self._files = files.pop_all()
         self._process = subprocess.Popen(
             [
                 *(imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"),
                 *self._command_tail,
-                *("-f", "mp4", str(self._temporary)),
+                *("-f", "mp4", str(temporary)),
             ],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
@@ -148,14 +144,19 @@ class VideoWriter:
             # A dead ffmpeg shows in its exit status below, with its own words.
             with contextlib.suppress(BrokenPipeError):
                 self._process.stdin.close()
-            failed = self._process.wait() != 0
-            if kind is None and failed:
+            if self._process.wait() != 0 and kind is None:
                 raise self._failure()
-            if kind is None:
-                os.replace(self._temporary, self._path)
-        finally:
-            self._temporary.unlink(missing_ok=True)
-            self._log.close()
+        except BaseException:
+            self._abandon()
+            raise
+        if kind is None:
+            self._files.close()
+        else:
+            self._abandon()
+
+    def _abandon(self) -> None:
+        """Leave what was at the path; what went wrong is not about the place, so it is not told of the error itself."""
+        self._files.__exit__(_AbandonedError, _AbandonedError(), None)
 
     def _failure(self) -> UserError:
         self._process.wait()

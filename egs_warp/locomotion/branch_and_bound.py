@@ -15,7 +15,9 @@ from egs_warp.locomotion.solvers import QpSolution, QpSolver, quadratic_program
 
 @dataclass(frozen=True)
 class _Branch:
-    """What is decided about one contact; a contact that slides does so along directions ``first`` to ``last`` of the ring."""
+    """What is decided about one contact; a contact that slides does so along directions ``first`` to ``last`` of the
+    ring.
+    """
 
     kind: str = "open"
     first: int = 0
@@ -32,7 +34,8 @@ class _Branch:
                 _Branch("arc", half, directions),
             ]
         if self.kind == "arc" and self.last - self.first > 1:
-            # Friction lies on one edge of the pyramid or on a face between two, so the halves share only the middle edge.
+            # Friction lies on one edge of the pyramid or on a face between two, so the halves share only the middle
+            # edge.
             middle = (self.first + self.last) // 2
             return [replace(self, last=middle), replace(self, first=middle)]
         if self.kind == "arc":
@@ -72,9 +75,9 @@ def exact_states(
 ) -> ExactResult | None:
     """Global optimum of ``program``; None if no contact states are feasible (or found within ``qp_limit``).
 
-    ``starts``: states (n,) worth trying first; a good one prunes most of the tree. Each node relaxes the pairs that are not
-    decided yet to 0 <= x, 0 <= w, which is a convex QP that bounds all its states from below. The search ends when no node is
-    better by more than 1e-7, or ``relative_gap`` of the best objective.
+    ``starts``: states (n,) worth trying first; a good one prunes most of the tree. Each node relaxes the pairs that are
+    not decided yet to 0 <= x, 0 <= w, which is a convex QP that bounds all its states from below. The search ends when
+    no node is better by more than 1e-7, or ``relative_gap`` of the best objective.
     """
     layout = program.layout
     qp = quadratic_program(program.P, program.q, program.A, solver=QpSolver.DAQP)

@@ -10,8 +10,8 @@ from egs_warp.contact.detection import tangent_directions
 
 SEPARATE = -2
 STATIC = -1
-"""A state is SEPARATE, STATIC, or slide k: friction along +D_k and slip along -D_k for 0 <= k < n_d; n_d + k: friction anywhere
-between D_k and D_(k+1), slip midway."""
+"""A state is SEPARATE, STATIC, or slide k: friction along +D_k and slip along -D_k for 0 <= k < n_d; n_d + k: friction
+anywhere between D_k and D_(k+1), slip midway."""
 
 Pivot = tuple[float, int, int]
 """(gain, contact, new state)."""
@@ -118,8 +118,9 @@ def proposed_pivots(
 ) -> list[Pivot]:
     """(gain, contact, new state), best first, read from the multipliers (rows,) of the rows held at zero (DESIGN 8).
 
-    ``x`` and ``w`` (pairs,) as ``ContactProgram.pairs`` gives them. Only states that the point itself obeys are proposed, so no
-    proposal is infeasible, nor are several contacts' proposals together. ``zero`` is the accuracy of x, w and the multipliers.
+    ``x`` and ``w`` (pairs,) as ``ContactProgram.pairs`` gives them. Only states that the point itself obeys are
+    proposed, so no proposal is infeasible, nor are several contacts' proposals together. ``zero`` is the accuracy of x,
+    w and the multipliers.
     """
     n, nd = layout.contacts, layout.directions
     table = tangent_directions(nd)
@@ -139,14 +140,14 @@ def proposed_pivots(
         if state == SEPARATE:
             if c[i] <= zero:
                 along = w_t[i] - lam[i]
-                propose(y_force[i], i, np.argmin(along) if along.min() < -zero else STATIC)
+                propose(y_force[i], i, int(np.argmin(along)) if along.min() < -zero else STATIC)
         elif state == STATIC:
             # The rows of a static contact are redundant: only their sum along D means something.
             pull = y_slip[i] @ table
             size = float(np.linalg.norm(pull))
             if f_n[i] <= zero:
                 propose(max(y_normal[i], size), i, SEPARATE)
-                propose(size, i, np.argmin(table @ pull))
+                propose(size, i, int(np.argmin(table @ pull)))
             elif cone[i] <= zero:
                 k = int(np.argmax(f_t[i]))
                 along = float(table[k] @ pull)
@@ -187,8 +188,8 @@ def plain_pivots(
 ) -> list[Pivot]:
     """The moves of ``proposed_pivots`` as a QPCC pivots without our corrections: each multiplier is taken at its word.
 
-    A contact whose free side is zero goes to the state in which the multiplier's row is free: static to separate or slide k, slide k
-    to static, separate or slide j, separate to static. For the baseline.
+    A contact whose free side is zero goes to the state in which the multiplier's row is free: static to separate or
+    slide k, slide k to static, separate or slide j, separate to static. For the baseline.
     """
     n, nd = layout.contacts, layout.directions
     friction, slip = slice(n, n + n * nd), slice(n + n * nd, None)

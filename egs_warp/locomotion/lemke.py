@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg.blas import dger
+from scipy.linalg.blas import dger  # pyright: ignore[reportAttributeAccessIssue]  # compiled: no stub names it
 
 
 def lemke(matrix: np.ndarray, q: np.ndarray, *, pivot_limit: int = 2000) -> np.ndarray | None:
     """z (n,) with 0 <= z, 0 <= matrix z + q and their product zero; None on a secondary ray or at ``pivot_limit``.
 
-    For the contact rows of Eq. (9) the matrix is copositive and the method ends at a solution (Anitescu and Potra 1997). Ties
-    are broken lexicographically by the columns of the basis inverse, so degenerate problems cannot cycle.
+    For the contact rows of Eq. (9) the matrix is copositive and the method ends at a solution (Anitescu and Potra
+    1997). Ties are broken lexicographically by the columns of the basis inverse, so degenerate problems cannot cycle.
     """
     count = len(q)
     if count == 0 or q.min() >= 0.0:

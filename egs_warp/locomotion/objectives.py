@@ -25,8 +25,8 @@ class Objective:
     """(k,) m/s."""
     weight: float
     lifted: tuple[int, ...] = ()
-    """Nodes whose contacts ought to let go: the first guess of their state is that they separate. Stage 1 keeps last step's
-    activations, so it cannot foresee a foot that the muscles are about to lift."""
+    """Nodes whose contacts ought to let go: the first guess of their state is that they separate. Stage 1 keeps last
+    step's activations, so it cannot foresee a foot that the muscles are about to lift."""
 
 
 def centre_of_mass_velocity(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
@@ -37,7 +37,8 @@ def centre_of_mass_velocity(body: SoftBody, target: np.ndarray, weight: float) -
 
 @dataclass(frozen=True)
 class SpinObjective:
-    """weight |L+ - target|^2 / (m r)^2, r the radius of gyration, for the angular momentum about the centre of mass at the end of the step.
+    """weight |L+ - target|^2 / (m r)^2, r the radius of gyration, for the angular momentum about the centre of mass at
+    the end of the step.
 
     The stepper keeps L+ = L + dt sum (x - c) x f (DESIGN 5), so contact forces alone steer it.
     """
@@ -57,7 +58,7 @@ def lifted_contacts(contacts: ContactSet, objectives: Sequence[Objective | SpinO
 def node_velocities(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
     """Velocities (N, 3) of all nodes, each weighted by its share of the mass: a pose to move towards."""
     shares = np.sqrt(np.repeat(body.node_mass / body.mass, 3))
-    return Objective("pose", sparse.diags(shares).tocsr(), shares * target.ravel(), weight)
+    return Objective("pose", sparse.csr_matrix(sparse.diags(shares)), shares * target.ravel(), weight)
 
 
 @dataclass(frozen=True)
@@ -166,10 +167,11 @@ def part_angular_momentum(
     weight: float,
     coordinates: Coordinates = WORLD,
 ) -> Objective:
-    """Angular momentum (3,) kg m^2/s of ``part`` about its own centre; in relative coordinates about the centre of mass of the body,
-    with velocities relative to its.
+    """Angular momentum (3,) kg m^2/s of ``part`` about its own centre; in relative coordinates about the centre of mass
+    of the body, with velocities relative to its.
 
-    Told in m/s: over mass x radius of gyration. For the whole body ``SpinObjective`` is exact, this is linear in the arms.
+    Told in m/s: over mass x radius of gyration. For the whole body ``SpinObjective`` is exact, this is linear in the
+    arms.
     """
     if coordinates.relative:
         pivot, moving = body.centre_of_mass(state.positions), body.node_mass / body.mass
@@ -193,7 +195,9 @@ def part_turning(
     weight: float,
     coordinates: Coordinates = WORLD,
 ) -> Objective:
-    """Angular velocity (3,) rad/s of ``part``, that of the rigid body with its momentum: the rate of its orientation."""
+    """Angular velocity (3,) rad/s of ``part``, that of the rigid body with its momentum:
+    the rate of its orientation.
+    """
     momentum = part_angular_momentum(body, part, state, np.zeros(3), weight)
     unit = _gyration(part, state.positions) * part.masses.sum()
     radius = _gyration(part, state.positions)
@@ -226,7 +230,9 @@ def base_area(part: BodyPart, state: BodyState, up: np.ndarray, target: float, w
 
 
 def part_nodes(body: SoftBody, part: BodyPart, target: np.ndarray, weight: float) -> Objective:
-    """Velocities (k, 3) m/s of every node of ``part``, each with the same share of the weight: place and shape at once."""
+    """Velocities (k, 3) m/s of every node of ``part``, each with the same share of the weight:
+    place and shape at once.
+    """
     count = len(part.nodes)
     columns = (3 * part.nodes[:, None] + np.arange(3)).ravel()
     share = np.sqrt(1.0 / count)

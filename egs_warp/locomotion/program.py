@@ -18,8 +18,8 @@ from egs_warp.muscles.tension import MuscleTension
 class ContactProgram:
     """min 1/2 y^T P y + q^T y + constant over y = (a, f_n, f_t, lambda), subject to the pairs of Eq. (9).
 
-    Rows A y + offset are ``ContactLayout``'s; only their bounds depend on the contact states. Units: activations in their
-    bounds, forces in body weights, speeds in sqrt(g H).
+    Rows A y + offset are ``ContactLayout``'s; only their bounds depend on the contact states. Units: activations in
+    their bounds, forces in body weights, speeds in sqrt(g H).
     """
 
     layout: ContactLayout
@@ -88,8 +88,8 @@ def linear_response(
 ) -> LinearResponse:
     """(S + dt^2 K_a) v = M v0 + dt (f + A a + W^T f_c) around p + dt ``velocities`` (N, 3).
 
-    ``actuation`` (3N, M): newtons at full activation, in the directions at p + dt ``velocities``; K_a is the stiffness of the
-    muscles at the last step's ``tension``.
+    ``actuation`` (3N, M): newtons at full activation, in the directions at p + dt ``velocities``; K_a is the stiffness
+    of the muscles at the last step's ``tension``.
     """
     body, dt = step.body, step.dt
     solve = step.tangent(velocities, tension)
@@ -145,7 +145,13 @@ def _moment_rows(step: ImplicitStep, contacts: ContactSet, layout: ContactLayout
 
 
 def _quadratic_cost(
-    step, linear, contacts, objectives, layout, previous, scales: CostScales
+    step: ImplicitStep,
+    linear: LinearResponse,
+    contacts: ContactSet,
+    objectives: Sequence[Objective | SpinObjective],
+    layout: ContactLayout,
+    previous: np.ndarray,
+    scales: CostScales,
 ) -> tuple[np.ndarray, np.ndarray, float]:
     body, state = step.body, step.state
     moments = _moment_rows(step, contacts, layout)

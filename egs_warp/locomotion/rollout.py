@@ -50,8 +50,8 @@ def steps_per_frame(body: SoftBody) -> int:
 def settle(stepper: LocomotionStepper) -> BodyState:
     """The body at rest on its ground: contact steps from rest, long ones, each begun without velocity.
 
-    One that gives way is not followed to the ground: it is returned once a node has gone 0.2 H in one step, or its centre of
-    mass 0.1 H in all.
+    One that gives way is not followed to the ground: it is returned once a node has gone 0.2 H in one step, or its
+    centre of mass 0.1 H in all.
     """
     body = stepper.body
     state = BodyState(body.mesh.nodes.copy(), np.zeros_like(body.mesh.nodes))
@@ -95,8 +95,8 @@ def simulate(
 ) -> Simulation:
     """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``.
 
-    ``step``: seconds of a solver step, if not the usual (DESIGN 4); one longer than a frame makes the frame as long. ``progress`` is
-    told each frame done.
+    ``step``: seconds of a solver step, if not the usual (DESIGN 4); one longer than a frame makes the frame as long.
+    ``progress`` is told each frame done.
     """
     per_frame = steps_per_frame(stepper.body) if step is None else max(round(1.0 / (FRAME_RATE * step)), 1)
     dt = step or 1.0 / (FRAME_RATE * per_frame)

@@ -1,4 +1,6 @@
-"""The two-stage stepper: predict the contact states, optimise the muscles, correct with the full mechanics (Eq. 12, 13)."""
+"""The two-stage stepper: predict the contact states, optimise the muscles,
+correct with the full mechanics (Eq. 12, 13).
+"""
 
 from __future__ import annotations
 
@@ -7,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy import sparse
 
 from egs_warp.contact.corrector import ContactStepResult, contact_step
 from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet, independent_contacts
@@ -46,11 +49,11 @@ class LocomotionSettings:
     qp_solver: QpSolver | str = QpSolver.OSQP
     strategy: Strategy | str = Strategy.TWO_STAGE
     activation_weight: float = 2e-4
-    """For a step of sqrt(H / g) / 19 and a muscle of 4 body weights. Shorter steps change speeds by less, so they weigh activations
-    less: by the square of their share. Stronger muscles weigh more, as their force."""
+    """For a step of sqrt(H / g) / 19 and a muscle of 4 body weights. Shorter steps change speeds by less, so they weigh
+    activations less: by the square of their share. Stronger muscles weigh more, as their force."""
     activation_change_weight: float = 3e-4
-    """Likewise, by the step's share, and by the square of the force: the strong muscles of a stiff body would else play full
-    strokes against each other from step to step, further than the linearised program knows the way."""
+    """Likewise, by the step's share, and by the square of the force: the strong muscles of a stiff body would else play
+    full strokes against each other from step to step, further than the linearised program knows the way."""
     drag: float = 0.0
     """alpha, 1/s."""
 
@@ -205,7 +208,15 @@ class LocomotionStepper:
         return candidates[chosen]
 
     def _optimise(
-        self, step, before, columns, contacts: ContactSet, prediction: Prediction, memory, objectives, clock
+        self,
+        step: ImplicitStep,
+        before: MuscleTension,
+        columns: sparse.csc_matrix,
+        contacts: ContactSet,
+        prediction: Prediction,
+        memory: StepMemory,
+        objectives: Sequence[Objective | SpinObjective],
+        clock: _Clock,
     ) -> _Plan:
         body, settings = self.body, self.settings
         all_contacts = contacts.count
@@ -259,7 +270,9 @@ class LocomotionStepper:
             velocities = prediction.velocities
         return _Plan(activations, velocities, forces, found)
 
-    def _finish(self, step, state, plan: _Plan, result: ContactStepResult, clock):
+    def _finish(
+        self, step: ImplicitStep, state: BodyState, plan: _Plan, result: ContactStepResult, clock: _Clock
+    ) -> tuple[BodyState, StepMemory, StepReport]:
         end = step.end_positions(result.velocities)
         external = result.nodal_forces - self.settings.drag * self.body.node_mass[:, None] * result.velocities
         velocities, spin = conserve_angular_momentum(self.body, state, end, result.velocities, external, step.dt)

@@ -18,9 +18,13 @@ from egs_warp.locomotion.solvers import QpSolution, QpSolver, QpStatus, Quadrati
 GOOD_ENOUGH = 1.005
 """A search ends when the objective is within this factor of its bound."""
 DOUBTFUL = 1.2
-"""A search that ends further than this factor from its bound is done again from other states, with ``PATIENCE`` times as many QPs."""
+"""A search that ends further than this factor from its bound is done again from other states,
+with ``PATIENCE`` times as many QPs.
+"""
 IMMATERIAL = 0.01
-"""Unless there is no more to gain than this share of what it costs to do nothing, to fall without muscles and ground."""
+"""Unless there is no more to gain than this share of what it costs to do nothing,
+to fall without muscles and ground.
+"""
 PRESSED = 1e-3
 """Body weights, of a contact that holds."""
 PATIENCE = 3
@@ -110,7 +114,9 @@ class _Search:
         return True
 
     def within(self, factor: float, share: float = 0.0) -> bool:
-        """Whether no states can be better by more than ``factor``, or by more than a ``share`` of the cost of doing nothing."""
+        """Whether no states can be better by more than ``factor``,
+        or by more than a ``share`` of the cost of doing nothing.
+        """
         if self.best is None or self.relaxed is None:
             return False
         constant = self.program.constant
@@ -150,8 +156,9 @@ def find_states(
 ) -> SearchResult:
     """Contact states and the optimum for them by ``strategy`` (or its name).
 
-    ``predicted`` (n,) states of stage 1 (Eq. 12); ``activations`` (M,) of the last step, in their bounds. Where a strategy's own
-    first states have no solution, it starts from those that follow from ``activations``, which always have one.
+    ``predicted`` (n,) states of stage 1 (Eq. 12); ``activations`` (M,) of the last step, in their bounds. Where a
+    strategy's own first states have no solution, it starts from those that follow from ``activations``, which always
+    have one.
     """
     strategy = Strategy(strategy)
     if strategy is Strategy.EXACT:
@@ -184,7 +191,8 @@ def find_states(
 
 
 def contact_under(program: ContactProgram, activations: np.ndarray) -> np.ndarray | None:
-    """(variables,) what contact and friction make of given ``activations`` (M,): the y that obeys Eq. (9); None if none is found.
+    """(variables,) what contact and friction make of given ``activations`` (M,): the y that obeys Eq. (9); None if none
+    is found.
 
     There always is one, whatever the contacts: the starts that it gives never lose a frame.
     """
@@ -212,8 +220,8 @@ def _start_relaxed(search: _Search, predicted: np.ndarray, activations: np.ndarr
 
 
 def _other_starts(search: _Search, predicted: np.ndarray) -> Iterator[np.ndarray]:
-    """States (n,) worth another search: feet that hold where the best point without complementarity presses, or where the prediction
-    does, and the predicted states themselves."""
+    """States (n,) worth another search: feet that hold where the best point without complementarity presses, or where
+    the prediction does, and the predicted states themselves."""
     if search.relaxed is not None:
         layout = search.program.layout
         pressed = search.relaxed.x[layout.normal] > PRESSED
@@ -223,7 +231,9 @@ def _other_starts(search: _Search, predicted: np.ndarray) -> Iterator[np.ndarray
 
 
 def _move(search: _Search, *, together: bool) -> None:
-    """Move contacts to their better states while that lowers the objective: each contact's best move ``together``, else one by one."""
+    """Move contacts to their better states while that lowers the objective:
+    each contact's best move ``together``, else one by one.
+    """
     improved = search.best is not None
     while improved and not search.within(GOOD_ENOUGH):
         pivots = search.pivots()

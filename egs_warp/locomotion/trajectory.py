@@ -1,4 +1,6 @@
-"""What a simulation leaves behind: every solver step, its contacts, and the measures and audit computed from them alone."""
+"""What a simulation leaves behind: every solver step, its contacts,
+and the measures and audit computed from them alone.
+"""
 
 from __future__ import annotations
 

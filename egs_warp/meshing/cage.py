@@ -34,8 +34,8 @@ class CageMethod(Enum):
     """Which mesher makes the tetrahedra."""
 
     VOXEL = "voxel"
-    """Isosurface stuffing of the voxel solid: the same bits in every run; dihedral angles of 10 degrees and more, but where
-    the surface meets the floor (7.6 degrees at the least in 400 random solids)."""
+    """Isosurface stuffing of the voxel solid: the same bits in every run; dihedral angles of 10 degrees and more, but
+    where the surface meets the floor (7.6 degrees at the least in 400 random solids)."""
     TETWILD = "tetwild"
     """fTetWild, for thin parts with fewer nodes. It seeds its random numbers from the system, so two runs give two
     meshes; where it fails or leaves a sliver, VOXEL takes its place."""

@@ -1,9 +1,9 @@
 """Tetrahedra inside a level set: isosurface stuffing of a body-centred cubic lattice whose lowest layer is a plane.
 
 F. Labelle and J. R. Shewchuk, "Isosurface stuffing: fast tetrahedral meshes with good dihedral angles", SIGGRAPH 2007.
-Lattice points close to the surface are moved onto it; the other tetrahedra that the surface crosses are cut. The lattice
-ends in the plane: its lowest tetrahedra are halves of lattice tetrahedra with one more point in the middle of each
-square, so the bottom is exactly flat and its outline is cut as finely as any other part of the surface.
+Lattice points close to the surface are moved onto it; the other tetrahedra that the surface crosses are cut. The
+lattice ends in the plane: its lowest tetrahedra are halves of lattice tetrahedra with one more point in the middle of
+each square, so the bottom is exactly flat and its outline is cut as finely as any other part of the surface.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ paper's 0.24999 and 0.41189 give dihedral angles of at least 10.78 degrees."""
 def stuff(field: Field, low: np.ndarray, high: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
     """Nodes (N, 3) and tetrahedra (T, 4) of either winding that fill ``field`` < 0 above z = 0.
 
-    The box ``low`` (3,), ``high`` (3,) holds the solid; ``cell`` is the lattice's cube side, in the units of the points.
-    A solid thinner than about a cell falls between the lattice points. T is 0 if nothing is inside.
+    The box ``low`` (3,), ``high`` (3,) holds the solid; ``cell`` is the lattice's cube side, in the units of the
+    points. A solid thinner than about a cell falls between the lattice points. T is 0 if nothing is inside.
     """
     points, tets, long_edges, is_floor = _lattice(low, high, cell)
     value = field(points)
@@ -48,7 +48,9 @@ _CORNER_PAIRS = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
 
 
 def _lattice(low: np.ndarray, high: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Points (P, 3), tetrahedra (T, 4), their two long edges (T, 2) as numbers of ``_CORNER_PAIRS``, floor mask (P,)."""
+    """Points (P, 3), tetrahedra (T, 4), their two long edges (T, 2) as numbers of ``_CORNER_PAIRS``,
+    floor mask (P,).
+    """
     centre = 0.5 * (low + high)[:2]
     half = np.ceil(0.5 * (high - low)[:2] / cell).astype(int) + 1
     nx, ny = 2 * half
@@ -70,7 +72,8 @@ def _lattice(low: np.ndarray, high: np.ndarray, cell: float) -> tuple[np.ndarray
     )
     pieces = []
     for axis in range(3):
-        # The square between two neighbouring cells, its corners in turn; the floor's squares have the floor point below.
+        # The square between two neighbouring cells, its corners in turn; the floor's squares have the floor point
+        # below.
         other = [k for k in range(3) if k != axis]
         count = [nx, ny, nz]
         inner = [slice(None)] * 3

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import types
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any, Protocol
 
 import numpy as np
 from skimage import measure
@@ -22,7 +23,9 @@ class SampledField(Protocol):
 
 
 def flat_bottomed_surface(field: SampledField) -> tuple[np.ndarray, np.ndarray]:
-    """Marching-cubes vertices (v, 3) and outward faces (f, 3) of the field, closed by an exactly flat bottom at z = 0."""
+    """Marching-cubes vertices (v, 3) and outward faces (f, 3) of the field,
+    closed by an exactly flat bottom at z = 0.
+    """
     values, start = field.samples()
     closed = np.concatenate([np.full_like(values[:, :, :1], 2.0), values], axis=2)
     vertices, faces, _, _ = measure.marching_cubes(closed, 0.0)
@@ -55,7 +58,7 @@ def tetwild(field: SampledField, target_nodes: int) -> TetMesh | None:
         return None
 
 
-def _tetrahedralize():
+def _tetrahedralize() -> Callable[..., Any]:
     """pytetwild's function. Its 0.4.2 imports pyvista (and with it all of VTK) for an accessor that is not used here,
     though its metadata call pyvista optional: an empty module takes its place while it is imported."""
     try:

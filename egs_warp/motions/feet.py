@@ -61,7 +61,9 @@ def find_feet(mesh: TetMesh, heights: np.ndarray, body_height: float) -> tuple[F
 
 
 def feet_around(feet: Sequence[Foot], positions: np.ndarray, up: np.ndarray) -> tuple[int, int, int, int]:
-    """Indices of the feet of a four-legged body at ``positions`` (N, 3), anticlockwise seen against ``up`` (3,), unit."""
+    """Indices of the feet of a four-legged body at ``positions`` (N, 3), anticlockwise seen against ``up`` (3,),
+    unit.
+    """
     if len(feet) != 4:
         raise UserError(f"walk: a walk needs four separate feet, the body has {len(feet)}")
     centres = np.array([positions[foot.sole].mean(axis=0) for foot in feet])

@@ -48,7 +48,9 @@ class FollowPhase(Enum):
 
 
 class Follow:
-    """The keys' own objectives, and beside them a standing body: balance, no spin, its shape, each unless a key rules it."""
+    """The keys' own objectives, and beside them a standing body:
+    balance, no spin, its shape, each unless a key rules it.
+    """
 
     def __init__(self, place: Place, keys: Sequence[Key], *, weights: Weights | None = None) -> None:
         """Raises ``UserError`` for a key of a part that the body does not have."""
@@ -71,7 +73,9 @@ class Follow:
         self._turned = {name: np.zeros(3) for name in self.parts}
 
     def planned(self) -> dict[str, float]:
-        """How many keys there are, how long they take (seconds), and the worst miss so far, in the unit of its quantity."""
+        """How many keys there are, how long they take (seconds), and the worst miss so far,
+        in the unit of its quantity.
+        """
         misses = [float(np.linalg.norm(self._miss(index))) for index in self._reached]
         return {"keys": float(len(self.keys)), "duration": self._end, "worst_miss": max(misses, default=0.0)}
 
@@ -177,7 +181,9 @@ class Follow:
         return part_angular_momentum(body, part, state, momentum, weight, axes)
 
     def _measured(self, name: str, quantity: Quantity, state: BodyState) -> np.ndarray:
-        """(3,) in the unit of the quantity, axes of the ground; of a turn, the one that the body came by since the last look at it."""
+        """(3,) in the unit of the quantity, axes of the ground;
+        of a turn, the one that the body came by since the last look at it.
+        """
         part, axes, height = self.parts[name], self.ground.axes, self.body.height
         if quantity is Quantity.POSITION:
             return axes @ (part.centre(state.positions) - part.centre(self._standing)) / height
@@ -240,7 +246,9 @@ def _quaternion(turn: np.ndarray) -> np.ndarray:
 
 
 def _lift_near(turn: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """(3,) ``turn``, a rotation vector of at most 180 degrees, or the same rotation the longer way round if that is nearer to ``last``."""
+    """(3,) ``turn``, a rotation vector of at most 180 degrees,
+    or the same rotation the longer way round if that is nearer to ``last``.
+    """
     if _quaternion(turn) @ _quaternion(last) >= 0.0:
         return turn
     angle = float(np.linalg.norm(turn))

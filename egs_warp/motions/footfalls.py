@@ -19,10 +19,12 @@ class Footfalls:
     """What the feet of a walk did; lengths over the stride."""
 
     slip: float
-    """Longest way along the ground that the loaded contact points of a foot slid while it stood: in each step the mean over the
-    foot's contacts, weighted by their normal forces, added up from landing to lift-off."""
+    """Longest way along the ground that the loaded contact points of a foot slid while it stood: in each step the mean
+    over the foot's contacts, weighted by their normal forces, added up from landing to lift-off."""
     sole_shift: float
-    """Largest distance of the middle of a sole from where it came to stand, while it stood: slip and rolling together."""
+    """Largest distance of the middle of a sole from where it came to stand, while it stood:
+    slip and rolling together.
+    """
     landings: int
     """Times that a foot came to stand again."""
 

@@ -11,7 +11,9 @@ from scipy.spatial import ConvexHull
 
 @dataclass(frozen=True)
 class Gait:
-    """Diagonal pairs of feet swing in turn. Each step sets a pair ``step_length`` ahead of the other; one more swing closes the feet."""
+    """Diagonal pairs of feet swing in turn. Each step sets a pair ``step_length`` ahead of the other;
+    one more swing closes the feet.
+    """
 
     steps: int
     step_length: float
@@ -61,13 +63,15 @@ class Gait:
         return swing * self.step_length + self.speed * (elapsed - 0.5 * self.swing_time)
 
     def lifted(self, progress: float) -> float:
-        """Metres a foot is above the ground when ``progress`` (0 to 1) of its swing is over; it leaves and lands at rest."""
+        """Metres a foot is above the ground when ``progress`` (0 to 1) of its swing is over;
+        it leaves and lands at rest.
+        """
         return self.lift * float(_smooth(progress / 0.2) * (1.0 - _smooth((progress - 0.65) / 0.35)))
 
     @staticmethod
     def carried(progress: float) -> float:
-        """Part of its way that a foot has gone when ``progress`` (0 to 1) of its swing is over; it has arrived before it lands,
-        lest an early touch of the ground drag it."""
+        """Part of its way that a foot has gone when ``progress`` (0 to 1) of its swing is over; it has arrived before
+        it lands, lest an early touch of the ground drag it."""
         return float(_smooth((progress - 0.1) / 0.7))
 
 

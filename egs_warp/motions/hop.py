@@ -14,7 +14,9 @@ class Hop(Leap):
     """A jump whose feet aim at a point of the ground."""
 
     def __init__(self, place: Place, square: np.ndarray, height: float, *, weights: Weights | None = None) -> None:
-        """``square`` (3,): where the middle of the feet shall land; ``height``: rise of the centre of mass, both metres."""
+        """``square`` (3,): where the middle of the feet shall land;
+        ``height``: rise of the centre of mass, both metres.
+        """
         feet = sole_shares(place.body, place.ground, place.standing) @ place.standing
         way = square - feet
         place = place.facing(way)
@@ -34,7 +36,9 @@ class Hop(Leap):
 
 
 class Squares:
-    """A row of squares ahead of a place; made when the first hop begins, so that later ones do not add up their errors."""
+    """A row of squares ahead of a place; made when the first hop begins,
+    so that later ones do not add up their errors.
+    """
 
     def __init__(self, distance: float, height: float, count: int, asked: dict[str, float]) -> None:
         """``distance`` from square to square and ``height`` of each jump in metres; ``asked`` is what a report says."""

@@ -13,7 +13,9 @@ from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.stance import Ground, Measurement, PoseFamily, Weights
 
 RISE = 0.92
-"""A thrust ends when the centre of mass would reach this share of the asked height in free flight: one step more is too much."""
+"""A thrust ends when the centre of mass would reach this share of the asked height in free flight:
+one step more is too much.
+"""
 CARRIED = 2.0
 """Speed ahead at the end of a crouch, in leans over its time: 2 is a steady acceleration, 0 a stop."""
 FULL_RISE = 0.99
@@ -180,7 +182,9 @@ class Jump:
     def _thrust_velocity(
         self, com_velocity: np.ndarray, seen: Measurement, position: np.ndarray, dt: float
     ) -> np.ndarray:
-        """``com_velocity`` (3,) m/s, no faster than free flight to the target needs; ``position`` (3,) is the reference's."""
+        """``com_velocity`` (3,) m/s, no faster than free flight to the target needs;
+        ``position`` (3,) is the reference's.
+        """
         forward = (self._landing_com(position)[0] - seen.com[0]) / self.plan.flight_time
         speed_up = min(com_velocity[2], self._sufficient_speed(seen, dt))
         return np.array([min(com_velocity[0], max(forward, 0.0)), com_velocity[1], speed_up])
@@ -228,7 +232,8 @@ class Jump:
         if self.phase is JumpPhase.SETTLE:
             return start, np.zeros(3)
         down = np.array([plan.lean, 0.0, -plan.crouch_depth])
-        # The crouch ends at rest over the ground but already on the way ahead: friction has little left to give during the thrust.
+        # The crouch ends at rest over the ground but already on the way ahead: friction has little left to give during
+        # the thrust.
         onset = np.array([min(CARRIED * plan.lean / plan.crouch_time, plan.speed_forward), 0.0, 0.0])
         if self.phase is JumpPhase.CROUCH:
             s = min(elapsed / plan.crouch_time, 1.0)
@@ -239,7 +244,9 @@ class Jump:
         position = start + down + onset * elapsed + 0.5 * (take_off - onset) * elapsed**2 / plan.thrust_time
         return position, onset + (take_off - onset) * elapsed / plan.thrust_time
 
-    def _stand(self, state: BodyState, com_velocity, position, base, dt: float) -> list[Objective | SpinObjective]:
+    def _stand(
+        self, state: BodyState, com_velocity: np.ndarray, position: np.ndarray, base: np.ndarray, dt: float
+    ) -> list[Objective | SpinObjective]:
         pose = self.pose.over_base(position, base)
         spin = self.pose.turn_towards(state, pose) * 4.0 / self._time_unit
         if self.phase is JumpPhase.THRUST:
@@ -266,7 +273,9 @@ class Jump:
         return self._write(state, velocity, pose, spin, dt)
 
     def _falling(self, seen: Measurement, dt: float) -> tuple[np.ndarray, float, np.ndarray]:
-        """Where the centre of mass (3,) will touch down, the seconds left until then, and its velocity (3,) after this step."""
+        """Where the centre of mass (3,) will touch down, the seconds left until then,
+        and its velocity (3,) after this step.
+        """
         drop = max(seen.com[2] - self._start_com[2], 0.0)
         speed = seen.velocity[2]
         left = (speed + np.sqrt(max(speed**2 + 2.0 * self.gravity * drop, 0.0))) / self.gravity
@@ -287,7 +296,9 @@ class Jump:
         velocity = self._balanced(seen, seen.velocity + dt * acceleration, dt)
         return self._stand(state, velocity, seen.com + dt * velocity, seen.base, dt)
 
-    def _write(self, state: BodyState, com_velocity, pose, spin, dt: float) -> list[Objective | SpinObjective]:
+    def _write(
+        self, state: BodyState, com_velocity: np.ndarray, pose: np.ndarray, spin: np.ndarray, dt: float
+    ) -> list[Objective | SpinObjective]:
         rate = (pose - self._pose) / dt
         if np.abs(rate).max() > 5.0 / self._time_unit:
             rate = np.zeros((3, 3))

@@ -36,8 +36,8 @@ class Quantity(Enum):
 
 
 PARTS = ("body", "base", "head", "foot")
-"""Parts that a key may name: the whole body (of which the position is that of the centre of mass), what stands on the ground, the top,
-the only foot. Feet of a body with several have numbers, as ``foot 2``."""
+"""Parts that a key may name: the whole body (of which the position is that of the centre of mass), what stands on the
+ground, the top, the only foot. Feet of a body with several have numbers, as ``foot 2``."""
 _NUMBERED_FOOT = re.compile(r"foot [1-9]\d?")
 LONGEST_TIME = 60.0
 """Seconds."""
@@ -70,7 +70,9 @@ class Key:
 
 @dataclass(frozen=True)
 class Channel:
-    """All keys of one part and quantity, joined by a monotone cubic from zero at time 0; after the last key its value stays."""
+    """All keys of one part and quantity, joined by a monotone cubic from zero at time 0;
+    after the last key its value stays.
+    """
 
     part: str
     quantity: Quantity
@@ -106,7 +108,9 @@ def read_keyframes(path: Path) -> tuple[Key, ...]:
 
 
 def channels(keys: Sequence[Key]) -> tuple[Channel, ...]:
-    """Keys by part and quantity; raises ``UserError`` if two of a channel are nearly at the same time, or times go back."""
+    """Keys by part and quantity; raises ``UserError`` if two of a channel are nearly at the same time,
+    or times go back.
+    """
     found: dict[tuple[str, Quantity], list[Key]] = {}
     for key in keys:
         group = found.setdefault((key.part, key.quantity), [])

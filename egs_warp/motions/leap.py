@@ -13,8 +13,8 @@ from egs_warp.motions.sequence import Place
 from egs_warp.motions.stance import Ground, Measurement, PoseFamily, Weights
 
 LEAN = 0.2
-"""Of the distance: how far the weight is put ahead before take-off. With it over the middle of the feet a push forward would
-turn the body backward."""
+"""Of the distance: how far the weight is put ahead before take-off. With it over the middle of the feet a push forward
+would turn the body backward."""
 FURTHEST_LEAN = 0.35
 """Of the way from under the centre of mass to the front of the feet."""
 DEEPEST_CROUCH = 0.3
@@ -22,14 +22,17 @@ DEEPEST_CROUCH = 0.3
 FOOTHOLD = 0.4
 """Of the footprint: how far from the capture point the feet may be put down for the sake of the target."""
 RUN_ON = 0.08
-"""Of sqrt(H / g): for how long the feet go on at the body's speed when they touch down, swinging and sliding (measured on the pawn)."""
+"""Of sqrt(H / g): for how long the feet go on at the body's speed when they touch down,
+swinging and sliding (measured on the pawn).
+"""
 CLEARANCE = 0.15
 """Of the height of a step: how far above it the feet are before they swing ahead."""
 THRUST_LEAD = 0.7
 """Part of the time of a thrust in which the speed forward is to be reached."""
 AIRBORNE_POSE = 0.08
-"""Weight of the pose in the air, where nothing else can be steered and the feet have to get to their place. Much more crumples
-the body, and one so slender that it was made stiffer to stand (``SoftBody.stiffening``) buckles under less, by the square."""
+"""Weight of the pose in the air, where nothing else can be steered and the feet have to get to their place. Much more
+crumples the body, and one so slender that it was made stiffer to stand (``SoftBody.stiffening``) buckles under less, by
+the square."""
 IN_TIME = 2.5
 """Over the time left in the air: the rate at which the pose of the landing is approached, gently at first."""
 CALM = 0.03
@@ -37,7 +40,9 @@ CALM = 0.03
 
 
 class Leap(Jump):
-    """A jump that lands ``target.distance`` ahead, turned by ``turn`` radians, and rests as soon as the body is calm."""
+    """A jump that lands ``target.distance`` ahead, turned by ``turn`` radians,
+    and rests as soon as the body is calm.
+    """
 
     def __init__(
         self,
@@ -99,8 +104,8 @@ class Leap(Jump):
         left = max((plan.speed_up - seen.velocity[2]) / plan.speed_up * plan.thrust_time, dt)
         goal = np.array([self._landing_com(position)[0], self._start_com[1]])
         needed = (goal - seen.com[:2] - 0.5 * left * seen.velocity[:2]) / (plan.flight_time + 0.5 * left)
-        # What the ground gives lags behind what is asked: the speed forward is asked for ahead of the speed up, and with what the
-        # last step fell short by, at most twice over.
+        # What the ground gives lags behind what is asked: the speed forward is asked for ahead of the speed up, and
+        # with what the last step fell short by, at most twice over.
         change = (needed - seen.velocity[:2]) * dt / max(THRUST_LEAD * left, dt)
         short = self._asked - seen.velocity[:2] if self._asked is not None else np.zeros(2)
         most = np.linalg.norm(change)
@@ -110,7 +115,8 @@ class Leap(Jump):
         return velocity
 
     def _risen(self, seen: Measurement, dt: float) -> bool:
-        # A body in the air has thrust, however fast it goes; waiting for the asked speed there would lose the steering of the feet.
+        # A body in the air has thrust, however fast it goes; waiting for the asked speed there would lose the steering
+        # of the feet.
         return super()._risen(seen, dt) or not (seen.touching or seen.sole_height <= 0.0)
 
     def _falling(self, seen: Measurement, dt: float) -> tuple[np.ndarray, float, np.ndarray]:

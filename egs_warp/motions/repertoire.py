@@ -70,14 +70,18 @@ def parts_of(requests: Sequence[MotionRequest], height: float) -> list[Part]:
 
 
 def check_possible(parts: Sequence[Part], place: Place) -> None:
-    """Raises the ``UserError`` that a later motion would raise when its turn comes, for a body that stands at ``place``."""
+    """Raises the ``UserError`` that a later motion would raise when its turn comes,
+    for a body that stands at ``place``.
+    """
     for part in parts:
         if part.name != "hop":  # a row of hops remembers where it began
             part.begin(place)
 
 
 def also_reached(motion: BodyMotion, trajectory: Trajectory, first: int, last: int) -> dict[str, float]:
-    """What a report says of a motion beside the measures that all have; ``first`` and ``last`` are indices into ``time``."""
+    """What a report says of a motion beside the measures that all have;
+    ``first`` and ``last`` are indices into ``time``.
+    """
     if isinstance(motion, Hop):
         return {"square_miss": motion.miss(trajectory.positions[last]) / motion.target.distance}
     if isinstance(motion, Walk):

@@ -64,7 +64,10 @@ class Place:
 class BodyMotion(Protocol):
     """A state machine that ends in a phase whose value is "rest"."""
 
-    phase: Enum
+    @property
+    def phase(self) -> Enum:
+        """Where it is."""
+        ...
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[Objective | SpinObjective]:
         """Objectives of the step of ``dt`` seconds that starts at ``state``; ``report`` is of the step before."""

@@ -98,9 +98,11 @@ class PoseFamily:
     def balanced_acceleration(
         self, seen: Measurement, wanted: np.ndarray, up: float, gravity: float, *, margin: float = 0.8
     ) -> np.ndarray:
-        """(2,) the horizontal acceleration nearest to ``wanted`` (2,) m/s^2 that the feet can give without tipping the body.
+        """(2,) the horizontal acceleration nearest to ``wanted`` (2,) m/s^2 that the feet can give without tipping the
+        body.
 
-        The centre of pressure com - h a / (g + ``up``) stays within ``margin`` of the footprint (linear inverted pendulum).
+        The centre of pressure com - h a / (g + ``up``) stays within ``margin`` of the footprint (linear inverted
+        pendulum).
         """
         lever = max(seen.com[2], 0.3 * self.standing_height) / max(gravity + up, 0.2 * gravity)
         pressure = seen.com[:2] - lever * wanted
@@ -140,7 +142,9 @@ class PoseFamily:
         return heading_between(self._arms, positions, self._sole_share, self.ground)
 
     def affine(self, stretch: float, lean: np.ndarray, heading: float = 0.0) -> np.ndarray:
-        """(3, 3) world matrix: ``stretch`` along up, half the volume kept by bulging, sheared by ``lean`` (2,), then turned."""
+        """(3, 3) world matrix: ``stretch`` along up, half the volume kept by bulging, sheared by ``lean`` (2,),
+        then turned.
+        """
         bulge = stretch**-0.25
         local = np.diag([bulge, bulge, stretch])
         local[:2, 2] = lean
@@ -148,7 +152,9 @@ class PoseFamily:
         return self.ground.axes.T @ local @ self.ground.axes
 
     def over_base(self, com: np.ndarray, base: np.ndarray, heading: float = 0.0) -> np.ndarray:
-        """(3, 3) the pose whose sole is flat at ``base`` (2,) while the centre of mass is at ``com`` (3,), ground coordinates."""
+        """(3, 3) the pose whose sole is flat at ``base`` (2,) while the centre of mass is at ``com`` (3,),
+        ground coordinates.
+        """
         turned = Rotation.from_rotvec([0.0, 0.0, heading]).as_matrix()[:2, :2] @ self.base_offset
         lean = (com[:2] - base + turned) / self.standing_height
         lean = lean * min(1.0, 0.5 / max(float(np.linalg.norm(lean)), 1e-9))
@@ -166,7 +172,8 @@ class PoseFamily:
         follow: float,
         weights: Weights,
     ) -> list[Objective | SpinObjective]:
-        """Objectives for a step: centre-of-mass velocity (3,) in ground axes, angular velocity ``spin`` (3,) in world axes, and a pose.
+        """Objectives for a step: centre-of-mass velocity (3,) in ground axes, angular velocity ``spin`` (3,) in world
+        axes, and a pose.
 
         ``pose`` (3, 3) is approached at rate ``follow`` (1/s) on top of its own ``pose_rate`` (3, 3).
         """
@@ -190,14 +197,18 @@ class PoseFamily:
 
 
 def sole_shares(body: SoftBody, ground: Ground, standing: np.ndarray) -> np.ndarray:
-    """(N,) weights, sum 1, whose mean is the centre of the feet: the mass of the nodes that are near the ground at rest."""
+    """(N,) weights, sum 1, whose mean is the centre of the feet:
+    the mass of the nodes that are near the ground at rest.
+    """
     heights = standing @ ground.surface_normal
     mass = body.node_mass * (heights < heights.min() + 0.06 * body.height)
     return mass / mass.sum()
 
 
 def heading_between(before: np.ndarray, after: np.ndarray, share: np.ndarray, ground: Ground) -> float:
-    """Radians about the ground's up by which points ``before`` (N, 3), weighted by ``share`` (N,), best turn to ``after``."""
+    """Radians about the ground's up by which points ``before`` (N, 3), weighted by ``share`` (N,),
+    best turn to ``after``.
+    """
     flat_before, flat_after = ((x - share @ x) @ ground.axes[:2].T for x in (before, after))
     sine = share @ (flat_before[:, 0] * flat_after[:, 1] - flat_before[:, 1] * flat_after[:, 0])
     return float(np.arctan2(sine, share @ (flat_before * flat_after).sum(axis=1)))

@@ -91,7 +91,8 @@ class Turn:
 def largest_turn(twist: Twist, place: Place) -> float:
     """Radians that friction under the feet could turn the body by in one jump as planned (DESIGN 9).
 
-    Its impulse is mu r_eff times that of the normal forces, m (v_z + g t), r_eff the mean distance of the feet from their middle.
+    Its impulse is mu r_eff times that of the normal forces, m (v_z + g t), r_eff the mean distance of the feet from
+    their middle.
     """
     plan, body, up = twist.plan, place.body, place.ground.axes[2]
     arms = (place.touching - place.touching.mean(axis=0)) @ place.ground.axes[:2].T

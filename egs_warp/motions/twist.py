@@ -15,7 +15,9 @@ from egs_warp.motions.stance import Measurement, Weights
 AIRBORNE_SHARE = 0.88
 """Of the planned time of flight the body is off the ground: it stretches before it leaves it and before it lands."""
 SPARE_SPIN = 1.27
-"""Spin is built with this factor in hand: the muscles fall short of what is asked, and wide in the air the body is slowed."""
+"""Spin is built with this factor in hand:
+the muscles fall short of what is asked, and wide in the air the body is slowed.
+"""
 SLIDE = np.radians(5.0)
 """By this angle the feet slide on while friction stops the spin on landing."""
 WIDEST = 1.15
@@ -54,7 +56,8 @@ class Twist(Leap):
             return super()._stand(state, com_velocity, position, base, dt)
         landing = self.pose.over_base(self._landing_com(position), self._goal_base, self._turned)
         tilt = self.pose.turn_towards(state, landing) / self.plan.flight_time
-        # The body flies in about the shape in which it stands, so its inertia then, not the one now, says what spin it needs.
+        # The body flies in about the shape in which it stands, so its inertia then, not the one now, says what spin it
+        # needs.
         yaw = SPARE_SPIN * self._left_to_turn() / (AIRBORNE_SHARE * self.plan.flight_time)
         spin = self._with_yaw(tilt, yaw * self._standing_inertia / self._inertia(state))
         return self._write(state, com_velocity, self.pose.over_base(position, base, self._turned), spin, dt)

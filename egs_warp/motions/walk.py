@@ -70,7 +70,8 @@ class Walk:
     """Shifts its weight, swings and stands until the last swing has closed the feet, and gathers itself."""
 
     def __init__(self, place: Place, steps: int, step_length: float, *, control: WalkControl | None = None) -> None:
-        """``step_length`` in metres, shortened to what the legs reach. Raises ``UserError`` unless the body has four separate feet.
+        """``step_length`` in metres, shortened to what the legs reach. Raises ``UserError`` unless the body has four
+        separate feet.
 
         It walks along the side of its feet that is nearest to the forward of ``place``.
         """
@@ -206,8 +207,8 @@ class Walk:
         return self.gait.lift * s * s * (3.0 - 2.0 * s)
 
     def _com_velocity(self, local: np.ndarray, velocity: np.ndarray, elapsed: float, dt: float) -> np.ndarray:
-        """(3,) m/s at the end of the step; steered by a centre of pressure under the standing feet, so that the divergent part of
-        the motion (com + v sqrt(h/g), linear inverted pendulum) follows the reference."""
+        """(3,) m/s at the end of the step; steered by a centre of pressure under the standing feet, so that the
+        divergent part of the motion (com + v sqrt(h/g), linear inverted pendulum) follows the reference."""
         com = self.body.centre_of_mass(local)
         place, speed = self._com_reference(elapsed)
         rate = np.sqrt(self.gravity / self._start_com[2])
@@ -239,7 +240,9 @@ class Walk:
             targets[index, 2] += gait.lifted(progress) - 0.02 * self.body.height * max(progress - 1.0, 0.0)
         return targets
 
-    def _foot_objective(self, index: int, local, before, after, elapsed: float, dt: float) -> Objective:
+    def _foot_objective(
+        self, index: int, local: np.ndarray, before: np.ndarray, after: np.ndarray, elapsed: float, dt: float
+    ) -> Objective:
         sole, part, control = self.feet[index].sole, self._parts[index], self.control
         if index not in self.swinging:
             return part_nodes(self.body, part, np.zeros((len(sole), 3)), control.support)

@@ -1,8 +1,8 @@
 """A height-like function that grows along every limb of a body away from the ground.
 
-First a drainage field u (the body is heated evenly and cooled only at its base, so that heat flows down every limb to the
-ground: -lap u = 1, u = 0 at the base; u has no minimum but the base and no maximum but the tips), then the ascent, with the
-direction of u's gradient and unit slope, as in the heat method of Crane, Weischedel and Wardetzky (2013).
+First a drainage field u (the body is heated evenly and cooled only at its base, so that heat flows down every limb to
+the ground: -lap u = 1, u = 0 at the base; u has no minimum but the base and no maximum but the tips), then the ascent,
+with the direction of u's gradient and unit slope, as in the heat method of Crane, Weischedel and Wardetzky (2013).
 """
 
 from __future__ import annotations

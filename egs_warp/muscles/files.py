@@ -1,7 +1,7 @@
 """Muscles that a user writes down as JSON.
 
-A file is an object with ``fibres``, a list of entries. Lengths are in units of the capture. Every entry has ``name`` and
-``kind`` and, by kind,
+A file is an object with ``fibres``, a list of entries. Lengths are in units of the capture. Every entry has ``name``
+and ``kind`` and, by kind,
 
 * ``longitudinal``: ``from``, ``to`` (points [x, y, z]) and ``segments`` (default 4): a straight fibre;
 * ``polyline``: ``points``, two or more: one segment between each two;

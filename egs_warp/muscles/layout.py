@@ -22,8 +22,8 @@ _DETAILS = (
 )
 """From the richest to the poorest."""
 _LEG_DETAILS = (Detail(4, 4, 1, 2, 1, 1), Detail(4, 3, 1, 1, 1, 1), *_DETAILS[-2:])
-"""The same of each leg of a body on ``_LEGS`` or more. A foot is carried ahead and set down flat by a leg that bends one way
-above and the other way below, which takes three segments on each side of it."""
+"""The same of each leg of a body on ``_LEGS`` or more. A foot is carried ahead and set down flat by a leg that bends
+one way above and the other way below, which takes three segments on each side of it."""
 _LEGS = 3
 _SEGMENTS, _LEGGED_SEGMENTS = 112, 120
 
@@ -36,11 +36,11 @@ def is_legged(skeleton: Skeleton) -> bool:
 def lay_fibres(
     mesh: TetMesh, skeleton: Skeleton, *, max_force: float, max_stress: float, max_segments: int | None = None
 ) -> list[Fibre]:
-    """Longitudinal, radial, circular and oblique fibres on every branch, at most ``max_segments`` segments in all (112; for a
-    body on three legs or more 120).
+    """Longitudinal, radial, circular and oblique fibres on every branch, at most ``max_segments`` segments in all (112;
+    for a body on three legs or more 120).
 
-    ``max_force`` in newtons bounds each segment; ``max_stress`` in pascals bounds all longitudinal fibres of one section
-    together. Branches too many for the budget go without, the least voluminous first.
+    ``max_force`` in newtons bounds each segment; ``max_stress`` in pascals bounds all longitudinal fibres of one
+    section together. Branches too many for the budget go without, the least voluminous first.
     """
     edge = mean_edge_length(mesh)
     surface = Surface(mesh)
@@ -81,8 +81,8 @@ def _share_segments(skeleton: Skeleton, edge: float, budget: int | None) -> list
         return len(families[family]) * detail(family).segment_count()
 
     def greed(family: int) -> tuple[bool, float]:
-        """Segments against the volume they move; legs count double, since they alone push the ground, and those of a body on
-        many legs come last."""
+        """Segments against the volume they move; legs count double, since they alone push the ground, and those of a
+        body on many legs come last."""
         volume = sum(branch.volume * (2.0 if branch.starts_on_ground else 1.0) for branch in families[family])
         return ladders[family] is _DETAILS, count(family) / volume**0.5
 

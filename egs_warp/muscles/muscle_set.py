@@ -214,10 +214,10 @@ def automatic_muscles(
 ) -> MuscleSet:
     """Muscles for any body: fibres of every kind along each branch of its curve skeleton (DESIGN 6).
 
-    ``plane_normal`` (3,) points away from the ground; ``body_weight`` in newtons; ``height`` in metres along the normal;
-    ``strength`` is F_max of a segment in body weights. It is lowered where the body is thin: all longitudinal fibres
-    of a section together pull no harder than twice its area times E (``young_modulus``, pascals; default that of sag 0.05,
-    body_weight height / (0.05 volume)); of a body on three legs or more, whose legs would crumple, 0.4 times.
+    ``plane_normal`` (3,) points away from the ground; ``body_weight`` in newtons; ``height`` in metres along the
+    normal; ``strength`` is F_max of a segment in body weights. It is lowered where the body is thin: all longitudinal
+    fibres of a section together pull no harder than twice its area times E (``young_modulus``, pascals; default that of
+    sag 0.05, body_weight height / (0.05 volume)); of a body on three legs or more, whose legs would crumple, 0.4 times.
     """
     volume = float(mesh.volumes().sum())
     young = young_modulus or body_weight * height / (volume * 0.05)

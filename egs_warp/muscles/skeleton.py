@@ -1,8 +1,8 @@
 """Curve skeleton of a body: branches (legs, trunk, arms) from the ground up, each a polyline with sections.
 
-Connected slabs of a height-like function (``egs_warp.muscles.ascent``) are the body's sections; how they join is its Reeb graph, whose
-short and thin chains are merged into their neighbours. Slabs cut through tetrahedra (the function is linear inside each), so
-that a coarse mesh has as fine a skeleton as a dense one.
+Connected slabs of a height-like function (``egs_warp.muscles.ascent``) are the body's sections; how they join is its
+Reeb graph, whose short and thin chains are merged into their neighbours. Slabs cut through tetrahedra (the function is
+linear inside each), so that a coarse mesh has as fine a skeleton as a dense one.
 """
 
 from __future__ import annotations
@@ -189,7 +189,9 @@ class _SectionGraph:
         return np.average(self.samples[members], axis=0, weights=self.sample_volumes[members])
 
     def _tip(self, members: np.ndarray, last_points: list[np.ndarray]) -> np.ndarray:
-        """Where a free end of the body is: as far on from the last point as its samples reach in the axis' direction."""
+        """Where a free end of the body is: as far on from the last point as its samples reach
+        in the axis' direction.
+        """
         middle = last_points[-1]
         onwards = middle - last_points[0]
         length = float(np.linalg.norm(onwards))

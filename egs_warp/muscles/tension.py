@@ -13,11 +13,12 @@ from egs_warp.muscles.muscle_set import MuscleSet
 
 @dataclass(frozen=True)
 class MuscleTension:
-    """Segments that pull with constant tensions T over a step: V(p) = sum_j T_j |D_j p|, D_j p the vector between the ends.
+    """Segments that pull with constant tensions T over a step: V(p) = sum_j T_j |D_j p|, D_j p the vector between the
+    ends.
 
-    Its force is that of Eq. (7) at ``p``, so it turns with the body. Forces that keep the direction of the step's start instead
-    are dead loads: they press on the elements without the tension's own stiffness T / L across the line, and slender parts
-    buckle under muscles that in truth hold them straight.
+    Its force is that of Eq. (7) at ``p``, so it turns with the body. Forces that keep the direction of the step's start
+    instead are dead loads: they press on the elements without the tension's own stiffness T / L across the line, and
+    slender parts buckle under muscles that in truth hold them straight.
     """
 
     rows: sparse.csr_matrix
@@ -45,7 +46,9 @@ class MuscleTension:
         return -(self._columns @ ((self.tensions / np.where(lengths > 0.0, lengths, 1.0))[:, None] * vectors))
 
     def stiffness(self, positions: np.ndarray, *, pulling_only: bool = False) -> TensionStiffness:
-        """The second derivative of V at ``positions``; ``pulling_only`` leaves out segments that push, which makes it semi-definite."""
+        """The second derivative of V at ``positions``;
+        ``pulling_only`` leaves out segments that push, which makes it semi-definite.
+        """
         vectors = self.rows @ positions
         lengths = np.linalg.norm(vectors, axis=1)
         held = np.where(lengths > 0.0, lengths, 1.0)
@@ -69,11 +72,13 @@ class TensionStiffness:
     def product(self, x: np.ndarray) -> np.ndarray:
         """(N, 3) K x for ``x`` (N, 3)."""
         d = self.rows @ x
-        along = (d * self.directions).sum(axis=1, keepdims=True)
+        along = np.sum(d * self.directions, axis=1, keepdims=True)
         return self.columns @ (self.rates[:, None] * (d - along * self.directions))
 
     def factors(self) -> tuple[np.ndarray, np.ndarray]:
-        """U (3N, 2m) and rates (2m,) with K = U diag(rates) U^T: two directions across each of the m segments that matter."""
+        """U (3N, 2m) and rates (2m,) with K = U diag(rates) U^T:
+        two directions across each of the m segments that matter.
+        """
         kept = np.flatnonzero(np.abs(self.rates) > 1e-3 * np.abs(self.rates).max(initial=1e-300))
         along = self.directions[kept]
         axis = np.eye(3)[np.argmin(np.abs(along), axis=1)]

@@ -11,9 +11,13 @@ from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.skeleton import Branch
 
 _RADIUS_FRACTION = 0.7
-"""Fibres run at this part of the way from the branch's axis to the surface: near enough to bend, inside enough to hold."""
+"""Fibres run at this part of the way from the branch's axis to the surface:
+near enough to bend, inside enough to hold.
+"""
 _MAX_FLARE = 1.6
-"""No fibre is further from the axis than this many section radii, lest those of a leg spread over the seat it carries."""
+"""No fibre is further from the axis than this many section radii,
+lest those of a leg spread over the seat it carries.
+"""
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,9 @@ LARGEST_FRICTION = 10.0
 
 @dataclass(frozen=True)
 class AnimateOptions:
-    """What a user may ask; lengths of targets are in body heights. Targets hold for motions that do not say their own."""
+    """What a user may ask; lengths of targets are in body heights.
+    Targets hold for motions that do not say their own.
+    """
 
     distance: float | None = None
     height: float | None = None
@@ -93,10 +95,11 @@ def animate(
 ) -> dict:
     """Bring ``cloud`` (scene units) to life and write video, contact sheet, report and trajectory into ``out``.
 
-    ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.motions.script``). ``background`` (scene
-    units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from the object to the camera.
-    ``muscles_file``, ``solids``, ``gravity_up`` and ``settings``: see ``make_creature``; ``forward`` (3,): see ``first_place``.
-    Returns the report (docs/report.md). Raises ``UserError`` for bad input, before any file of an earlier run is touched.
+    ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.motions.script``).
+    ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
+    the object to the camera. ``muscles_file``, ``solids``, ``gravity_up`` and ``settings``: see ``make_creature``;
+    ``forward`` (3,): see ``first_place``. Returns the report (docs/report.md). Raises ``UserError`` for bad input,
+    before any file of an earlier run is touched.
     """
     options = options or AnimateOptions()
     requests = parse_script(motion, defaults=options.targets())

@@ -74,9 +74,10 @@ def make_creature(
 ) -> Creature:
     """Give a capture (scene units) a body that stands on ``plane``, or on its own base, square to ``up`` (3,).
 
-    ``muscles_file``: see ``body_muscles``. ``solids`` (scene units) are steps and walls beside the ground; ``gravity_up`` (3,) is
-    against gravity if the ground is a slope. ``settings`` of its stepper choose the strategy for the contact states and the QP solver.
-    The body is as stiff as makes it sag by ``sag`` of its height; one that its weight would bend out of shape is made stiffer.
+    ``muscles_file``: see ``body_muscles``. ``solids`` (scene units) are steps and walls beside the ground;
+    ``gravity_up`` (3,) is against gravity if the ground is a slope. ``settings`` of its stepper choose the strategy for
+    the contact states and the QP solver. The body is as stiff as makes it sag by ``sag`` of its height; one that its
+    weight would bend out of shape is made stiffer.
     """
     if plane is None:
         if up is None:
@@ -111,7 +112,9 @@ def _check_slope(plane: Plane, up: np.ndarray) -> None:
 
 
 def body_muscles(body: SoftBody, plane: Plane, file: Path | None, *, metres_per_unit: float) -> MuscleSet:
-    """The muscles that ``file`` (JSON, ``egs_warp.muscles.files``) gives a body on ``plane``; without one, automatic ones."""
+    """The muscles that ``file`` (JSON, ``egs_warp.muscles.files``) gives a body on ``plane``;
+    without one, automatic ones.
+    """
     if file is not None:
         return read_muscles(file, body.mesh, body_weight=body.weight, metres_per_unit=metres_per_unit)
     return automatic_muscles(
@@ -134,7 +137,8 @@ def _stands(stepper: LocomotionStepper, start: BodyState) -> bool:
 
 
 def first_place(creature: Creature, forward: np.ndarray | None = None, *, step: float | None = None) -> Place:
-    """Where the creature stands at the start; ``forward`` (3,) is the way of its motions, else the long axis of its footprint.
+    """Where the creature stands at the start; ``forward`` (3,) is the way of its motions, else the long axis of its
+    footprint.
 
     ``step``: seconds of a solver step, if not the usual (DESIGN 4).
     """

@@ -106,7 +106,9 @@ def _behind(
 
 
 def view_of(simulation: Simulation, ground: Ground, size: int, view_from: np.ndarray | None = None) -> Camera:
-    """A fixed camera that holds the whole motion: in front of the jump's side, or in the direction ``view_from`` (3,)."""
+    """A fixed camera that holds the whole motion:
+    in front of the jump's side, or in the direction ``view_from`` (3,).
+    """
     local = ground.local(simulation.trajectory.positions).reshape(-1, 3)
     low, high = local.min(axis=0), local.max(axis=0)
     low[2] = min(low[2], 0.0)

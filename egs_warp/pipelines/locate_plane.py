@@ -58,9 +58,9 @@ def locate_plane(
 ) -> LocatedPlane:
     """The plane under the object, and the object on it.
 
-    A coarse plane is sampled from the Gaussians, the object found on it, and the plane then fitted to the depth rendered
-    beside the object, through ``cameras`` or else a ring of steep ones; then the object is found again. With ``plane``
-    given, only the object is sought.
+    A coarse plane is sampled from the Gaussians, the object found on it, and the plane then fitted to the depth
+    rendered beside the object, through ``cameras`` or else a ring of steep ones; then the object is found again. With
+    ``plane`` given, only the object is sought.
     """
     notes: list[str] = []
     if plane is not None:

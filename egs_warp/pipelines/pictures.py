@@ -30,7 +30,8 @@ def picture_cameras(plane: Plane, centre: np.ndarray, size: float, cameras: Sequ
 def plane_picture(
     cloud: GaussianCloud, planes: Sequence[Plane], cameras: Sequence[Camera], *, centre: np.ndarray, size: float
 ) -> np.ndarray:
-    """(H, W, 3) uint8: the capture with a grid on each plane, in a colour of its own, faint where something stands before it.
+    """(H, W, 3) uint8: the capture with a grid on each plane, in a colour of its own, faint where something stands
+    before it.
 
     Ten lines to the ``size`` (scene units) of the object about ``centre`` (3,).
     """

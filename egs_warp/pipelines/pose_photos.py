@@ -57,10 +57,10 @@ def pose_photos(
 ) -> PoseResult:
     """Find the poses of the photos in the folder ``source``, or of ``frames`` sharp frames of the video ``source``.
 
-    ``out`` then holds ``images`` (upright: EXIF's turn is done) and COLMAP's ``sparse/0``: what ``train`` reads. Features
-    are found at no more than ``max_side`` pixels. ``stage`` is called with what begins, ``progress`` with a stage's name,
-    how much of it is done, and of how much. Raises ``UserError`` where pycolmap is not installed, where ``out`` has
-    photos already, and where fewer than three photos can be posed.
+    ``out`` then holds ``images`` (upright: EXIF's turn is done) and COLMAP's ``sparse/0``: what ``train`` reads.
+    Features are found at no more than ``max_side`` pixels. ``stage`` is called with what begins, ``progress`` with a
+    stage's name, how much of it is done, and of how much. Raises ``UserError`` where pycolmap is not installed, where
+    ``out`` has photos already, and where fewer than three photos can be posed.
     """
     try:
         import pycolmap  # type: ignore[import-not-found]

@@ -141,7 +141,8 @@ def take_apart(
 
 
 def viewing_direction(scene: PreparedScene, cameras: Sequence[Camera]) -> np.ndarray:
-    """(3,) from the object to where a picture is best taken: where the capture's own cameras were, or else from half above.
+    """(3,) from the object to where a picture is best taken: where the capture's own cameras were, or else from half
+    above.
 
     Captures look best from where they were taken; of those cameras it is the one of median height.
     """

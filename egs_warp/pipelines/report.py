@@ -41,7 +41,9 @@ def qp_summary(reports: Sequence[StepReport], frames: np.ndarray) -> dict:
 
 
 def timing_summary(reports: Sequence[StepReport], frames: np.ndarray, drawing: dict[str, list[float]]) -> dict:
-    """Milliseconds a frame by stage: mean and worst. ``drawing`` holds the milliseconds of each drawn frame by stage."""
+    """Milliseconds a frame by stage: mean and worst.
+    ``drawing`` holds the milliseconds of each drawn frame by stage.
+    """
     stages: dict[str, list[float]] = {}
     for first, last in zip(frames[:-1], frames[1:], strict=True):
         sums: dict[str, float] = {}

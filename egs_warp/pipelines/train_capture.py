@@ -67,7 +67,7 @@ class TrainResult:
     """Photos that are not used, or no longer, and why."""
 
     def mean_score(self, *, held_out: bool) -> tuple[float, float] | None:
-        """Mean PSNR and SSIM of the photos held out, or of those trained on, without misfits; None where there are none."""
+        """Mean PSNR and SSIM of photos held out, or of those trained on, misfits apart; None where there are none."""
         chosen = [(s.psnr, s.ssim) for s in self.scores if s.held_out is held_out and not s.misfit]
         if not chosen:
             return None
@@ -177,12 +177,14 @@ def score_photo(
     picture = render(cloud, view.camera, background=background, threads=threads).colour.numpy()
     known = None if view.weight is None else view.weight > 0
     plain, toned = np.clip(picture, 0, 1), np.clip(in_tone_of(view.image, picture, known), 0, 1)
-    values = [
-        value
-        for shown in (toned, plain)
-        for value in (psnr(shown, view.image, known), ssim_of(shown, view.image, known))
-    ]
-    return PhotoScore(view.name, held_out, *values)
+    return PhotoScore(
+        view.name,
+        held_out,
+        psnr=psnr(toned, view.image, known),
+        ssim=ssim_of(toned, view.image, known),
+        plain_psnr=psnr(plain, view.image, known),
+        plain_ssim=ssim_of(plain, view.image, known),
+    )
 
 
 def _unfit(scores: list[PhotoScore]) -> set[int]:

@@ -1,4 +1,6 @@
-"""What is behind the moving object: a plain floor with a grid, or a captured scene; and the object's soft shadow on it."""
+"""What is behind the moving object: a plain floor with a grid, or a captured scene;
+and the object's soft shadow on it.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.render.rasteriser import render
@@ -40,13 +42,11 @@ class ContactShadow:
     def __init__(
         self, camera: Camera, plane: Plane, *, centre: np.ndarray, reach: float, depth: np.ndarray | None = None
     ) -> None:
-        """``centre`` (3,) and ``reach`` (world units) bound the part of the plane that can be in shadow; ``depth`` (H, W) is
-        the z-depth of the uneven ground that it falls on, 0 where that is the plane."""
+        """``centre`` (3,) and ``reach`` (world units) bound the part of the plane that can be in shadow; ``depth`` (H,
+        W) is the z-depth of the uneven ground that it falls on, 0 where that is the plane."""
         self._plane, self._centre, self._reach = plane, centre, reach
         self._tangents = np.stack(plane.tangents())
-        u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], axis=-1)
-        rays = rays @ camera.rotation
+        rays = camera_rays(camera)
         slope = rays @ plane.normal
         self.depth = -float(plane.heights(camera.centre)) / np.where(np.abs(slope) > 1e-9, slope, np.inf)
         """(H, W) z-depth of the plane; meaningful where ``hit``."""
@@ -151,7 +151,7 @@ class CapturedScene:
         on_plane = np.clip(1.5 - np.where(lift > 0.0, lift, -0.5 * lift), 0.0, 1.0) * self._shadow.hit
         # Specks in the air before the floor would shine in the shadow, and hard edges look cut out.
         kernel = 2 * (max(camera.width, camera.height) // 40) + 1
-        on_plane = cv2.medianBlur(np.rint(255.0 * on_plane).astype(np.uint8), kernel) / 255.0
+        on_plane = np.asarray(cv2.medianBlur(np.rint(255.0 * on_plane).astype(np.uint8), kernel), np.float64) / 255.0
         on_plane = cv2.GaussianBlur(on_plane, (0, 0), _SOFTENED * kernel)
         fade = np.clip(1.6 - 1.6 * np.linalg.norm(self._shadow.flat, axis=-1) / reach, 0.0, 1.0)
         strength = on_plane * fade * image.alpha.numpy() if shadow else np.zeros_like(fade)

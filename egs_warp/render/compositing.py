@@ -12,7 +12,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.kernels.render.compositing import composite_tile_kernel
 from egs_warp.kernels.render.ellipse import TILE_PIXELS
 from egs_warp.kernels.render.geometry import composite_geometry_kernel, splat_normals_kernel
-from egs_warp.launching import empty, launch_rows
+from egs_warp.launching import device_of, empty, launch_rows
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.tiles import TileLists
 
@@ -51,7 +51,7 @@ def composite(
     projected: ProjectedGaussians, lists: TileLists, view: Any, *, background: Background, threads: int
 ) -> RenderedImage:
     """Blend every tile's Gaussians from front to back over ``background``."""
-    device: Any = projected.ellipse.device
+    device = device_of(projected.ellipse)
     width, height = int(view.width), int(view.height)
     colour = empty((height, width), wp.vec3, device)
     alpha = empty((height, width), wp.float32, device)

@@ -14,7 +14,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.kernels.render.projection import NOT_FINITE, View, project_kernel
-from egs_warp.launching import empty, launch_rows
+from egs_warp.launching import device_of, empty, launch_rows
 
 _ATTRIBUTES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 
@@ -94,11 +94,11 @@ _read_back = threading.local()
 
 def _last(values: wp.array) -> int:
     """The last of ``values`` (n,) int64; on a GPU this waits until it is there."""
-    device: Any = values.device
+    device = device_of(values)
     if device.is_cpu:
         return int(values.numpy()[-1])
     if not hasattr(_read_back, "array"):
-        _read_back.array = wp.empty(1, dtype=wp.int64, device="cpu", pinned=True)
+        _read_back.array = empty(1, wp.int64, "cpu", pinned=True)
         _read_back.values = _read_back.array.numpy()
     wp.copy(_read_back.array, values, src_offset=len(values) - 1, count=1)
     wp.synchronize_stream(device.stream)

@@ -14,7 +14,7 @@ import warp as wp
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.launching import available_threads
+from egs_warp.launching import Device, available_threads
 from egs_warp.render.compositing import Background, RenderedImage, add_geometry, composite
 from egs_warp.render.projection import project, view_from_camera
 from egs_warp.render.tiles import build_tile_lists
@@ -32,10 +32,8 @@ def render(
     """Picture of ``cloud`` through ``camera``, on the device of the cloud.
 
     ``background`` is one colour, or an image (H, W, 3) of this camera's size. ``antialiased`` dims each splat by what
-    the 0.3 px
-    low-pass adds to its area. ``geometry`` adds
-    median depth and normals. ``threads`` (a CPU only) defaults to the available cores; the picture does not depend
-    on it.
+    the 0.3 px low-pass adds to its area. ``geometry`` adds median depth and normals. ``threads`` (a CPU only) defaults
+    to the available cores; the picture does not depend on it.
     Raises ``UserError`` for non-finite Gaussians, which it names, for an impossible camera and for a background of
     another size.
     """
@@ -62,7 +60,7 @@ def refusing_what_does_not_fit(cloud: GaussianCloud, camera: Camera) -> Iterator
     try:
         yield
     except (RuntimeError, MemoryError) as error:
-        device: Any = cloud.device
+        device = cloud.device
         # A failure inside Warp's own scratch memory comes under many names.
         full = device.is_cuda and device.free_memory < 0.05 * device.total_memory
         if isinstance(error, RuntimeError) and not (full or re.search("alloc|out of mem", str(error), re.IGNORECASE)):
@@ -82,7 +80,7 @@ def _is_finite_number(value: Any) -> bool:
     return isinstance(value, float | int) and math.isfinite(value)
 
 
-def background_of(background: Any, camera: Camera, device: Any) -> Background:
+def background_of(background: Any, camera: Camera, device: Device) -> Background:
     """From a colour or an image (H, W, 3). Raises ``UserError`` for anything else."""
     shape = (camera.height, camera.width)
     if isinstance(background, tuple) and len(background) == 3 and all(map(_is_finite_number, background)):

@@ -15,7 +15,7 @@ from egs_warp.kernels.render.tiles import (
     fill_tiles_kernel,
     finish_lists_kernel,
 )
-from egs_warp.launching import empty, launch_again, launch_rows, zeros
+from egs_warp.launching import device_of, empty, launch_again, launch_rows, zeros
 from egs_warp.render.projection import ProjectedGaussians
 
 TILE_SIDE = int(TILE)
@@ -46,7 +46,7 @@ def build_tile_lists(projected: ProjectedGaussians, view: Any, *, threads: int) 
     """Sort the visible Gaussians by depth and list them for every tile that they reach (exact ellipse-tile test)."""
     columns = -(-view.width // TILE_SIDE)
     rows = -(-view.height // TILE_SIDE)
-    device: Any = projected.ellipse.device
+    device = device_of(projected.ellipse)
     if device.is_cuda:
         return _lists_by_sorting(projected, view, columns * rows)
     return _lists_by_counting(projected, view, columns * rows, threads)
@@ -54,20 +54,21 @@ def build_tile_lists(projected: ProjectedGaussians, view: Any, *, threads: int) 
 
 def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, threads: int) -> TileLists:
     """Counting sort in chunks of the depth order, side by side: no pair is compared."""
-    device = projected.ellipse.device
+    device = device_of(projected.ellipse)
     slot_counts = np.diff(projected.slot_end.numpy(), prepend=0)
     gaussian_from_visible = np.flatnonzero(slot_counts).astype(np.int32)
     visible_count = len(gaussian_from_visible)
     keys = empty(2 * max(visible_count, 1), wp.float32, device)
     order = empty(2 * max(visible_count, 1), wp.int32, device)
     keys.numpy()[:visible_count] = projected.colour_depth.numpy()[gaussian_from_visible, 3]
-    order.numpy()[:visible_count] = gaussian_from_visible
+    by_depth: np.ndarray = order.numpy()
+    by_depth[:visible_count] = gaussian_from_visible
     wp.utils.radix_sort_pairs(keys, order, visible_count)
 
     # Near Gaussians reach more tiles than far ones: chunks have the same number of pairs, not of Gaussians.
     chunks = min(8 + 4 * threads, max(1, visible_count // 256)) if threads > 1 else 1
     # One Gaussian in eight tells well enough.
-    pairs_done = np.cumsum(slot_counts[order.numpy()[:visible_count:8]])
+    pairs_done = np.cumsum(slot_counts[by_depth[:visible_count:8]])
     inner = 8 * np.searchsorted(pairs_done, np.arange(1, chunks) * (pairs_done[-1] / chunks)) if chunks > 1 else []
     edges = np.concatenate([[0], inner, [visible_count]]).astype(np.int32)
     chunk_start = wp.array(edges, dtype=wp.int32, device=device)
@@ -92,12 +93,15 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, thr
 
 
 def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int) -> TileLists:
-    """Radix sort of all (tile, Gaussian) pairs by tile and the leading bits of depth; 32 bits sort twice as fast as 64."""
-    device = projected.ellipse.device
+    """Radix sort of all (tile, Gaussian) pairs by tile and the leading bits of depth;
+    32 bits sort twice as fast as 64.
+    """
+    device = device_of(projected.ellipse)
     count, pairs = projected.slot_end.shape[0], projected.slot_count
     if pairs == 0:
-        none = [empty(1, wp.int32, device) for _ in range(2)]
-        return TileLists(zeros(tiles + 1, wp.int32, device), *none, None)
+        return TileLists(
+            zeros(tiles + 1, wp.int32, device), empty(1, wp.int32, device), empty(1, wp.int32, device), None
+        )
     keys = empty(2 * pairs, wp.uint32, device)
     # Slots, room to sort them, and the Gaussian of each slot.
     scratch = empty(3 * pairs, wp.int32, device)

@@ -18,7 +18,7 @@ from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.geometry.plane import Plane
 from egs_warp.kernels.deformation.splitting import split_kernel
 from egs_warp.kernels.segmentation.clearance import half_space_kernel, reach_kernel
-from egs_warp.launching import launch_rows
+from egs_warp.launching import empty, launch_rows
 from egs_warp.render.rasteriser import render
 from egs_warp.segmentation.plane_fit import plane_depth
 
@@ -71,7 +71,7 @@ def reach_across(cloud: GaussianCloud, plane: Plane, reach: Reach = Reach.ELLIPS
     A Gaussian straddles the plane where |d0| < eta_seg.
     """
     count, device = cloud.count, cloud.device
-    outputs = [wp.empty(count, dtype=wp.float32, device=device) for _ in range(3)]
+    outputs = [empty(count, wp.float32, device) for _ in range(3)]
     launch_rows(
         reach_kernel,
         count,

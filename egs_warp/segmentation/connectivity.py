@@ -6,7 +6,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -24,7 +24,7 @@ def connected_parts(cloud: GaussianCloud, chosen: np.ndarray, *, cell: float, pl
     """
     points = cloud.means.numpy()[chosen].astype(np.float64)
     if len(points) > 1:
-        cell = max(cell, 2.0 * float(np.median(cKDTree(points).query(points, k=2)[0][:, 1])))
+        cell = max(cell, 2.0 * float(np.median(KDTree(points).query(points, k=2)[0][:, 1])))
     lengths = np.minimum(_ARM * np.exp(cloud.log_scales.numpy()[chosen].astype(np.float64)), 4.0 * cell)
     turns = Rotation.from_quat(cloud.rotations.numpy()[chosen][:, [1, 2, 3, 0]]).as_matrix()
     arms = (turns * lengths[:, None, :]).transpose(0, 2, 1)
@@ -40,7 +40,8 @@ def connected_parts(cloud: GaussianCloud, chosen: np.ndarray, *, cell: float, pl
 
 
 def enclosed(points: np.ndarray, shell: np.ndarray, cell: float) -> np.ndarray:
-    """(n,) bool: whether ``points`` (n, k) lie in or within the closed shell of ``shell`` (m, k), on a grid of ``cell``.
+    """(n,) bool: whether ``points`` (n, k) lie in or within the closed shell of ``shell`` (m, k), on a grid of
+    ``cell``.
 
     Gaps of up to four cells are closed.
     """
@@ -65,4 +66,4 @@ def close_to(points: np.ndarray, others: np.ndarray, reach: float) -> np.ndarray
     """(n,) bool: ``points`` (n, k) within ``reach`` of one of ``others`` (m, k)."""
     if len(others) == 0:
         return np.zeros(len(points), bool)
-    return cKDTree(others).query(points, distance_upper_bound=reach)[0] <= reach
+    return KDTree(others).query(points, distance_upper_bound=reach)[0] <= reach

@@ -1,4 +1,6 @@
-"""Which Gaussians of a capture are the object: votes of masks, a box or a point; then what is connected above the plane."""
+"""Which Gaussians of a capture are the object: votes of masks, a box or a point;
+then what is connected above the plane.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
@@ -34,7 +36,9 @@ FOOTPRINT_HEIGHT = 0.08
 _HALO = 0.1
 """Of the object's size: floaters this near to it are its halo."""
 _WISP, _WISP_HEIGHT = 0.015, 0.1
-"""Of the object's size: standard deviation from which, and height up to which, a Gaussian may be a shred of the floor."""
+"""Of the object's size: standard deviation from which, and height up to which,
+a Gaussian may be a shred of the floor.
+"""
 _NEIGHBOURS = 16
 """Gaussians whose median colour is that of a place."""
 _FOOT = 0.015
@@ -200,7 +204,9 @@ def _body(
 
 
 def _wisps(scene: _Scene, chosen: np.ndarray, size: float) -> np.ndarray:
-    """(n,) bool: wide Gaussians at the object's foot in the floor's colour, which would go along as shreds of the floor."""
+    """(n,) bool: wide Gaussians at the object's foot in the floor's colour,
+    which would go along as shreds of the floor.
+    """
     low = scene.heights < _WISP_HEIGHT * size
     length = np.exp(scene.cloud.log_scales.numpy().max(axis=1))
     wide = length > max(_WISP * size, 2.0 * float(np.median(length[chosen])))
@@ -213,7 +219,7 @@ def _wisps(scene: _Scene, chosen: np.ndarray, size: float) -> np.ndarray:
     colours = scene.cloud.sh.numpy()[:, 0].astype(np.float64) * SH_BAND_0
 
     def apart(others: np.ndarray) -> np.ndarray:
-        tree = cKDTree(scene.means[others])
+        tree = KDTree(scene.means[others])
         _, nearest = tree.query(scene.means[suspects], k=min(_NEIGHBOURS, len(others)))
         nearest = np.reshape(nearest, (len(suspects), -1))
         return np.linalg.norm(np.median(colours[others[nearest]], axis=1) - colours[suspects], axis=1)
@@ -238,7 +244,9 @@ def _diagonal(points: np.ndarray) -> float:
 
 
 def _floor_top(scene: _Scene, chosen: np.ndarray, size: float) -> float:
-    """Height up to which the floor's own Gaussians scatter, judged beside the object ``chosen`` (n,) bool; at least 0."""
+    """Height up to which the floor's own Gaussians scatter, judged beside the object ``chosen`` (n,) bool;
+    at least 0.
+    """
     middle = np.median(scene.flat[chosen], axis=0)
     beside = scene.level & scene.solid & ~chosen & (np.abs(scene.heights) < 0.05 * size)
     beside &= np.linalg.norm(scene.flat - middle, axis=1) < size
@@ -278,7 +286,9 @@ def _voted(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> tuple[np.ndarra
 
 
 def masks_from_selection(cloud: GaussianCloud, selection: np.ndarray, cameras: Sequence[Camera]) -> list[MaskedView]:
-    """Masks of where the Gaussians ``selection`` (n,) bool make up more than half of what shows, through ``cameras``."""
+    """Masks of where the Gaussians ``selection`` (n,) bool make up more than half of what shows,
+    through ``cameras``.
+    """
     from egs_warp.render.rasteriser import render
 
     sh = np.zeros((cloud.count, 1, 3), np.float32)

@@ -190,7 +190,14 @@ def _refined(pixels: _Pixels, start: Plane, loss: Callable[[float], tuple], *, r
         middle = np.median(pixels.points, axis=0)
         reach = max(float(np.median(np.linalg.norm(pixels.points - middle, axis=1))), 1e-12)
 
-        def of(x: np.ndarray, base=base, first=first, second=second, middle=middle, reach=reach) -> Plane:
+        def of(
+            x: np.ndarray,
+            base: Plane = base,
+            first: np.ndarray = first,
+            second: np.ndarray = second,
+            middle: np.ndarray = middle,
+            reach: float = reach,
+        ) -> Plane:
             normal = base.normal + x[0] * first + x[1] * second
             normal = normal / np.linalg.norm(normal)
             return Plane(normal, float(-(middle @ normal) + base.heights(middle) + x[2] * reach))

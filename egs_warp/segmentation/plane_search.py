@@ -174,8 +174,8 @@ def plane_views(
     """Pictures of the surroundings of ``centre`` (3,) in which the plane is masked.
 
     The masks are the pixels whose rendered point lies within ``band`` (default 3 % of ``radius``) of the plane and
-    within ``radius`` of ``centre`` along it, less those of ``object_mask`` (n,) bool Gaussians. Cameras below the plane,
-    and those that see nothing of it, do not count; of more than ``max_views``, some are picked evenly.
+    within ``radius`` of ``centre`` along it, less those of ``object_mask`` (n,) bool Gaussians. Cameras below the
+    plane, and those that see nothing of it, do not count; of more than ``max_views``, some are picked evenly.
     """
     band = band or _BAND * radius
     above = [camera for camera in cameras if plane.heights(camera.centre) > 0.1 * radius]

@@ -80,8 +80,8 @@ def check_size(view: MaskedView) -> None:
     height, width = view.camera.height, view.camera.width
     if view.mask.shape != (height, width):
         raise UserError(
-            f"{view.name}: the mask is {view.mask.shape[1]} x {view.mask.shape[0]} pixels, its camera {width} x {height}; "
-            "make it at the photo's size"
+            f"{view.name}: the mask is {view.mask.shape[1]} x {view.mask.shape[0]} pixels, its camera {width} x"
+            f" {height}; make it at the photo's size"
         )
 
 

@@ -248,7 +248,9 @@ def cameras_extent(cameras: Sequence[Camera]) -> float:
 
 
 def scene_extent(cameras: Sequence[Camera], cloud: GaussianCloud) -> float:
-    """Length that the step size of the means is measured by: 1.1 times the cameras' radius, or the cloud's if smaller."""
+    """Length that the step size of the means is measured by:
+    1.1 times the cameras' radius, or the cloud's if smaller.
+    """
     centres = np.array([camera.centre for camera in cameras])
     of_cameras = 1.1 * float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     means = cloud.means.numpy()

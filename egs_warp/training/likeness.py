@@ -7,7 +7,9 @@ import torch
 
 
 def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Mean structural similarity of two pictures (H, W, 3) in 0 to 1: 11 x 11 Gaussian window, sigma 1.5, zero padding."""
+    """Mean structural similarity of two pictures (H, W, 3) in 0 to 1:
+    11 x 11 Gaussian window, sigma 1.5, zero padding.
+    """
     offsets = torch.arange(-5.0, 6.0, device=a.device)
     line = torch.exp(-(offsets**2) / (2 * 1.5**2))
     line = line / line.sum()

@@ -1,4 +1,7 @@
-"""Photos that do not fit the others, by what is left of them when all others fit: a wrong pose, or something that moved."""
+"""Photos that do not fit the others, by what is left of them when all others fit.
+
+Their pose is wrong, or something moved.
+"""
 
 from __future__ import annotations
 

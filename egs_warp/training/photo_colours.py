@@ -58,8 +58,8 @@ def photographs_in_colours_of(cloud: GaussianCloud, posed: Sequence[PosedImage])
 
 
 def in_colours_of(reference: np.ndarray, photo: np.ndarray, shared: np.ndarray) -> np.ndarray:
-    """(H, W, 3) float32: ``photo`` (H, W, 3) with the exposure and white balance of ``reference`` (H, W, 3), as the pixels
-    ``shared`` (H, W) bool tell them: what is trained against it must not change colour beside what is not.
+    """(H, W, 3) float32: ``photo`` (H, W, 3) with the exposure and white balance of ``reference`` (H, W, 3), as the
+    pixels ``shared`` (H, W) bool tell them: what is trained against it must not change colour beside what is not.
 
     The three channels are mixed linearly, by least squares over the three quarters that agree best; without 100 shared
     pixels nothing changes.

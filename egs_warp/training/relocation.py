@@ -54,8 +54,10 @@ class Population:
         )
 
     def step(self, *, done: float, settling: bool = False) -> None:
-        """One step of Adam; the rate of the means falls to a hundredth as ``done`` goes from 0 to 1, and with ``settling``
-        the others to a tenth over the last part."""
+        """One step of Adam; the rate of the means falls to a hundredth as ``done`` goes from 0 to 1.
+
+        With ``settling`` the others fall to a tenth over the last part.
+        """
         late = max(0.0, done - _SETTLING_FROM) / (1 - _SETTLING_FROM) if settling else 0.0
         for group in self._optimiser.param_groups:
             group["lr"] = self._rates[group["name"]] * (0.01**done if group["name"] == "means" else _SETTLED**late)
@@ -79,8 +81,11 @@ class Population:
 
     @torch.no_grad()
     def evolve(self, step: int, steps: int, growth: Growth) -> None:
-        """Jitter the means; now and then move faint Gaussians onto opaque ones and grow: to a cap that was asked for by
-        half time, else at the least pace while ``growth`` lets them."""
+        """Jitter the means; now and then move faint Gaussians onto opaque ones and grow.
+
+        A cap that was asked for is reached by half time; else the number grows at the least pace, while ``growth``
+        lets it.
+        """
         self._jitter()
         # The last fifth of the steps settles what is there.
         if step % _EVERY != _EVERY - 1 or step > 0.8 * steps:

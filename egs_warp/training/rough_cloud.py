@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
@@ -78,12 +78,12 @@ def rough_cloud(
 def cloud_from_points(
     points: SparsePoints, *, count: int | None, sh_degree: int, seed: int = 0, device: str | None = None
 ) -> GaussianCloud:
-    """Round Gaussians at the triangulated ``points``, at most ``count`` of them, each as large as the three nearest are far."""
+    """Round Gaussians at ``points``, at most ``count`` of them, each as large as its three nearest are far."""
     positions, colours = points.positions, points.colours
     if count is not None and len(positions) > count:
         chosen = np.sort(np.random.default_rng(seed).permutation(len(positions))[:count])
         positions, colours = positions[chosen], colours[chosen]
-    near = cKDTree(positions).query(positions, k=4)[0][:, 1:]
+    near = KDTree(positions).query(positions, k=4)[0][:, 1:]
     spacing = np.sqrt(np.mean(near**2, axis=1))
     # Points on one spot have no room at all.
     spacing = np.maximum(spacing, 1e-3 * np.median(spacing))

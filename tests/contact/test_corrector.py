@@ -1,4 +1,6 @@
-"""The corrector (Eq. 4, 8, 9): a dropped body comes to rest, and a step obeys contact, friction and the balance of momentum."""
+"""The corrector (Eq. 4, 8, 9): a dropped body comes to rest, and a step obeys contact,
+friction and the balance of momentum.
+"""
 
 from __future__ import annotations
 
@@ -85,7 +87,9 @@ def passive(body: SoftBody, detector: ContactDetector, lift: float = 0.0) -> Pas
 
 
 def test_dropped_body_comes_to_rest_without_gaining_energy() -> None:
-    """Eq. (4), Eq. (9): dropped from H/2 with muscles off, no step adds more than 1e-7 m g H, and it ends at rest on its base."""
+    """Eq. (4), Eq. (9): dropped from H/2 with muscles off, no step adds more than 1e-7 m g H,
+    and it ends at rest on its base.
+    """
     body, detector = block_on(Plane(np.array([0.0, 0.0, 1.0]), 0.0))
     falling = passive(body, detector, 0.5 * body.height)
     unit = body.weight * body.height
@@ -112,8 +116,8 @@ def test_dropped_body_comes_to_rest_without_gaining_energy() -> None:
 def test_block_on_an_incline_sticks_or_slides(degrees: float) -> None:
     """Eq. (9), closed form: with mu = 0.4 it sticks at 15 degrees and at 30 slides with a = g (sin - mu cos), to 2 %.
 
-    Gravity is turned instead of the floor; the block is stiff and flat (it must not tip), starts at rest, and its mean over 20
-    steps is taken.
+    Gravity is turned instead of the floor; the block is stiff and flat (it must not tip), starts at rest, and its mean
+    over 20 steps is taken.
     """
     angle, friction = np.radians(degrees), 0.4
     body, detector = block_on(

@@ -144,7 +144,9 @@ def test_gaussians_below_the_plane_are_left_out_and_counted() -> None:
 
 
 def test_contact_frame_maps_nodes_to_points(device: str) -> None:
-    """Eq. (8): frame rows give normal and tangential velocity of each point; axes are orthonormal; end gaps are linear."""
+    """Eq. (8): frame rows give normal and tangential velocity of each point; axes are orthonormal;
+    end gaps are linear.
+    """
     mesh = block_mesh()
     slope = Plane.from_coefficients(0.4, -0.2, 1.0, 0.3)
     geometry = contact_geometry(surface_cloud(mesh, 200, lowest=0.1), mesh, (slope,), device=device)
@@ -190,7 +192,9 @@ def test_independent_contacts_are_well_conditioned() -> None:
 
 
 def test_push_out_speed_and_tangent_directions() -> None:
-    """Eq. (8): c = u_n + min(phi, 0) b / dt + max(phi, 0) / dt with b = 1/2, the push-out capped; D is a regular star."""
+    """Eq. (8): c = u_n + min(phi, 0) b / dt + max(phi, 0) / dt with b = 1/2, the push-out capped;
+    D is a regular star.
+    """
     shift = push_out_speeds(np.array([0.02, 0.0, -0.004, -1.0]), 0.1, 0.3)
     assert shift.tolist() == pytest.approx([0.2, 0.0, -0.02, -0.3])
     for count in (4, 6, 8):
@@ -222,7 +226,9 @@ def assert_coulomb(
 @pytest.mark.parametrize(("count", "unknowns"), [(1, 6), (4, 20), (12, 60), (12, 24), (40, 150), (40, 60)])
 @pytest.mark.parametrize("friction", [0.0, 0.3, 0.8])
 def test_coulomb_forces_on_random_problems(count: int, unknowns: int, friction: float) -> None:
-    """Eq. (8), Eq. (9): complementarity and exact cone; with fewer unknowns than rows G is singular, and one contact is doubled."""
+    """Eq. (8), Eq. (9): complementarity and exact cone;
+    with fewer unknowns than rows G is singular, and one contact is doubled.
+    """
     for seed in range(4):
         rng = np.random.default_rng(seed)
         rows = rng.standard_normal((3 * count, unknowns)) * rng.uniform(0.3, 2.0, unknowns)
@@ -256,7 +262,9 @@ def block_on_incline(angle: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def test_block_on_an_incline() -> None:
-    """Eq. (9), closed form: sticks while tan < mu, else slides with a = g (sin - mu cos) and friction mu m g cos uphill."""
+    """Eq. (9), closed form: sticks while tan < mu,
+    else slides with a = g (sin - mu cos) and friction mu m g cos uphill.
+    """
     friction, dt = 0.5, 0.01
     for angle in np.radians([5.0, 20.0, 26.0, 27.2, 35.0, 42.0]):
         delassus, acceleration, _ = block_on_incline(angle)

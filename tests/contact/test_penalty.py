@@ -47,7 +47,9 @@ def random_penalty(body: SoftBody) -> tuple[PenaltyContact, np.ndarray]:
 
 
 def test_penalty_derivatives(body: SoftBody) -> None:
-    """Eq. (10), Eq. (11): gradient and Hessian by central differences, away from the kinks; the matrix is what is added."""
+    """Eq. (10), Eq. (11): gradient and Hessian by central differences, away from the kinks;
+    the matrix is what is added.
+    """
     penalty, v = random_penalty(body)
     assembly = body.assembly
     entries = np.zeros(assembly.upper_pattern.nnz)
@@ -65,7 +67,9 @@ def test_penalty_derivatives(body: SoftBody) -> None:
 
 
 def test_friction_never_exceeds_coulomb(body: SoftBody) -> None:
-    """Eq. (11) as corrected: one two-dimensional tangential velocity, so |f_t| = min(k |u_t|, cap), straight against it."""
+    """Eq. (11) as corrected: one two-dimensional tangential velocity, so |f_t| = min(k |u_t|, cap),
+    straight against it.
+    """
     penalty, v = random_penalty(body)
     for speed in (1e-3, 1.0, 1e3):
         force = penalty.forces(speed * v)
@@ -77,7 +81,9 @@ def test_friction_never_exceeds_coulomb(body: SoftBody) -> None:
 
 
 def test_resting_body_creeps_at_the_chosen_speed(body: SoftBody) -> None:
-    """Eq. (10): the penalty is a dashpot, so a resting body sinks at weight / sum k_n = 5e-3 H/s and its forces hold the weight."""
+    """Eq. (10): the penalty is a dashpot, so a resting body sinks at weight / sum k_n = 5e-3 H/s and its forces hold
+    the weight.
+    """
     base = np.array([[x, y, 0.0] for x in (-0.2, 0.0, 0.2) for y in (-0.2, 0.0, 0.2)])
     contacts = contacts_at(body, base)
     assert np.abs(contacts.gaps).max() < 1e-12
@@ -96,7 +102,9 @@ def test_resting_body_creeps_at_the_chosen_speed(body: SoftBody) -> None:
 
 
 def test_prediction_pushes_out_of_the_plane_and_balances_momentum(body: SoftBody) -> None:
-    """Eq. (4), Eq. (10): m dv_com = dt (m g + sum f) to Newton's tolerance; a point in the plane gets b phi / dt of push-out."""
+    """Eq. (4), Eq. (10): m dv_com = dt (m g + sum f) to Newton's tolerance;
+    a point in the plane gets b phi / dt of push-out.
+    """
     base = np.array([[x, y, 0.0] for x in (-0.2, 0.2) for y in (-0.2, 0.2)])
     contacts = contacts_at(body, base)
     sunk = replace(contacts, gaps=np.full(4, -0.01))

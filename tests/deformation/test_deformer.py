@@ -89,8 +89,8 @@ def test_colour_turns_exactly_where_euler_angles_are_arbitrary(device: str) -> N
 
 
 def test_turning_the_object_is_turning_the_camera(device: str) -> None:
-    """Eq. (15): the picture of the turned object is that of the object seen by a camera turned the other way, to 1e-4 in linear
-    colour, with bands 1 to 3 at full strength."""
+    """Eq. (15): the picture of the turned object is that of the object seen by a camera turned the other way, to 1e-4
+    in linear colour, with bands 1 to 3 at full strength."""
     mesh, cloud = box(), random_cloud(300, degree=3, device=device)
     turn = Rotation.from_rotvec([0.7, -2.1, 0.4]).as_matrix()
     turned = deform(cloud, embed_gaussians(cloud, mesh), mesh.nodes @ turn.T).cloud
@@ -141,8 +141,8 @@ def test_an_affine_cage_carries_flat_splats_exactly(device: str) -> None:
 
 
 def test_arms_go_where_their_ends_go(device: str) -> None:
-    """Eq. (14): (F+ + F-)/2 from the carried ends, in float64, gives the carried covariance: for ends in the same tetrahedron, in the
-    next one and beyond, where the cage is bent and shaken."""
+    """Eq. (14): (F+ + F-)/2 from the carried ends, in float64, gives the carried covariance: for ends in the same
+    tetrahedron, in the next one and beyond, where the cage is bent and shaken."""
     mesh, cloud = box((4, 4, 4)), random_cloud(400, degree=0, scale=0.15, device=device)
     rng = np.random.default_rng(2)
     positions = bent(mesh.nodes, 1.0) + 0.02 * rng.normal(size=mesh.nodes.shape)

@@ -63,8 +63,8 @@ def test_children_keep_mean_and_covariance(rule: SplitRule, device: str) -> None
 
 
 def profile_error(opacity: float, rule: SplitRule, tilt: float) -> float:
-    """Largest difference, over the opacity, between the pictures of a round needle and of its children. The needle's axis
-    makes the angle ``tilt`` with the line of sight; its thickness is 0.3 of its length."""
+    """Largest difference, over the opacity, between the pictures of a round needle and of its children. The needle's
+    axis makes the angle ``tilt`` with the line of sight; its thickness is 0.3 of its length."""
     offsets, shrink = child_layout(rule)
     peaks = child_opacities(np.array([opacity]), rule)[0]
     x = np.linspace(-4.0, 4.0, 401)
@@ -80,8 +80,8 @@ def profile_error(opacity: float, rule: SplitRule, tilt: float) -> float:
 
 @pytest.mark.parametrize("opacity", [0.05, 0.2, 0.5, 0.8, 0.9, 0.99])
 def test_a_split_is_hard_to_see_from_the_side_and_from_the_end(opacity: float) -> None:
-    """Eq. (17): side-on the picture changes by at most 8 % of the opacity; end-on by a third for a faint one; the paper's
-    two humps change it by a third and more side-on."""
+    """Eq. (17): side-on the picture changes by at most 8 % of the opacity; end-on by a third for a faint one; the
+    paper's two humps change it by a third and more side-on."""
     side, end = (profile_error(opacity, SplitRule.MEASURED, tilt) for tilt in (np.pi / 2, 0.0))
     assert side < 0.08
     assert end < 0.33
@@ -117,8 +117,8 @@ def test_an_affine_motion_splits_nothing() -> None:
 
 
 def test_nothing_pops_in_an_animation_that_splits() -> None:
-    """Eq. (17): over a bend that grows, frames of the cloud that was split for the motion follow each other as smoothly as
-    those of the unsplit one; a cloud that is split in the middle of it is caught by the same measure."""
+    """Eq. (17): over a bend that grows, frames of the cloud that was split for the motion follow each other as smoothly
+    as those of the unsplit one; a cloud that is split in the middle of it is caught by the same measure."""
     mesh = box((24, 2, 2), (4.0, 0.4, 0.4))
     cloud = bar_cloud()
     frames = [bent(mesh.nodes, 4.0 / angle) for angle in np.linspace(1.0, 1.02, 17)]

@@ -1,4 +1,6 @@
-"""The soft body: mass, momenta, energy, best-fit rotation, and the elasticity and damping that follow from its height."""
+"""The soft body: mass, momenta, energy, best-fit rotation,
+and the elasticity and damping that follow from its height.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,9 @@ def test_damping_ratio_of_the_first_mode(body: SoftBody) -> None:
 
 
 def test_momenta_of_a_rigid_motion(body: SoftBody) -> None:
-    """For v = u + omega x (x - c): the centre moves with u, L = I omega, kinetic energy = m u^2/2 + omega . I omega / 2."""
+    """For v = u + omega x (x - c): the centre moves with u, L = I omega,
+    kinetic energy = m u^2/2 + omega . I omega / 2.
+    """
     x = body.mesh.nodes @ Rotation.from_rotvec([0.1, 0.7, -0.4]).as_matrix().T + [0.3, 0.2, 1.0]
     centre = body.centre_of_mass(x)
     u, omega = np.array([1.0, -0.5, 2.0]), np.array([0.3, 1.1, -0.7])

@@ -93,8 +93,8 @@ def test_meld_takes_the_gradients_and_drops_the_step() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_no_island_of_what_lies_far_from_the_hole(seed: int) -> None:
-    """A hole in an unevenly lit pale sheet on dark boards, with little of the sheet left around it, gets no dark patch; a
-    crack that runs through a hole in the boards goes on."""
+    """A hole in an unevenly lit pale sheet on dark boards, with little of the sheet left around it, gets no dark patch;
+    a crack that runs through a hole in the boards goes on."""
     random = np.random.default_rng(seed)
     image = np.full((128, 128, 3), (0.42, 0.36, 0.33)) + random.normal(0.0, 0.02, (128, 128, 1))
     image[:, 108:111] = 0.1

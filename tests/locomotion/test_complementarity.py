@@ -1,4 +1,6 @@
-"""Contact states as bounds (Eq. 9, 12, 13): each state's rows, and moves between states against brute force over all of them."""
+"""Contact states as bounds (Eq. 9, 12, 13):
+each state's rows, and moves between states against brute force over all of them.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ def obeys(program: ContactProgram, y: np.ndarray, states: np.ndarray) -> bool:
 
 
 def test_rows_are_the_terms_of_the_lcp() -> None:
-    """Eq. (9), Eq. (13): rows A y + offset are y, c = u_n + shift, D^T u + E lambda and mu f_n - E^T f_t, one by one."""
+    """Eq. (9), Eq. (13): rows A y + offset are y, c = u_n + shift, D^T u + E lambda and mu f_n - E^T f_t,
+    one by one.
+    """
     problem = small_problem(0, contacts=3, directions=6)
     program, layout = problem.program, problem.program.layout
     y = np.random.default_rng(1).standard_normal(layout.variables)
@@ -48,7 +52,9 @@ def test_rows_are_the_terms_of_the_lcp() -> None:
 
 
 def test_every_state_satisfies_the_complementarity_conditions() -> None:
-    """Eq. (9), Eq. (13): whatever the states, a feasible point has 0 <= x, 0 <= w, x.w = 0, and moves as its states say."""
+    """Eq. (9), Eq. (13): whatever the states, a feasible point has 0 <= x, 0 <= w, x.w = 0,
+    and moves as its states say.
+    """
     feasible = between = 0
     for seed in range(8):
         problem = small_problem(seed)
@@ -99,7 +105,8 @@ def test_states_of_pairs_are_states_the_point_obeys() -> None:
 
 
 def test_moves_are_feasible_and_almost_always_better() -> None:
-    """DESIGN 8: the optimum of any states obeys the states of each proposed move, and of all together; most moves are better.
+    """DESIGN 8: the optimum of any states obeys the states of each proposed move, and of all together; most moves are
+    better.
 
     A move that one multiplier proposes without regard to the contact's other rows is often not feasible at all.
     """
@@ -132,7 +139,9 @@ def test_moves_are_feasible_and_almost_always_better() -> None:
 
 
 def test_moves_name_the_contact_that_helps() -> None:
-    """DESIGN 8: a closed contact that holds the body down is opened, an open one that could help is closed to sliding."""
+    """DESIGN 8: a closed contact that holds the body down is opened,
+    an open one that could help is closed to sliding.
+    """
     layout = ContactLayout(0, 1, 4)
     zeros, lam = np.zeros(6), slice(5, 6)
 

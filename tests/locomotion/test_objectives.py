@@ -81,7 +81,9 @@ def place(part: BodyPart, frame: Coordinates, positions: np.ndarray) -> np.ndarr
 @by_part
 @by_frame
 def test_part_rows_are_the_rate_of_the_parts_place(part: BodyPart, frame: Coordinates) -> None:
-    """Velocity, position and acceleration of a part: rows by differences; a velocity that meets the target brings what is asked."""
+    """Velocity, position and acceleration of a part: rows by differences;
+    a velocity that meets the target brings what is asked.
+    """
     state, dt = shaken_state(), 0.01
     v = np.random.default_rng(4).standard_normal(state.positions.shape)
     rate = rate_of(lambda x: place(part, frame, x), state, v)
@@ -100,7 +102,9 @@ def test_part_rows_are_the_rate_of_the_parts_place(part: BodyPart, frame: Coordi
 @by_part
 @by_frame
 def test_momentum_rows_measure_the_angular_momentum_in_metres_a_second(part: BodyPart, frame: Coordinates) -> None:
-    """Sum of m (x - c) x (v - v_c) over the part, about its own centre or that of the body; a rigid turn gives inertia x omega."""
+    """Sum of m (x - c) x (v - v_c) over the part, about its own centre or that of the body;
+    a rigid turn gives inertia x omega.
+    """
     state = shaken_state()
     v = np.random.default_rng(5).standard_normal(state.positions.shape)
     origin = BODY.centre_of_mass if frame.relative else part.centre
@@ -132,7 +136,9 @@ def test_turning_rows_are_the_rate_of_the_best_fit_rotation_of_a_rigid_part(part
 
 
 def test_area_rows_are_the_rate_of_the_area_of_the_base() -> None:
-    """dA/dt of the hull of the base seen along a tilted up, by differences; the target closes the gap at the asked rate."""
+    """dA/dt of the hull of the base seen along a tilted up, by differences;
+    the target closes the gap at the asked rate.
+    """
     part, state, up = BodyPart.base(BODY, HEIGHTS), shaken_state(), TURNED[2]
     v = np.random.default_rng(6).standard_normal(state.positions.shape)
     plane = np.stack([TURNED[0], TURNED[1]])

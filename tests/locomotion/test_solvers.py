@@ -21,7 +21,9 @@ def random_program(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @SOLVERS
 def test_closed_form(solver: QpSolver, accuracy: float) -> None:
-    """min (x-2)^2 + (y+1)^2 with x <= 1, y free: (1, -1), and the multiplier is positive where the upper bound pushes."""
+    """min (x-2)^2 + (y+1)^2 with x <= 1, y free:
+    (1, -1), and the multiplier is positive where the upper bound pushes.
+    """
     program = quadratic_program(2 * np.eye(2), np.array([-4.0, 2.0]), np.eye(2), solver=solver)
     solution = program.solve(np.array([-np.inf, -np.inf]), np.array([1.0, np.inf]))
     assert solution.status is QpStatus.SOLVED
@@ -32,7 +34,9 @@ def test_closed_form(solver: QpSolver, accuracy: float) -> None:
 
 @SOLVERS
 def test_bounds_only_updates_give_the_optimum_of_a_fresh_set_up(solver: QpSolver, accuracy: float) -> None:
-    """Eq. (13): rows switch between free, one-sided and held, as contact states do; KKT holds and x is that of a fresh solver."""
+    """Eq. (13): rows switch between free, one-sided and held, as contact states do;
+    KKT holds and x is that of a fresh solver.
+    """
     P, q, A = random_program(0)
     for rows in (A, np.vstack([np.eye(20), A[:10]])):  # plain bounds first, as the contact program has them
         rng = np.random.default_rng(1)
@@ -78,7 +82,9 @@ def test_rows_that_repeat_each_other_may_all_be_held(solver: QpSolver, accuracy:
 
 
 def test_an_iteration_limit_is_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the limit the point may be read if it nearly obeys its bounds; one that does not has a false, low objective."""
+    """At the limit the point may be read if it nearly obeys its bounds;
+    one that does not has a false, low objective.
+    """
     P, q, A = random_program(0)
     program = quadratic_program(P, q, A, accuracy=1e-30)
     near = program.solve(np.zeros(30), np.full(30, np.inf))

@@ -1,4 +1,6 @@
-"""The two-stage stepper (Eq. 12, 13): every step audited by hand, bit-identical runs, subdivision of a step that fails."""
+"""The two-stage stepper (Eq. 12, 13): every step audited by hand, bit-identical runs,
+subdivision of a step that fails.
+"""
 
 from __future__ import annotations
 
@@ -72,7 +74,9 @@ def run_hop(stepper: LocomotionStepper, steps: int) -> tuple[list[BodyState], li
 
 
 def test_audit_of_a_hop(device: str) -> None:
-    """Eq. (4), Eq. (9), Eq. (12), Eq. (13): momentum 1e-5, angular 1e-4, cone 1e-4, complementarity 1e-4, penetration 0.01."""
+    """Eq. (4), Eq. (9), Eq. (12), Eq. (13):
+    momentum 1e-5, angular 1e-4, cone 1e-4, complementarity 1e-4, penetration 0.01.
+    """
     stepper = muscular_block(device)
     body = stepper.body
     states, reports = run_hop(stepper, 16)
@@ -148,7 +152,9 @@ def test_degenerate_contact_sets_never_lose_a_frame(feet: np.ndarray, solver: Qp
 
 @pytest.mark.parametrize("strategy", [Strategy.STATIC, Strategy.QPCC, Strategy.TWO_STAGE])
 def test_every_strategy_drives_the_stepper(strategy: Strategy) -> None:
-    """Eq. (12), Eq. (13): the same steps with another search; all static takes one QP, two where that has no solution."""
+    """Eq. (12), Eq. (13): the same steps with another search;
+    all static takes one QP, two where that has no solution.
+    """
     settings = LocomotionSettings(strategy=strategy, qp_limit=6, qp_solver=QpSolver.DAQP)
     _, reports = run_hop(muscular_block(settings=settings), 6)
     assert all(report.converged for report in reports)
@@ -169,7 +175,9 @@ class LateStepper(LocomotionStepper):
 
 @pytest.mark.parametrize(("longest", "parts"), [(1.0, 1), (0.6, 2), (0.3, 4), (0.01, 16)])
 def test_a_step_that_does_not_converge_is_subdivided(longest: float, parts: int) -> None:
-    """Halved until it converges, four times over at most; the parts make up the step and the last failure stays reported."""
+    """Halved until it converges, four times over at most;
+    the parts make up the step and the last failure stays reported.
+    """
     made = muscular_block()
     stepper = LateStepper(made.body, made.muscles, made.geometry, device="cpu")
     stepper.longest = longest * DT

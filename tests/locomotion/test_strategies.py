@@ -55,7 +55,9 @@ def test_two_stage_against_brute_force(solver: QpSolver) -> None:
 
 
 def test_order_of_the_strategies() -> None:
-    """Over many problems: exact <= two-stage <= qpcc <= static in the mean, and two-stage takes far fewer QPs than exact."""
+    """Over many problems: exact <= two-stage <= qpcc <= static in the mean,
+    and two-stage takes far fewer QPs than exact.
+    """
     means, counts = {}, {}
     problems = [small_problem(seed, contacts=3).program for seed in range(30)]
     for strategy in Strategy:
@@ -67,7 +69,9 @@ def test_order_of_the_strategies() -> None:
 
 
 def test_the_limit_is_kept_and_more_qps_are_never_worse() -> None:
-    """One more QP never raises the objective; at the limit, thrice that where the best is in doubt, the best so far is returned."""
+    """One more QP never raises the objective;
+    at the limit, thrice that where the best is in doubt, the best so far is returned.
+    """
     for seed in range(8):
         program = small_problem(seed, contacts=3).program
         last = np.inf
@@ -110,7 +114,9 @@ def degenerate_frames() -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("name", list(degenerate_frames()))
 @pytest.mark.parametrize("solver", list(QpSolver))
 def test_degenerate_contact_sets_never_lose_a_frame(name: str, solver: QpSolver) -> None:
-    """Every contact in one line, duplicates, one point, 40 points on a rigid base: a finite answer that obeys every pair."""
+    """Every contact in one line, duplicates, one point, 40 points on a rigid base:
+    a finite answer that obeys every pair.
+    """
     frame = degenerate_frames()[name]
     for seed in range(4):
         program = small_problem(seed, contacts=len(frame) // 3, activations=4, frame=frame).program
@@ -121,7 +127,9 @@ def test_degenerate_contact_sets_never_lose_a_frame(name: str, solver: QpSolver)
 
 
 def test_states_that_contradict_each_other_are_replaced() -> None:
-    """Points of one rigid place whose gaps differ cannot all be static: the search starts from what contact would do."""
+    """Points of one rigid place whose gaps differ cannot all be static:
+    the search starts from what contact would do.
+    """
     frame = degenerate_frames()["same"]
     problem = small_problem(1, contacts=6, frame=frame)
     program = replace(problem.program, offset=problem.program.offset.copy())

@@ -18,7 +18,9 @@ GRAVITY = np.array([0.0, 0.0, -9.81])
 
 @pytest.fixture
 def flight() -> Trajectory:
-    """A rigid block that takes off with (1, 0, 2) m/s and is posed turning about the vertical, by the implicit integrator's own rule."""
+    """A rigid block that takes off with (1, 0, 2) m/s and is posed turning about the vertical,
+    by the implicit integrator's own rule.
+    """
     mesh = block_mesh()
     mass = mesh.lumped_masses(1000.0)
     steps = 20

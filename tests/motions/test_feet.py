@@ -51,7 +51,9 @@ def test_other_bodies_have_other_numbers_of_feet_and_do_not_walk(mesh, height: f
 
 
 def made_trajectory() -> Trajectory:
-    """Six steps of a stool of 100 kg: foot 0 slides 1 mm a step under load for three, swings 50 mm in one, and stands still for two."""
+    """Six steps of a stool of 100 kg: foot 0 slides 1 mm a step under load for three, swings 50 mm in one,
+    and stands still for two.
+    """
     strides = np.array([0.0, 0.001, 0.001, 0.001, 0.05, 0.0, 0.0]).cumsum()
     leg = FEET[0].leg[:, None] > 0
     positions = STOOL.nodes + strides[:, None, None] * leg * [1.0, 0.0, 0.0]

@@ -1,4 +1,6 @@
-"""Following key frames: what is measured of a posed block, what is asked of the next step, and what is said of missed keys."""
+"""Following key frames: what is measured of a posed block, what is asked of the next step,
+and what is said of missed keys.
+"""
 
 from __future__ import annotations
 
@@ -158,7 +160,9 @@ def drifting(place: Place, speed: float, time: float) -> BodyState:
 
 
 def test_a_trajectory_rests_once_the_body_is_slow_and_at_last_in_any_case(place: Place) -> None:
-    """Slow from some time on, it rests 0.3 sqrt(H / g) later; never slow, 9 sqrt(H / g) after the last key, which is noted."""
+    """Slow from some time on, it rests 0.3 sqrt(H / g) later;
+    never slow, 9 sqrt(H / g) after the last key, which is noted.
+    """
     unit = np.sqrt(place.body.height / 9.81)
     for slow_from, rest in ((0.0, 0.5 + 0.3 * unit), (1.2, 1.2 + 0.3 * unit), (np.inf, 0.5 + 9.0 * unit)):
         follow = Follow(place, [key(0.5, "head", Quantity.POSITION, (0.0, 0.0, 0.0))])
@@ -203,7 +207,9 @@ def test_a_turn_is_reached_the_way_round_that_was_asked(place: Place, part: str,
 
 @pytest.mark.parametrize("behind", [0.0, 20.0, 190.0])
 def test_a_turn_over_half_is_steered_the_way_round_that_was_asked(place: Place, behind: float) -> None:
-    """Late in a turn by 350 degrees the asked rate is that of the curve, and more for what the body is behind, however far."""
+    """Late in a turn by 350 degrees the asked rate is that of the curve, and more for what the body is behind,
+    however far.
+    """
     follow = Follow(place, [key(2.0, "body", Quantity.ORIENTATION, (0.0, 0.0, 350.0))])
     (channel,), body = follow.channels, place.body
     follow.objectives(spun(place, 0.0, 0.0), None, DT)

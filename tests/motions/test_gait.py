@@ -15,7 +15,9 @@ GAIT = Gait.of(4, 0.1, height=1.0, gravity=9.81)
 
 @given(st.integers(1, 12), st.floats(0.02, 0.3))
 def test_footprints_alternate_and_close(steps: int, length: float) -> None:
-    """Each step sets a pair one step length ahead of the other, the last swing closes the feet at the whole distance."""
+    """Each step sets a pair one step length ahead of the other,
+    the last swing closes the feet at the whole distance.
+    """
     gait = Gait.of(steps, length, height=0.7, gravity=9.81)
     pairs = [0.0, 0.0]
     for swing in range(gait.swings):
@@ -36,7 +38,9 @@ def test_the_centre_of_mass_moves_evenly_and_is_over_the_standing_pair_in_mid_sw
 
 
 def test_a_swinging_foot_leaves_and_lands_at_rest() -> None:
-    """Height and way by differences at both ends; it is highest inside, goes forward only, and is up before it goes far."""
+    """Height and way by differences at both ends;
+    it is highest inside, goes forward only, and is up before it goes far.
+    """
     near = 1e-4
     for end in (0.0, 1.0):
         inside = end + near * (1.0 - 2.0 * end)

@@ -28,7 +28,9 @@ def test_json_and_csv_say_the_same(tmp_path: Path) -> None:
         written(
             tmp_path,
             "k.csv",
-            "time, part, quantity, x, y, z, weight\n0.5, head, position, 0.1, 0, -0.05,\n\n1, body, orientation, 0, 0, 30, 2\n",
+            "time, part, quantity, x, y, z, weight\n"
+            "0.5, head, position, 0.1, 0, -0.05,\n\n"
+            "1, body, orientation, 0, 0, 30, 2\n",
         )
     )
     assert [(k.time, k.part, k.quantity, k.value, k.weight) for k in from_json] == [

@@ -1,4 +1,6 @@
-"""Motions in a row, and leaps to a place, on a block that is posed by hand: geometry and bookkeeping without a simulation."""
+"""Motions in a row, and leaps to a place, on a block that is posed by hand:
+geometry and bookkeeping without a simulation.
+"""
 
 from __future__ import annotations
 
@@ -172,7 +174,9 @@ def test_a_landing_frame_holds_the_landed_body(place: Place) -> None:
 
 @pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.0 * np.pi])
 def test_a_twist_asks_friction_for_the_spin_that_is_left(place: Place, turn: float) -> None:
-    """In the thrust: up x L = I (angle left) / (time in the air) with a reserve; its own turning is counted beyond half turns."""
+    """In the thrust: up x L = I (angle left) / (time in the air) with a reserve;
+    its own turning is counted beyond half turns.
+    """
     twist = Twist(place, JumpTarget(0.0, 0.2), turn)
     twist.phase = JumpPhase.THRUST
     still = np.zeros_like(place.standing)

@@ -65,8 +65,8 @@ def test_a_walk_goes_along_its_feet_and_refuses_other_bodies() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("slope", [0.0, 5.0])
 def test_a_coarse_stool_takes_a_step(slope: float) -> None:
-    """One step, up a slope too, and the closing one: each foot lands once, none slips 2 % of the stride, the distance is met, the
-    audit holds."""
+    """One step, up a slope too, and the closing one: each foot lands once, none slips 2 % of the stride, the distance
+    is met, the audit holds."""
     tilt = np.radians(slope)
     up = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
     stepper, place, state = standing(stool(), forward=np.array([1.0, 0.0, 0.0]), up=up)

@@ -211,7 +211,9 @@ def test_oblique_fibres_twist_by_their_hand_and_hoops_do_not(column_body: SoftBo
 
 
 def test_hoops_make_no_axial_torque_between_halves(column_muscles: MuscleSet) -> None:
-    """A planar hoop's forces turn neither half of the body about the axis, whatever its activations (erratum, DESIGN 6)."""
+    """A planar hoop's forces turn neither half of the body about the axis,
+    whatever its activations (erratum, DESIGN 6).
+    """
     columns = muscle_columns(column_muscles, COLUMN.nodes).reshape(-1, 3, column_muscles.segment_count)
     x = COLUMN.nodes
     torque = x[:, 0, None] * columns[:, 1] - x[:, 1, None] * columns[:, 0]

@@ -134,7 +134,9 @@ def test_every_branch_gets_every_kind_of_fibre(make: Callable[[], TetMesh], bran
 
 
 def test_legs_bend_both_ways_at_once() -> None:
-    """Each leg of a four-legged body has three segments or more on each of four sides, and muscles that do not crumple it."""
+    """Each leg of a four-legged body has three segments or more on each of four sides,
+    and muscles that do not crumple it.
+    """
     mesh = stool()
     muscles = automatic_muscles(mesh, UP, body_weight=100.0, height=0.8, young_modulus=1e4)
     longitudinal = muscles.segments_of_kind(FibreKind.LONGITUDINAL)

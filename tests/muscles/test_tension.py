@@ -122,7 +122,9 @@ def press(rod: SoftBody, load: float, *, follows: bool) -> np.ndarray:
 
 
 def test_a_tendon_holds_the_rod_straight_that_its_dead_load_buckles(rod: SoftBody) -> None:
-    """A tendon inside a rod cannot buckle it (its thrust bends with the rod); with its direction frozen over a step it does."""
+    """A tendon inside a rod cannot buckle it (its thrust bends with the rod);
+    with its direction frozen over a step it does.
+    """
     second_moment, length = 0.08**4 / 12, 0.9
     euler = np.pi**2 * rod.young_modulus * second_moment / (4 * length**2)
     straight, buckled = press(rod, 8.0 * euler, follows=True), press(rod, 8.0 * euler, follows=False)

@@ -133,7 +133,7 @@ def test_without_any_photo_an_earlier_result_stays(tmp_path: Path, capsys: pytes
 
 
 def test_portrait_and_landscape_through_a_lens(tmp_path: Path) -> None:
-    """Two cameras, one of them stored on its side with EXIF's tag, both through a lens: trained, judged, on one sheet."""
+    """Two cameras, one stored on its side with EXIF's tag, both through a lens: trained, judged, on one sheet."""
     posed = posed_folder(tmp_path / "posed", size=48)
     tree = json.loads((posed / "transforms.json").read_text())
     for number, frame in enumerate(tree["frames"]):

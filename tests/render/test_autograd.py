@@ -111,7 +111,9 @@ def many_splats(count: int = 800) -> tuple[dict[str, np.ndarray], Camera]:
 
 
 def test_directional_derivative_of_a_crowded_scene(device: str) -> None:
-    """Hundreds of overlapping splats with early stops: moving all of them downhill changes the twin's loss as predicted."""
+    """Hundreds of overlapping splats with early stops:
+    moving all of them downhill changes the twin's loss as predicted.
+    """
     values, camera = many_splats(300)
     got = gradients(values, camera, device)
     random = np.random.default_rng(3)

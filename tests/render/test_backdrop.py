@@ -41,8 +41,8 @@ def test_the_shadow_falls_where_the_floor_is_seen() -> None:
 
 
 def test_the_shadow_lies_on_an_uneven_floor_without_an_edge() -> None:
-    """Half of a floor that stands 3 % of the reach above the fitted plane, as sheets do, bears nearly the same shadow; at a
-    terrace too high for it the shadow ends, but not from one pixel to the next."""
+    """Half of a floor that stands 3 % of the reach above the fitted plane, as sheets do, bears nearly the same shadow;
+    at a terrace too high for it the shadow ends, but not from one pixel to the next."""
     cloud, truth = ball_on_floor()
     camera = Camera.look_at(np.array([0.0, -4.0, 2.5]), np.zeros(3), np.eye(3)[2], width=120, height=120)
     fields = ("rotations", "log_scales", "opacity_logits", "sh")

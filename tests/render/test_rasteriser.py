@@ -283,7 +283,8 @@ def test_impossible_cameras_and_backgrounds_are_refused() -> None:
 
 @pytest.mark.parametrize("spread", [1.0, 1e-5])
 def test_sorted_lists_equal_counted_ones(spread: float) -> None:
-    """A GPU sorts pairs and a CPU counts them: tile by tile the same Gaussians in the same order, equal depths by index.
+    """A GPU sorts pairs and a CPU counts them: tile by tile the same Gaussians in the same order, equal depths by
+    index.
 
     With a spread of 1e-5 hundreds of Gaussians of each tile share the leading bits of depth that are sorted by.
     """

@@ -63,7 +63,9 @@ def check(cloud: GaussianCloud, truth: np.ndarray, spec: ObjectSpec) -> None:
 
 
 def test_shreds_of_the_floor_do_not_go_along() -> None:
-    """Wide floor-coloured Gaussians at the foot of a dark ball belong to neither; a dark one as wide stays the ball's."""
+    """Wide floor-coloured Gaussians at the foot of a dark ball belong to neither;
+    a dark one as wide stays the ball's.
+    """
     cloud, truth = ball_on_floor()
     random = np.random.default_rng(5)
     angles = np.arange(6)

@@ -55,7 +55,9 @@ def render_twin(
     background: np.ndarray | tuple[float, float, float] = (1.0, 1.0, 1.0),
     antialiased: bool = False,
 ) -> dict[str, np.ndarray]:
-    """Colour (H, W, 3), alpha, expected and median depth, normal of the Gaussians in ``values`` (the cloud's fields)."""
+    """Colour (H, W, 3), alpha, expected and median depth,
+    normal of the Gaussians in ``values`` (the cloud's fields).
+    """
     m, q, log_scales, logits, sh = (
         np.asarray(values[k], dtype=np.float64) for k in ("means", "rotations", "log_scales", "opacity_logits", "sh")
     )

@@ -1,4 +1,4 @@
-"""Exposures that differ are found with the cloud; views that never fit are found, too; growth ends when it gains nothing."""
+"""Exposures that differ are found, and views that never fit; growth ends when it gains nothing."""
 
 from __future__ import annotations
 

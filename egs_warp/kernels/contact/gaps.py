@@ -23,7 +23,8 @@ def point_gaps_kernel(
 ):
     """Signed distance of each embedded point to the nearest solid, and which of its planes faces the point.
 
-    The planes of a solid, its intersection, follow each other; the largest distance to them bounds that to the solid from below.
+    The planes of a solid, its intersection, follow each other; the largest distance to them bounds that to the solid
+    from below.
     """
     point = wp.tid()
     tet = tets[tet_from_point[point]]

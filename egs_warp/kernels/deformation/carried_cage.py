@@ -50,8 +50,8 @@ def store_row(rows: wp.array[wp.vec4], row: wp.int32, value: wp.vec4):
 
 @wp.struct
 class CarriedCage:
-    """The affine map x0' + F (x - x0) of each tetrahedron, and the rotation of F. Arrays in a struct, since eight functions pass
-    them on."""
+    """The affine map x0' + F (x - x0) of each tetrahedron, and the rotation of F. Arrays in a struct, since eight
+    functions pass them on."""
 
     maps: wp.array[wp.vec4]
     """(3 T,) rows of F, each with one coordinate of x0' behind it: all that most arms ask for, close together."""
@@ -118,7 +118,9 @@ def image(map: Affine, point: wp.vec3) -> wp.vec3:
 
 
 RIGID = wp.constant(wp.float32(3.0))
-"""Share of the first arm that marks a Gaussian far outside the cage, which is not stretched but only turned and moved."""
+"""Share of the first arm that marks a Gaussian far outside the cage,
+which is not stretched but only turned and moved.
+"""
 
 
 SixTets = wp.types.vector(length=6, dtype=wp.int32)
@@ -132,23 +134,23 @@ def exponential(v: wp.vec3) -> wp.vec3:
 
 @wp.func
 def reach_of(arms: wp.array2d[wp.float32], row: wp.int32, axis: wp.int32, scale: wp.float32) -> wp.float32:
-    """Distance between the ends of an axis; gradients jump between tetrahedra, and over a much shortened arm the jump is no
-    derivative."""
+    """Distance between the ends of an axis; gradients jump between tetrahedra, and over a much shortened arm the jump
+    is no derivative."""
     return wp.max(arms[row, axis] + arms[row, 3 + axis], 3.0 * scale)
 
 
 @wp.struct
 class ArmPlan:
-    """What ``carried_arms`` wants to know about each of n Gaussians, once for all frames. Arrays of one value a Gaussian:
-    threads side by side read side by side."""
+    """What ``carried_arms`` wants to know about each of n Gaussians, once for all frames. Arrays of one value a
+    Gaussian: threads side by side read side by side."""
 
     mean_tets: wp.array[wp.int32]
     """(n,) tetrahedron of the mean; its one's complement if the Gaussian is not simply carried by that tetrahedron."""
     end_tets: wp.array2d[wp.int32]
     """(6, n)"""
     shares: wp.array2d[wp.float32]
-    """(6, n) share of each arm that lies in the tetrahedron of the mean; less than 0: minus the length of an arm whose end has nothing
-    to do with that tetrahedron, so that one must look where the end has gone."""
+    """(6, n) share of each arm that lies in the tetrahedron of the mean; less than 0: minus the length of an arm whose
+    end has nothing to do with that tetrahedron, so that one must look where the end has gone."""
     bulges: wp.array2d[wp.float32]
     """(3, n) metres: s_k^2 over the reach of both arms."""
 
@@ -168,10 +170,10 @@ def plan_arms_kernel(
     # Out:
     plan_out: ArmPlan,
 ):
-    """The motion is continuous and linear in each tetrahedron. So an arm that goes from the tetrahedron of the mean (gradient F)
-    through a face into the next one (gradient G) is carried to (u F + (1 - u) G) r per length, u the share of it before
-    the face: no difference of positions, which for a tiny arm would be mostly rounding. A longer arm that ends elsewhere
-    has a negative share.
+    """The motion is continuous and linear in each tetrahedron. So an arm that goes from the tetrahedron of the mean
+    (gradient F) through a face into the next one (gradient G) is carried to (u F + (1 - u) G) r per length, u the share
+    of it before the face: no difference of positions, which for a tiny arm would be mostly rounding. A longer arm that
+    ends elsewhere has a negative share.
     """
     row = first_row + wp.tid()
     mean_tet = point_tets[7 * row]
@@ -233,8 +235,8 @@ def carried_arm(
 ) -> wp.vec3:
     """Where one arm along ``axis`` has gone, per length: a column of D_s D_m^-1 R (Eq. 14). ``through`` is F axis.
 
-    An arm that bridges a gap between two limbs can be stretched far more than the matter at either end. That is a spike:
-    its length is held to ``max_stretch`` times the larger stretch at its two ends.
+    An arm that bridges a gap between two limbs can be stretched far more than the matter at either end. That is a
+    spike: its length is held to ``max_stretch`` times the larger stretch at its two ends.
     """
     if tet == mean_tet:
         return through

@@ -205,8 +205,8 @@ def matched_order(frame: wp.mat33, carried: wp.mat33) -> wp.vec3i:
 
 @wp.func
 def rotation_of(m: wp.mat33) -> wp.mat33:
-    """``rotation_part`` of a matrix with det > 0, by Newton's iteration X <- (g X + X^-T / g) / 2 (Higham 1986) where that is safe:
-    half the work."""
+    """``rotation_part`` of a matrix with det > 0, by Newton's iteration X <- (g X + X^-T / g) / 2 (Higham 1986) where
+    that is safe: half the work."""
     a = column(m, 0)
     b = column(m, 1)
     c = column(m, 2)

@@ -104,8 +104,8 @@ def carried_gaussian(
     result = CarriedGaussian()
     result.mean = both.mean
     stretched = both.through
-    # Alone in one tetrahedron, far outside, or where F is turned inside out: the rotation of that tetrahedron, found once
-    # for all.
+    # Alone in one tetrahedron, far outside, or where F is turned inside out: the rotation of that tetrahedron, found
+    # once for all.
     own = wp.bool(True)
     if both.straddles:
         bulge = wp.vec3(0.0)

@@ -81,7 +81,9 @@ def carry_local_tetrahedron_kernel(
     log_scales_out: wp.array[wp.vec3],
     turns_out: wp.array[wp.vec4],
 ):
-    """F from the corners of each Gaussian's own tetrahedron, which the cage has carried (VR-GS, two-level embedding)."""
+    """F from the corners of each Gaussian's own tetrahedron,
+    which the cage has carried (VR-GS, two-level embedding).
+    """
     row = first_row + wp.tid()
     lengths = local_lengths(log_scales[row], reach, least)
     centre = Vec3()

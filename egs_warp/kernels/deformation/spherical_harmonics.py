@@ -1,8 +1,8 @@
 """Rotate the colour of Gaussians: real spherical harmonics of bands 1 to 3 in the INRIA sign convention.
 
-A rotation is one about z, one about y, and one about z again; that about y is one about z between quarter turns about x. About
-z, the coefficients of orders m and -m turn as a pair; a quarter turn about x mixes few (Pinchon and Hoggan 2007). Half
-the work of a full matrix for each band, and no matrix to make.
+A rotation is one about z, one about y, and one about z again; that about y is one about z between quarter turns about
+x. About z, the coefficients of orders m and -m turn as a pair; a quarter turn about x mixes few (Pinchon and Hoggan
+2007). Half the work of a full matrix for each band, and no matrix to make.
 """
 
 import numpy as np
@@ -86,7 +86,9 @@ def band_2_about_z(c: Mat53, t: wp.vec2) -> Mat53:
 
 @wp.func
 def turned_band_2(c: Mat53, turns: Turns) -> Mat53:
-    """Coefficients 4 to 8, a row each, after the rotation. That about y is one about z between quarter turns about x."""
+    """Coefficients 4 to 8, a row each, after the rotation.
+    That about y is one about z between quarter turns about x.
+    """
     f = band_2_about_z(c, turns.first)
     g = Mat53()
     g[0] = f[3]

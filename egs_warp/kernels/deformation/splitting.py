@@ -23,8 +23,8 @@ def split_kernel(
     log_scales_out: wp.array[wp.vec3],
     sh_out: wp.array2d[wp.vec3],
 ):
-    """Row by row a copy of Gaussian ``parents``, or, where ``axes`` is not -1, its child ``offsets`` standard deviations
-    along that axis, whose own standard deviation is ``shrink`` times smaller there."""
+    """Row by row a copy of Gaussian ``parents``, or, where ``axes`` is not -1, its child ``offsets`` standard
+    deviations along that axis, whose own standard deviation is ``shrink`` times smaller there."""
     row = first_row + wp.tid()
     parent = parents[row]
     axis = axes[row]

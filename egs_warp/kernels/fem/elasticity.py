@@ -30,7 +30,9 @@ def damping_stress(start_gradient: Mat33, gradient: Mat33, dt: real, mu: real, l
 
 @wp.func
 def damping_block(gradient: Mat33, stress: Mat33, g_a: Vec3, g_b: Vec3, dt: real, mu: real, lam: real) -> Mat33:
-    """Block (a, b) of the derivative of F S by the corners, g_a.S g_b I from the turning of F and the rest from S itself."""
+    """Block (a, b) of the derivative of F S by the corners,
+    g_a.S g_b I from the turning of F and the rest from S itself.
+    """
     f_a = gradient * g_a
     f_b = gradient * g_b
     material = mu * (wp.dot(g_a, g_b) * (gradient * wp.transpose(gradient)) + wp.outer(f_b, f_a)) + lam * wp.outer(
@@ -150,7 +152,8 @@ def element_hessians_kernel(
     # Out:
     blocks_out: wp.array2d[Mat33],
 ):
-    """True Hessian of Eq. (5): block (a, b) = V [mu g_a.g_b I + (mu - lambda ln J) h_b h_a^T + lambda h_a h_b^T], h = F^-T g.
+    """True Hessian of Eq. (5): block (a, b) = V [mu g_a.g_b I + (mu - lambda ln J) h_b h_a^T + lambda h_a h_b^T],
+    h = F^-T g.
 
     Plus that of the damping (Eq. 6) over a step of dt, if dt is not 0.
     """
@@ -196,10 +199,10 @@ def element_projected_hessians_kernel(
 ):
     """The Hessian with the negative eigenvalues of each element set to zero, by the eigensystem of an isotropic energy.
 
-    In the frames of F = U diag(s) V^T the Hessian splits into the 3x3 block d2Psi/ds_i ds_j and, for each pair i < k, a twist
-    eigenvalue (Psi_i + Psi_k)/(s_i + s_k) and a flip eigenvalue (Psi_i - Psi_k)/(s_i - s_k) (Smith, de Goes, Kim 2019). For
-    Eq. (5) these are mu + (lambda ln J - mu)/(s_i s_k) and mu - (lambda ln J - mu)/(s_i s_k). Of the damping the semi-definite
-    part is added: without the turning of F.
+    In the frames of F = U diag(s) V^T the Hessian splits into the 3x3 block d2Psi/ds_i ds_j and, for each pair i < k, a
+    twist eigenvalue (Psi_i + Psi_k)/(s_i + s_k) and a flip eigenvalue (Psi_i - Psi_k)/(s_i - s_k) (Smith, de Goes, Kim
+    2019). For Eq. (5) these are mu + (lambda ln J - mu)/(s_i s_k) and mu - (lambda ln J - mu)/(s_i s_k). Of the damping
+    the semi-definite part is added: without the turning of F.
     """
     e = wp.tid()
     rest_inverse = rest_inverses[e]

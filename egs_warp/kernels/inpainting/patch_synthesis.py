@@ -27,7 +27,9 @@ def compare(
     source: wp.vec2i,
     shift_limit: wp.float32,
 ) -> Match:
-    """The patch around ``source`` as an explanation of the one at (row, column), each pixel counted by its confidence."""
+    """The patch around ``source`` as an explanation of the one at (row, column),
+    each pixel counted by its confidence.
+    """
     weight = wp.float32(0.0)
     sum = wp.vec3()
     squares = wp.float32(0.0)

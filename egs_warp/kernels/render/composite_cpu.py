@@ -4,12 +4,11 @@ Only rows and half rows inside the ellipse are visited, without branches in betw
 code of them; it does not of the same loop written in Warp's Python, which took about four times as long.
 """
 
-_SHARED = """
-    #pragma clang fp contract(fast)
-    constexpr float LOG_255 = 5.541263545158426f;
-    constexpr float CUT = 1.0f / 255.0f;
-    constexpr float LIMIT = 0.999f;
-    constexpr float STOP = 1.0e-4f;
+from egs_warp.kernels.render.ellipse import CUTOFFS_IN_CPP
+
+_SHARED = f"""
+    #pragma clang fp contract(fast){CUTOFFS_IN_CPP}"""
+_SHARED += """
     const int tile_width = width - left < 16 ? width - left : 16;
     const int tile_height = height - top < 16 ? height - top : 16;
     // Pixels not yet full, by eights.

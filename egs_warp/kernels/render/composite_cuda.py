@@ -5,13 +5,12 @@ ellipse reaches, and each warp then visits only its own. CUDA C++ because Warp's
 nor per-warp control flow; Warp compiles it at run time like every other kernel.
 """
 
+from egs_warp.kernels.render.ellipse import CUTOFFS_IN_CPP
+
 # log2(255), and alpha = exp2(log2 opacity - a u^2 - v dy^2) with a and v in units of log2 e.
-_SHARED = """
+_SHARED = CUTOFFS_IN_CPP
+_SHARED += """
     constexpr float LOG2_E = 1.4426950408889634f;
-    constexpr float LOG2_255 = 7.994353436858858f;
-    constexpr float CUT = 1.0f / 255.0f;
-    constexpr float LIMIT = 0.999f;
-    constexpr float STOP = 1.0e-4f;
     // Which of the eight parts (two columns by four rows of 8 x 4 pixels) does an ellipse reach?
     auto parts_of = [](float mx, float my, float a, float shear, float v, float cut) -> unsigned {
         // mx, my relative to the first pixel centre of the tile.

@@ -145,8 +145,8 @@ def composite_backward_tile_kernel(
 ):
     """One thread walks one tile again and sums each splat's gradient over its pixels.
 
-    With k = alpha dL/dalpha per pixel, ``moments_out[slot]`` holds (sum k, k u, k dy, k u^2), (k u dy, k dy^2, by depth, 0)
-    and (by colour, 0).
+    With k = alpha dL/dalpha per pixel, ``moments_out[slot]`` holds (sum k, k u, k dy, k u^2), (k u dy, k dy^2, by
+    depth, 0) and (by colour, 0).
     """
     tile = wp.tid() + first
     columns = (width + TILE - 1) / TILE

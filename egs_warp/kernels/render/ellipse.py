@@ -1,21 +1,36 @@
 """Screen ellipses: constants of the splatting model, a splat's alpha, and the exact ellipse-tile test."""
 
+import math
+
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
+_ALPHA_CUT = 1.0 / 255.0
+_ALPHA_LIMIT = 0.999
+_TRANSMITTANCE_STOP = 1.0e-4
+
 LOW_PASS = wp.constant(wp.float32(0.3))
 """Variance in square pixels added to every screen-space covariance."""
-ALPHA_CUT = wp.constant(wp.float32(1.0 / 255.0))
+ALPHA_CUT = wp.constant(wp.float32(_ALPHA_CUT))
 """A splat does not touch pixels where its alpha would be smaller."""
-LOG_255 = wp.constant(wp.float32(5.541263545158426))
-ALPHA_LIMIT = wp.constant(wp.float32(0.999))
+LOG_255 = wp.constant(wp.float32(-math.log(_ALPHA_CUT)))
+ALPHA_LIMIT = wp.constant(wp.float32(_ALPHA_LIMIT))
 """Largest alpha of one splat; above it no gradient flows."""
-TRANSMITTANCE_STOP = wp.constant(wp.float32(1.0e-4))
+TRANSMITTANCE_STOP = wp.constant(wp.float32(_TRANSMITTANCE_STOP))
 """A splat that would bring the transmittance here or lower is not drawn, and ends the pixel."""
 TILE = wp.constant(16)
 """Side of a square tile in pixels."""
 TILE_PIXELS = wp.constant(256)
+
+CUTOFFS_IN_CPP = f"""
+    constexpr float LOG_255 = {-math.log(_ALPHA_CUT)}f;
+    constexpr float LOG2_255 = {-math.log2(_ALPHA_CUT)}f;
+    constexpr float CUT = {_ALPHA_CUT}f;
+    constexpr float LIMIT = {_ALPHA_LIMIT}f;
+    constexpr float STOP = {_TRANSMITTANCE_STOP}f;
+"""
+"""The same for compositing in C++."""
 
 
 @wp.func

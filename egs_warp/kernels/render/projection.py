@@ -126,8 +126,7 @@ def project_kernel(
     """Screen ellipse, falloff and colour of every Gaussian; a Gaussian that cannot show reaches no tile.
 
     The ellipse is kept in its Cholesky form: with u = dx + shear dy, -ln(alpha / opacity) = a u^2 + v dy^2. Its terms
-    are all
-    positive, where the usual conic cancels for long thin splats.
+    are all positive, where the usual conic cancels for long thin splats.
     """
     g = wp.tid() + first
     mean = means[g]

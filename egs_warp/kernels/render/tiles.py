@@ -1,7 +1,7 @@
 """The Gaussians of every tile from front to back.
 
-A *slot* numbers the (Gaussian, tile) pairs Gaussian by Gaussian, row by row of tiles; an *intersection* numbers the same pairs
-tile by tile, nearest first. Gradients are written by slot, so that each Gaussian finds its own side by side.
+A *slot* numbers the (Gaussian, tile) pairs Gaussian by Gaussian, row by row of tiles; an *intersection* numbers the
+same pairs tile by tile, nearest first. Gradients are written by slot, so that each Gaussian finds its own side by side.
 """
 
 import warp as wp
@@ -93,7 +93,9 @@ def emit_tiles_kernel(
     key_out: wp.array[wp.uint32],
     slot_and_gaussian_out: wp.array[wp.int32],
 ):
-    """Sort key (tile, then the leading bits of the depth) of every slot, its number, and from 2 ``pair_count`` its Gaussian."""
+    """Sort key (tile, then the leading bits of the depth) of every slot, its number,
+    and from 2 ``pair_count`` its Gaussian.
+    """
     g = wp.tid()
     # Written side by side by neighbouring threads, which the loop below cannot do.
     for i in range(g, pair_count, slot_end.shape[0]):

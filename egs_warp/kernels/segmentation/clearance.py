@@ -51,8 +51,8 @@ def half_space_kernel(
 ):
     """Mass, mean and covariance of what Gaussian ``source`` has on the side that the normal points to.
 
-    With A = R S and w = A^T N / sigma, Sigma - c Sigma N N^T Sigma / sigma^2 = A' A'^T for
-    A' = A (I - (1 - sqrt(1 - c)) w w^T): the factor is decomposed, because the square would lose flat splats.
+    With A = R S and w = A^T N / sigma, Sigma - c Sigma N N^T Sigma / sigma^2 = A' A'^T for A' = A
+    (I - (1 - sqrt(1 - c)) w w^T): the factor is decomposed, because the square would lose flat splats.
     """
     row = first_row + wp.tid()
     g = source[row]

@@ -1,4 +1,4 @@
-"""A render in a photo's tone, its likeness to the photo, and the derivative of that by the render: one thread a pixel."""
+"""A render in a photo's tone, its likeness to the photo, and the derivative of that: one thread a pixel."""
 
 import warp as wp
 
@@ -119,7 +119,7 @@ def likeness_kernel(
     by_square_out: wp.array[wp.vec3],
     by_product_out: wp.array[wp.vec3],
 ):
-    """(1 - w) L1 + w (1 - SSIM) of each pixel, and the derivative of its SSIM by the blurred mean, square and product."""
+    """(1 - w) L1 + w (1 - SSIM) of a pixel, and the derivative of its SSIM by the blurred mean, square, product."""
     p = first_row + wp.tid()
     row = p // width
     mean_a = wp.vec3(0.0)

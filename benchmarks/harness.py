@@ -1,0 +1,181 @@
+"""What every benchmark shares: flags, the data folder, timing, the table, JSON and picture that it leaves.
+
+A benchmark takes ``--quick`` (under ten minutes on two cores), ``--device``, ``--seed``, ``--json PATH`` and
+``--plot PATH``, prints a table, and writes JSON with ``rows`` (the figures), ``environment`` (where they were
+measured), ``aims`` (true or false as the rows say, or null where this device cannot measure it) and ``why_null`` (the
+reason of each null).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+
+import numpy as np
+import warp as wp
+
+from egs_warp.io.video import write_png
+from egs_warp.launching import available_threads
+from egs_warp.pipelines.report import MECHANICS, versions
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+P = ParamSpec("P")
+T = TypeVar("T")
+Row = dict[str, Any]
+"""Figures by name."""
+
+
+def flags(
+    description: str | None, *, quick: str, device: str | None = None, seed: str | None = None, plot: str | None = None
+) -> argparse.ArgumentParser:
+    """The flags that every benchmark takes; the texts say what they mean here.
+
+    ``description`` is the script's docstring; ``device`` the default one, None for a GPU where there is one.
+    """
+    wp.config.log_level = wp.LOG_WARNING
+    if device is None:
+        device = "cuda:0" if wp.is_cuda_available() else "cpu"
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help=quick)
+    parser.add_argument("--device", default=device, help=f"{device} unless told")
+    parser.add_argument("--seed", type=int, default=0, help=seed)
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    parser.add_argument("--plot", type=Path, help=plot or "file for the picture")
+    return parser
+
+
+def data_folder() -> Path:
+    """Folder of captures, meshes and points: $EGS_WARP_DATA, else beside the repository."""
+    return Path(os.environ.get("EGS_WARP_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+
+
+def timed(action: Callable[P, T], *arguments: P.args, **options: P.kwargs) -> tuple[T, float]:
+    """What ``action`` returns, and its milliseconds."""
+    started = time.perf_counter()
+    result = action(*arguments, **options)
+    return result, 1e3 * (time.perf_counter() - started)
+
+
+def median_ms(
+    calls: Mapping[str, Callable[[], Any]],
+    *,
+    repeats: int,
+    synchronise: Callable[[], Any] = lambda: None,
+    warm_up: int = 3,
+) -> dict[str, float]:
+    """Median milliseconds of each call; the calls take turns, so that a drift of the machine hits all alike."""
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for turn in range(repeats + warm_up):
+        for name, call in calls.items():
+            synchronise()
+            started = time.perf_counter()
+            call()
+            synchronise()
+            if turn >= warm_up:
+                times[name].append(1e3 * (time.perf_counter() - started))
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+class Table:
+    """Rows of text under one head, each printed as soon as it is known."""
+
+    def __init__(self, **columns: str) -> None:
+        """A format such as ``8.2f`` or ``<12`` for each heading (``_`` prints as a space)."""
+        self._formats = list(columns.values())
+        names = [name.replace("_", " ") for name in columns]
+        self._widths = [
+            max(len(name), len(self._cell(form, 0 if form[-1] in "defg%" else "")))
+            for name, form in zip(names, self._formats, strict=True)
+        ]
+        self._line(names)
+
+    def row(self, *values: Any) -> None:
+        """Print one row; None is a dash."""
+        self._line([self._cell(form, value) for form, value in zip(self._formats, values, strict=True)])
+
+    @staticmethod
+    def _cell(form: str, value: Any) -> str:
+        return "-" if value is None else format(value, form)
+
+    def _line(self, cells: list[str]) -> None:
+        aligned = (
+            f"{cell.strip():<{width}}" if form.startswith("<") else f"{cell.strip():>{width}}"
+            for cell, form, width in zip(cells, self._formats, self._widths, strict=True)
+        )
+        print("  ".join(aligned).rstrip(), flush=True)
+
+
+def environment(options: argparse.Namespace, packages: Sequence[str] = ()) -> dict[str, Any]:
+    """Where the figures were measured, with the versions of ``packages`` beside those that all depend on."""
+    return {
+        "device": options.device,
+        "device_name": wp.get_device(options.device).name,
+        "threads": available_threads(),
+        **versions((*MECHANICS, *packages)),
+        "quick": options.quick,
+        "seed": options.seed,
+    }
+
+
+def record(
+    options: argparse.Namespace,
+    rows: Any,
+    *,
+    aims: Mapping[str, bool | None],
+    why_null: Mapping[str, str] | None = None,
+    packages: Sequence[str] = (),
+    conditions: Mapping[str, Any] | None = None,
+    **more: Any,
+) -> dict[str, Any]:
+    """The result, written to ``--json`` if asked; ``conditions`` are further entries of its environment.
+
+    Raises ``ValueError`` for an aim that is null without a reason.
+    """
+    why = dict(why_null or {})
+    unexplained = [name for name, value in aims.items() if value is None and name not in why]
+    if unexplained:
+        raise ValueError(f"aims without a value or a reason: {', '.join(unexplained)}")
+    result = {
+        "rows": rows,
+        **more,
+        "environment": {**environment(options, packages), **(conditions or {})},
+        "aims": {name: None if value is None else bool(value) for name, value in aims.items()},
+        "why_null": why,
+    }
+    if options.json:
+        options.json.write_text(json.dumps(result, indent=1) + "\n")
+    return result
+
+
+def report(
+    options: argparse.Namespace,
+    rows: Any,
+    *,
+    draw: Callable[[Figure], None] | None = None,
+    picture: np.ndarray | None = None,
+    size: tuple[float, float] = (7.0, 3.5),
+    **result: Any,
+) -> None:
+    """Everything at the end: ``record``, the aims as text, and ``--plot``, drawn or as it is.
+
+    ``draw`` gets an empty figure of ``size`` inches; ``picture`` is (H, W, 3), uint8 or floats from 0 to 1.
+    """
+    made = record(options, rows, **result)
+    print(json.dumps({name: made[name] for name in ("aims", "why_null")}, indent=1))
+    if options.plot and draw is not None:
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=size, layout="tight")
+        draw(figure)
+        figure.savefig(options.plot, dpi=120)
+    if options.plot and picture is not None:
+        floats = picture.dtype != np.uint8
+        write_png(options.plot, np.rint(255.0 * np.clip(picture, 0.0, 1.0)).astype(np.uint8) if floats else picture)

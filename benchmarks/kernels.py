@@ -1,0 +1,115 @@
+"""Kernels of the benchmarks: a ray caster, and probes of what a device can do at best."""
+
+import warp as wp
+
+from egs_warp.kernels.deformation.carried_cage import load_row, store_row
+from egs_warp.kernels.render.ellipse import ALPHA_CUT, TILE_PIXELS, TRANSMITTANCE_STOP, pixel_of_thread, splat_alpha
+
+wp.set_module_options({"enable_backward": False})
+
+PROBE_STEPS = wp.constant(2048)
+
+
+@wp.kernel
+def hits_kernel(
+    # In:
+    width: wp.int32,
+    height: wp.int32,
+    tile_start: wp.array[wp.int32],
+    gaussian_from_intersection: wp.array[wp.int32],
+    ellipse: wp.array[wp.vec4],
+    falloff: wp.array[wp.vec2],
+    # Out:
+    hits_out: wp.array[wp.int32],
+):
+    """Splats that each pixel blends: what no renderer of the same picture can leave out."""
+    thread = wp.tid()
+    pixel = pixel_of_thread(thread, width)
+    if pixel[0] >= width or pixel[1] >= height:
+        return
+    tile = thread / TILE_PIXELS
+    passing = wp.float32(1.0)
+    hits = wp.int32(0)
+    intersection = tile_start[tile]
+    end = tile_start[tile + 1]
+    while intersection < end:
+        g = gaussian_from_intersection[intersection]
+        intersection += 1
+        alpha = splat_alpha(ellipse[g], falloff[g], pixel)
+        if alpha >= ALPHA_CUT:
+            passing = passing * (1.0 - alpha)
+            hits += 1
+            if passing <= TRANSMITTANCE_STOP:
+                intersection = end
+    hits_out[pixel[1] * width + pixel[0]] = hits
+
+
+@wp.kernel
+def arithmetic_kernel(
+    first: wp.int32,
+    # In:
+    factor: wp.float32,
+    # Out:
+    sum_out: wp.array[wp.float32],
+):
+    """Eight independent chains of multiply and add: the most operations that this device can be brought to do."""
+    i = wp.tid() + first
+    a = wp.float32(i)
+    b = a + 1.0
+    c = a + 2.0
+    d = a + 3.0
+    e = a + 4.0
+    f = a + 5.0
+    g = a + 6.0
+    h = a + 7.0
+    for _step in range(PROBE_STEPS):
+        a = a * factor + 1.0
+        b = b * factor + 1.0
+        c = c * factor + 1.0
+        d = d * factor + 1.0
+        e = e * factor + 1.0
+        f = f * factor + 1.0
+        g = g * factor + 1.0
+        h = h * factor + 1.0
+    sum_out[i] = a + b + c + d + e + f + g + h
+
+
+@wp.kernel
+def copy_kernel(
+    # In:
+    source: wp.array[wp.vec4],
+    # Out:
+    target_out: wp.array[wp.vec4],
+):
+    """What a kernel that only copies takes."""
+    row = wp.tid()
+    store_row(target_out, row, load_row(source, row))
+
+
+@wp.kernel
+def trace_kernel(
+    # In:
+    mesh: wp.uint64,
+    rest: wp.array[wp.vec3],
+    world_from_camera: wp.mat33,
+    eye: wp.vec3,
+    focal: wp.vec2,
+    centre: wp.vec2,
+    width: wp.int32,
+    samples: wp.int32,
+    # Out:
+    rest_out: wp.array2d[wp.vec3],
+    hit_out: wp.array2d[wp.bool],
+):
+    """Where each sample of each pixel meets the mesh, as the place at rest."""
+    pixel, sample = wp.tid()
+    x = float(pixel % width) + (float(sample % samples) + 0.5) / float(samples)
+    y = float(pixel // width) + (float(sample // samples) + 0.5) / float(samples)
+    ray = wp.normalize(world_from_camera * wp.vec3((x - centre[0]) / focal[0], (y - centre[1]) / focal[1], 1.0))
+    hit = wp.mesh_query_ray(mesh, eye, ray, 1.0e6)
+    hit_out[pixel, sample] = hit.result
+    if hit.result:
+        a = wp.mesh_get_index(mesh, 3 * hit.face)
+        b = wp.mesh_get_index(mesh, 3 * hit.face + 1)
+        c = wp.mesh_get_index(mesh, 3 * hit.face + 2)
+        rest_out[pixel, sample] = hit.u * rest[a] + hit.v * rest[b] + (1.0 - hit.u - hit.v) * rest[c]
