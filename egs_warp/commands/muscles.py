@@ -31,26 +31,21 @@ def _muscles(chosen: argparse.Namespace) -> int:
 
     wp.config.log_level = wp.LOG_WARNING
     from egs_warp.fem.body import make_body
+    from egs_warp.geometry.body_frame import GROUND
     from egs_warp.io import read_capture
-    from egs_warp.meshing.cage import build_cage
     from egs_warp.muscles.plot import check_picture_name, plot_muscles
-    from egs_warp.pipelines.creature import body_muscles
-    from egs_warp.segmentation.base_plane import find_base_plane
+    from egs_warp.pipelines.creature import body_muscles, stand
 
     check_picture_name(chosen.plot)
     up = parse_up(chosen.up) if chosen.up else None
     plane = plane_of(chosen.plane) if chosen.plane else None
     capture = read_capture(chosen.capture)
-    if plane is None:
-        if up is None:
-            up, note = guessed_up(capture)
-            say(note)
-        plane = find_base_plane(capture.cloud, up)
-    cage = build_cage(capture.cloud, plane)
-    scale = 1.0 / cage.height(plane)
-    cage, plane = cage.scaled(scale), plane.scaled(scale)
-    body = make_body(cage.mesh, plane)
-    muscles = body_muscles(body, plane, chosen.muscles, metres_per_unit=scale)
-    plot_muscles(cage.mesh, muscles, chosen.plot, up=plane.normal)
+    if plane is None and up is None:
+        up, note = guessed_up(capture)
+        say(note)
+    standing = stand(capture.cloud, up=up, plane=plane)
+    body = make_body(standing.cage.mesh, GROUND)
+    muscles = body_muscles(body, chosen.muscles, standing.frame)
+    plot_muscles(body.mesh, muscles, chosen.plot, up=GROUND.normal)
     print(f"{muscles.fibre_count} fibres, {muscles.segment_count} segments; wrote {chosen.plot}")
     return 0

@@ -10,6 +10,7 @@ import warp as wp
 
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.kernels.fem import elasticity as kernels
+from egs_warp.launching import empty
 from egs_warp.precision import Mat33, Vec3, real
 
 
@@ -61,7 +62,7 @@ class ElasticAssembly:
         self._tets = wp.array(mesh.tets, dtype=wp.vec4i, device=device)
         self._rest_inverses = wp.array(np.linalg.inv(edges), dtype=Mat33, device=device)
         self._volumes = wp.array(mesh.volumes(), dtype=real, device=device)
-        self._no_gradients = wp.empty(0, dtype=Mat33, device=device)
+        self._no_gradients = empty(0, Mat33, device)
         self._positions = wp.zeros(node_count, dtype=Vec3, device=device)
         self._energies = wp.zeros(tet_count, dtype=real, device=device)
         self._determinants = wp.zeros(tet_count, dtype=real, device=device)
@@ -127,7 +128,7 @@ class ElasticAssembly:
 
     def damping(self, positions: np.ndarray, dt: float) -> Damping:
         """Of a step of ``dt`` seconds that starts at ``positions`` (N, 3)."""
-        gradients = wp.empty(len(self.mesh.tets), dtype=Mat33, device=self.device)
+        gradients = empty(len(self.mesh.tets), Mat33, self.device)
         self._upload(self._positions, positions)
         wp.launch(
             kernels.deformation_gradients_kernel,

@@ -41,6 +41,10 @@ class Plane:
         """The same plane after all lengths are multiplied by ``factor``."""
         return Plane(self.normal, self.offset * factor)
 
+    def moved(self, shift: np.ndarray) -> Plane:
+        """The same plane after all points have moved by ``shift`` (3,)."""
+        return Plane(self.normal, self.offset - float(self.normal @ shift))
+
     def tangents(self) -> tuple[np.ndarray, np.ndarray]:
         """Two unit vectors (3,) that span the plane; (t1, t2, N) is right-handed."""
         return square_to(self.normal)

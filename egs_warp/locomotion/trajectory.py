@@ -5,7 +5,7 @@ and the measures and audit computed from them alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.frames import best_turn
 from egs_warp.io.atomic import atomic_write
 from egs_warp.locomotion.stepper import StepReport
@@ -20,7 +21,11 @@ from egs_warp.locomotion.stepper import StepReport
 
 @dataclass(frozen=True)
 class Trajectory:
-    """F solver steps of N nodes with C contacts in all. Metres, seconds, kilograms, newtons."""
+    """F solver steps of N nodes with C contacts in all. Metres, seconds, kilograms, newtons; z is up, square to the
+    ground.
+
+    The frame is the body's own: where that lies in the capture, the last three fields say.
+    """
 
     time: np.ndarray
     """(F+1,)."""
@@ -61,6 +66,20 @@ class Trajectory:
     """(F+1,) metres, smallest gap of all contact Gaussians."""
     activations: np.ndarray
     """(F, M) metres."""
+    body_axes: np.ndarray = field(default_factory=lambda: np.eye(3))
+    """(3, 3) rows: this frame's x, y and z in the capture's axes."""
+    body_origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    """(3,) this frame's origin in the capture, capture's units."""
+    metres_per_unit: float = 1.0
+    """Of the capture's unit."""
+
+    def placed(self, frame: BodyFrame) -> Trajectory:
+        """The same trajectory of a body whose ``frame`` in the capture is known."""
+        return replace(self, body_axes=frame.axes, body_origin=frame.origin, metres_per_unit=frame.scale)
+
+    def in_capture(self, points: np.ndarray) -> np.ndarray:
+        """Points (..., 3) of this frame in the capture's frame and units."""
+        return BodyFrame(self.body_axes, self.body_origin, self.metres_per_unit).capture_points(points)
 
     def save(self, path: Path) -> None:
         """Write ``trajectory.npz``; the same trajectory gives the same bytes."""
@@ -75,7 +94,7 @@ class Trajectory:
             values = {name: data[name] for name in cls.__dataclass_fields__ if name in data}
         # Files of before there were solids: every plane a half space.
         values.setdefault("solid_from_plane", np.arange(len(values["planes"]), dtype=np.int32))
-        for name in ("friction", "drag", "height"):
+        for name in {"friction", "drag", "height", "metres_per_unit"} & values.keys():
             values[name] = float(values[name])
         return cls(**values)
 

@@ -16,6 +16,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.kernels.meshing.occupancy import inside_mesh_kernel
+from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame
 from egs_warp.meshing.occupancy import LatticeSolid, solid_from_gaussians
 from egs_warp.meshing.stuffing import stuff
 from egs_warp.meshing.tetwild import tetwild
@@ -28,6 +29,9 @@ _FINER_PER_STEP = 0.15
 _THIN_RADIUS = 0.56
 """In lattice cells: a rod of this radius cannot slip between the points of a body-centred cubic lattice, whose covering
 radius is sqrt(5)/4."""
+
+_RUNGS = 16
+"""Sizes of a cell there are to a factor of 2, so that a few lattice points more or less leave the cell as it is."""
 
 
 class CageMethod(Enum):
@@ -46,7 +50,7 @@ class Cage:
     """A tetrahedral mesh around an object, and what it holds."""
 
     mesh: TetMesh
-    """In the capture's units."""
+    """In the units and axes of the cloud that it was made for."""
     method: CageMethod
     """The mesher that made it."""
     min_dihedral_degrees: float
@@ -59,7 +63,7 @@ class Cage:
     below_plane_opacity_mass: float
     """Share, by opacity, of all Gaussians whose mean lies below the plane."""
     dilation: float
-    """How far the cage was grown around the occupied space, scene units."""
+    """How far the cage was grown around the occupied space, in the mesh's units."""
 
     def height(self, plane: Plane) -> float:
         """Body height H above ``plane``, in the mesh's units."""
@@ -78,8 +82,31 @@ def build_cage(
     dilation: float = 0.005,
     method: CageMethod = CageMethod.VOXEL,
 ) -> Cage:
-    """Cage of about ``target_nodes`` nodes around the opaque part of ``cloud`` above ``plane``, which it never crosses.
+    """Cage, in the capture's units and axes, of what ``cloud`` shows above ``plane``; see ``cage_of_body``.
 
+    It is made in the body's own frame, so it goes along with any move, turn or unit of the capture.
+    """
+    near, anchor = centred(cloud)
+    frame = find_body_frame(near, plane.moved(-anchor))
+    cage = cage_of_body(body_gaussians(near, frame), target_nodes=target_nodes, dilation=dilation, method=method)
+    frame = frame.moved(anchor)
+    return replace(
+        cage,
+        mesh=TetMesh(frame.capture_points(cage.mesh.nodes), cage.mesh.tets),
+        dilation=cage.dilation / frame.scale,
+    )
+
+
+def cage_of_body(
+    cloud: GaussianCloud,
+    *,
+    target_nodes: int = 500,
+    dilation: float = 0.005,
+    method: CageMethod = CageMethod.VOXEL,
+) -> Cage:
+    """Cage of about ``target_nodes`` nodes around the opaque part of ``cloud`` above z = 0, which it never crosses.
+
+    ``cloud`` is in its body's frame (``body_gaussians``), whose axes and origin are those of the lattice.
     ``dilation`` is in units of the object's longest side; it is raised, and the mesh refined (up to 1.75 times the
     nodes), until all but 0.07 % of the object's opacity mass is inside.
     The same input gives the same bits (``CageMethod.VOXEL``). DESIGN section 4.
@@ -88,12 +115,12 @@ def build_cage(
     """
     if not 50 <= target_nodes <= 20000:
         raise UserError(f"cage: {target_nodes} nodes asked; give a number from 50 to 20000")
-    solid = solid_from_gaussians(cloud, plane)
+    solid = solid_from_gaussians(cloud)
     _refuse_flat(solid)
     weights = np.where(solid.belongs, cloud.opacities(), 0.0)
     distance = _Distance(solid)
     # Two nodes a cell inside, about as many again on the surface.
-    cell = (4.0 * np.count_nonzero(solid.inside) / target_nodes) ** (1.0 / 3.0)
+    cell = _rung((4.0 * np.count_nonzero(solid.inside) / target_nodes) ** (1.0 / 3.0))
     # Large captures are judged by a regular sample while the cage grows, and by all in the end.
     sample = np.arange(0, cloud.count, max(1, cloud.count // _GROWTH_SAMPLE))
     best: tuple[float, float, TetMesh, CageMethod] | None = None
@@ -145,9 +172,9 @@ def _mesh(
         mesh = tetwild(_Field(distance, dilation, thin_radius=0.0), target_nodes)
         if mesh is not None and mesh.min_dihedral_degrees() >= _MIN_DIHEDRAL_DEGREES:
             nodes, tets = _main_piece(mesh.nodes, mesh.tets)
-            return TetMesh.oriented(solid.world(nodes), tets), CageMethod.TETWILD, cell
+            return TetMesh.oriented(solid.points(nodes), tets), CageMethod.TETWILD, cell
     nodes, tets, cell = _stuffed(distance, target_nodes, dilation, cell)
-    return TetMesh.oriented(solid.world(nodes), tets), CageMethod.VOXEL, cell
+    return TetMesh.oriented(solid.points(nodes), tets), CageMethod.VOXEL, cell
 
 
 def _stuffed(
@@ -155,25 +182,31 @@ def _stuffed(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Nodes (lattice spacings), tetrahedra and cell of the lattice mesh whose node count comes nearest to the target.
 
-    Secant steps on the cell's size, from ``cell``.
+    Secant steps on the cell's size, from ``cell``, from rung to rung.
     """
     best: tuple[float, np.ndarray, np.ndarray, float] | None = None
     for _ in range(6):
         field = _Field(distance, dilation, thin_radius=_THIN_RADIUS * cell)
         nodes, tets = stuff(field, *field.bounds(), cell)
         if len(tets) == 0:
-            cell *= 0.7
+            cell = _rung(0.7 * cell)
             continue
         nodes, tets = _main_piece(nodes, tets)
         miss = abs(float(np.log(len(nodes) / target_nodes)))
         if best is None or miss < best[0]:
             best = (miss, nodes, tets, cell)
-        if miss < 0.08:
+        following = _rung(cell * (len(nodes) / target_nodes) ** 0.45)
+        if miss < 0.08 or following == cell:
             break
-        cell *= (len(nodes) / target_nodes) ** 0.45
+        cell = following
     if best is None:
         raise UserError("object: it is too thin to be given a volume; choose another object")
     return best[1:]
+
+
+def _rung(cell: float) -> float:
+    """The nearest size of a cell that is used."""
+    return float(2.0 ** (np.rint(_RUNGS * np.log2(cell)) / _RUNGS))
 
 
 class _Distance:
@@ -189,6 +222,8 @@ class _Distance:
         """The same without the lattice's steps."""
         self.longest_side = solid.longest_side / solid.spacing
         """In lattice spacings."""
+        self.middle = -solid.corner[:2]
+        """(2,) lattice indices of the frame's origin, about which the cells are laid out."""
 
 
 class _Field:
@@ -205,14 +240,17 @@ class _Field:
                 value = np.minimum(value, _edt(~crest) - thin_radius)
         self._value = value[:, :, value.shape[2] // 2 - 1 :]
         self._offset = np.array([distance.pad, distance.pad, 1.0])
+        self._middle = distance.middle
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         return ndimage.map_coordinates(self._value, (points + self._offset).T, order=1, mode="nearest", prefilter=False)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Box (3,), (3,) of the solid, in lattice spacings."""
+        """Box (3,), (3,) that holds the solid, about the frame's origin, in lattice spacings."""
         where = np.argwhere(self._value < 0.0) - self._offset
-        return where.min(axis=0) - 1.0, where.max(axis=0) + 1.0
+        low, high = where.min(axis=0) - 1.0, where.max(axis=0) + 1.0
+        half = np.maximum(self._middle - low[:2], high[:2] - self._middle)
+        return np.append(self._middle - half, low[2]), np.append(self._middle + half, high[2])
 
     def samples(self) -> tuple[np.ndarray, np.ndarray]:
         """The lattice of values from layer 0 up, and the position (3,) of its first point."""

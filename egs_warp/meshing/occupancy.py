@@ -10,7 +10,6 @@ from scipy import ndimage
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.geometry.plane import Plane
 from egs_warp.kernels.meshing.occupancy import OPACITY_UNIT, enclosed_kernel, splat_occupancy_kernel
 
 _OPACITY_THRESHOLD = 0.25
@@ -23,16 +22,16 @@ _MAX_BRIDGE = 4
 
 @dataclass(frozen=True)
 class LatticeSolid:
-    """The object as a set of lattice points; layer 0 of the last axis lies in the plane."""
+    """The object as a set of lattice points in its body's frame; layer 0 of the last axis lies in the plane z = 0."""
 
     inside: np.ndarray
     """(nx, ny, nz) bool, one connected piece."""
-    frame: np.ndarray
-    """(3, 3) float64: rows are the lattice axes in the world; the last is the plane's normal."""
-    origin: np.ndarray
-    """(3,) float64: lattice point (0, 0, 0) in lattice axes, scene units."""
+    corner: np.ndarray
+    """(3,) int: lattice point (0, 0, 0) counted from the frame's origin, which is itself a lattice point."""
     spacing: float
-    """Scene units."""
+    """In the frame's lengths."""
+    longest_side: float
+    """Of the object's Gaussians, in the frame's lengths."""
     belongs: np.ndarray
     """(n,) bool: Gaussians of the object; the others are floaters or lie below the plane."""
     below_plane: np.ndarray
@@ -40,75 +39,72 @@ class LatticeSolid:
     bridged: int
     """Lattice spacings by which gaps were bridged on either side; 0 if the object is in one piece by itself."""
 
-    @property
-    def longest_side(self) -> float:
-        """Of the solid's box, scene units."""
-        return self.spacing * float(np.ptp(np.argwhere(self.inside), axis=0).max())
-
-    def world(self, lattice_points: np.ndarray) -> np.ndarray:
-        """World positions (m, 3) of points (m, 3) in lattice indices."""
-        return (self.origin + self.spacing * np.asarray(lattice_points, float)) @ self.frame
-
-    def lattice(self, world_points: np.ndarray) -> np.ndarray:
-        """Lattice indices (m, 3), float, of world points (m, 3)."""
-        return (np.asarray(world_points, float) @ self.frame.T - self.origin) / self.spacing
+    def points(self, lattice_points: np.ndarray) -> np.ndarray:
+        """Points (m, 3) of the body's frame, from lattice indices (m, 3)."""
+        return self.spacing * (np.asarray(lattice_points, float) + self.corner)
 
 
-def solid_from_gaussians(cloud: GaussianCloud, plane: Plane, *, resolution: int = 64) -> LatticeSolid:
-    """Occupied and enclosed space above ``plane``: the connected piece that holds most of the opacity mass.
+def solid_from_gaussians(cloud: GaussianCloud, *, resolution: int = 64) -> LatticeSolid:
+    """Occupied and enclosed space above z = 0: the connected piece that holds most of the opacity mass.
 
-    ``resolution`` lattice spacings span the object's longest side. Raises ``UserError`` if nothing opaque stands on
-    the plane.
+    ``cloud`` is in its body's frame. ``resolution`` lattice spacings span the object's longest side. Nothing but a
+    whole number hangs on which lattice points are the outermost, so that a body that has hardly changed keeps its
+    lattice. Raises ``UserError`` if nothing opaque stands on the plane.
     """
-    frame = np.stack([*plane.tangents(), plane.normal])
-    means = cloud.means.numpy().astype(np.float64) @ frame.T
-    means[:, 2] += plane.offset
+    means = cloud.means.numpy().astype(np.float64)
     opacities = cloud.opacities()
     low, high = _robust_bounds(means, opacities)
     # A coarse look first: strays may have stretched the bounds.
-    coarse = _one_look(cloud, plane, frame, means, opacities, low, high, min(resolution, 40))
+    coarse = _one_look(cloud, means, opacities, low, high, float(np.max(high - low)), min(resolution, 40))
     indices = np.argwhere(coarse.inside)
-    corner = coarse.origin + [0.0, 0.0, plane.offset]
-    low, high = corner + coarse.spacing * indices.min(axis=0), corner + coarse.spacing * indices.max(axis=0)
-    return _one_look(cloud, plane, frame, means, opacities, low, high, resolution)
+    low, high = coarse.points(indices.min(axis=0)), coarse.points(indices.max(axis=0))
+    longest = _longest_side(means[coarse.belongs], opacities[coarse.belongs])
+    return _one_look(cloud, means, opacities, low, high, longest or float(np.max(high - low)), resolution)
 
 
 def _robust_bounds(means: np.ndarray, opacities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Box (3,), (3,) around all but far strays: the central 98 % of the mass, grown by 60 % of its size."""
-    share = np.cumsum(opacities) / max(float(np.sum(opacities)), 1e-30)
-    low, high = np.empty(3), np.empty(3)
-    for axis in range(3):
-        order = np.argsort(means[:, axis], kind="stable")
-        share = np.cumsum(opacities[order])
-        low[axis], high[axis] = means[order, axis][
-            np.searchsorted(share, [0.01 * share[-1], 0.99 * share[-1]]).clip(0, len(order) - 1)
-        ]
+    low, high = _mass_quantiles(means, opacities, 0.01, 0.99)
     grow = 0.6 * (high - low)
     return np.maximum(low - grow, means.min(axis=0)), np.minimum(high + grow, means.max(axis=0))
 
 
+def _longest_side(means: np.ndarray, opacities: np.ndarray) -> float:
+    """Longest side of the box from the plane up that holds all but the outermost thousandths of the mass."""
+    if len(means) == 0:
+        return 0.0
+    low, high = _mass_quantiles(means, opacities, 0.001, 0.999)
+    return float(np.max(high - np.append(low[:2], 0.0)))
+
+
+def _mass_quantiles(means: np.ndarray, opacities: np.ndarray, *shares: float) -> list[np.ndarray]:
+    """Points (3,) below which, along each axis, these shares of the mass lie."""
+    found = np.empty((len(shares), 3))
+    for axis in range(3):
+        order = np.argsort(means[:, axis], kind="stable")
+        mass = np.cumsum(opacities[order])
+        found[:, axis] = means[order, axis][np.searchsorted(mass, np.array(shares) * mass[-1]).clip(0, len(order) - 1)]
+    return list(found)
+
+
 def _one_look(
     cloud: GaussianCloud,
-    plane: Plane,
-    frame: np.ndarray,
     means: np.ndarray,
     opacities: np.ndarray,
     low: np.ndarray,
     high: np.ndarray,
+    longest: float,
     resolution: int,
 ) -> LatticeSolid:
-    extent = float(np.max(high - low))
-    if not extent > 0.0:
+    if not longest > 0.0:
         raise UserError(
             f"object: all of its {cloud.count} Gaussians are at one point, so it has no volume; choose another object"
         )
-    spacing = extent / resolution
+    spacing = longest / resolution
     margin = _MAX_BRIDGE + 3
-    counts = np.ceil((np.maximum(high, 0.0) - np.append(low[:2], 0.0)) / spacing).astype(int) + 1 + margin
-    counts[:2] += margin
-    low = np.append(low[:2] - margin * spacing, 0.0)
+    corner = np.append(np.floor(low[:2] / spacing) - margin, 0.0).astype(int)
+    counts = np.ceil(np.maximum(high, 0.0) / spacing).astype(int) + 1 + margin - corner
     opacity_sum = wp.zeros(tuple(counts), dtype=wp.int32, device=cloud.device)
-    origin = low - [0.0, 0.0, plane.offset]
     wp.launch(
         splat_occupancy_kernel,
         dim=cloud.count,
@@ -117,10 +113,9 @@ def _one_look(
             cloud.rotations,
             cloud.log_scales,
             cloud.opacity_logits,
-            wp.mat33(*frame.ravel()),
-            wp.vec3(*origin),
+            wp.vec3(*(spacing * corner)),
             spacing,
-            0.08 * extent,
+            0.08 * longest,
         ],
         outputs=[opacity_sum],
         device=cloud.device,
@@ -131,8 +126,7 @@ def _one_look(
             f"object: nothing opaque stands on the plane (of {cloud.count} Gaussians, {int(np.sum(means[:, 2] > 0))} "
             f"are above it, most opaque {opacities.max():.2g}); check --plane and --up"
         )
-    position = (means - low) / spacing
-    node = np.rint(position).astype(int)
+    node = np.rint(means / spacing).astype(int) - corner
     in_lattice = np.all((node >= 0) & (node < counts), axis=1)
     masses = np.where(in_lattice, opacities, 0.0)
     at = tuple(node.clip(0, counts - 1).T)
@@ -150,7 +144,7 @@ def _one_look(
     piece = np.asarray(labels == main if main else whole)
     inside = _fill(piece, cloud.device)
     belongs = in_lattice & ndimage.binary_dilation(piece)[at] & (means[:, 2] >= 0.0)
-    return LatticeSolid(inside, frame, origin, spacing, belongs, means[:, 2] < 0.0, bridged)
+    return LatticeSolid(inside, corner, spacing, longest, belongs, means[:, 2] < 0.0, bridged)
 
 
 def _bridge(occupied: np.ndarray, radius: int) -> np.ndarray:

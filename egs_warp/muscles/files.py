@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from egs_warp.errors import UserError
+from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.frames import square_to
 from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
 from egs_warp.io.text import parse_json, read_text
@@ -33,16 +34,17 @@ from egs_warp.muscles.muscle_set import MuscleSet, attach_fibres
 MAX_SEGMENTS = 400
 """The quadratic program of a step has one unknown for each segment: more would take seconds a frame."""
 
+_SAME_FRAME = BodyFrame(np.eye(3), np.zeros(3), 1.0)
 _COMMON_KEYS = {"name", "kind", "strength", "stiffness", "group", "mirror"}
 _FILE_KEYS = {"fibres", "max_strain", "mirror_plane"}
 _DEFAULT_STRENGTH = 2.0
 _MAX_OUTSIDE_EDGES = 1.5
 
 
-def read_muscles(path: Path | str, mesh: TetMesh, *, body_weight: float, metres_per_unit: float = 1.0) -> MuscleSet:
+def read_muscles(path: Path | str, mesh: TetMesh, *, body_weight: float, frame: BodyFrame = _SAME_FRAME) -> MuscleSet:
     """Muscles of the JSON file ``path`` (module docstring), attached to ``mesh`` (metres).
 
-    ``body_weight`` in newtons; ``metres_per_unit`` turns the file's lengths into metres. Raises ``UserError`` with the
+    ``body_weight`` in newtons; ``frame`` is that of the mesh in the file's. Raises ``UserError`` with the
     file, the entry, what is wrong with it and what to do.
     """
     path = Path(path)
@@ -54,15 +56,15 @@ def read_muscles(path: Path | str, mesh: TetMesh, *, body_weight: float, metres_
     max_strain = _positive(f"{path}", content, "max_strain", 0.3)
     if max_strain >= 1.0:
         raise UserError(f'{path}: "max_strain" is {max_strain:g}; give a number below 1')
-    mirror = _mirror(f"{path}", content, metres_per_unit)
+    mirror = _mirror(f"{path}", content)
     fibres: list[Fibre] = []
     stiffness: list[float] = []
     groups: dict[str, int] = {}
     for index, entry in enumerate(entries):
-        made, its_stiffness = _fibres(path, index, entry, mirror, groups, metres_per_unit, body_weight)
+        made, its_stiffness = _fibres(path, index, entry, mirror, groups, frame, body_weight)
         fibres += made
         stiffness += [its_stiffness] * len(made)
-    _check(path, fibres, mesh, metres_per_unit)
+    _check(path, fibres, mesh, frame)
     muscles = attach_fibres(mesh, fibres, max_strain=max_strain)
     asked = np.array(stiffness)[muscles.fibre_from_segment]
     return replace(muscles, stiffness=np.where(np.isnan(asked), muscles.stiffness, asked))
@@ -81,7 +83,7 @@ def _fibres(
     entry: Any,
     mirror: Callable[[np.ndarray], np.ndarray] | None,
     groups: dict[str, int],
-    unit: float,
+    frame: BodyFrame,
     body_weight: float,
 ) -> tuple[list[Fibre], float]:
     """The fibres of one entry with their mirror images, and their stiffness in N/m, NaN if none was asked."""
@@ -112,14 +114,15 @@ def _fibres(
             f'{where} is to be mirrored but the file has no plane; give "mirror_plane" with point and normal'
         )
     group_index = groups.setdefault(group, len(groups))
-    polylines = [unit * points for points in shape(where, entry)]
+    polylines = shape(where, entry)
     made = []
     for number, points in enumerate(polylines):
         own = name if len(polylines) == 1 else f"{name} {number + 1}"
         image = f"{own} mirrored" if mirrored else None
-        made.append(Fibre(own, fibre_kind, points, force, group_index, image))
+        made.append(Fibre(own, fibre_kind, frame.points(points), force, group_index, image))
         if mirrored and mirror is not None:
-            made.append(Fibre(f"{own} mirrored", fibre_kind, mirror(points), force, group_index, own))
+            image_points = frame.points(mirror(points))
+            made.append(Fibre(f"{own} mirrored", fibre_kind, image_points, force, group_index, own))
     return made, stiffness
 
 
@@ -163,7 +166,7 @@ def _around(where: str, entry: dict[str, Any], angles: np.ndarray) -> np.ndarray
     return _point(where, entry, "centre") + _positive(where, entry, "radius", None) * spokes
 
 
-def _mirror(where: str, content: dict[str, Any], unit: float) -> Callable[[np.ndarray], np.ndarray] | None:
+def _mirror(where: str, content: dict[str, Any]) -> Callable[[np.ndarray], np.ndarray] | None:
     if "mirror_plane" not in content:
         return None
     plane = content["mirror_plane"]
@@ -171,11 +174,11 @@ def _mirror(where: str, content: dict[str, Any], unit: float) -> Callable[[np.nd
         raise UserError(f'{where}: "mirror_plane" must be an object with "point" and "normal"')
     where = f"{where}: mirror_plane"
     _refuse_unknown_keys(where, plane, {"point", "normal"})
-    point, normal = unit * _point(where, plane, "point"), _direction(where, plane, "normal")
+    point, normal = _point(where, plane, "point"), _direction(where, plane, "normal")
     return lambda points: points - 2.0 * ((points - point) @ normal)[:, None] * normal
 
 
-def _check(path: Path, fibres: list[Fibre], mesh: TetMesh, unit: float) -> None:
+def _check(path: Path, fibres: list[Fibre], mesh: TetMesh, frame: BodyFrame) -> None:
     names: set[str] = set()
     reach = _MAX_OUTSIDE_EDGES * mean_edge_length(mesh)
     for fibre in fibres:
@@ -186,10 +189,10 @@ def _check(path: Path, fibres: list[Fibre], mesh: TetMesh, unit: float) -> None:
         distances = np.linalg.norm(fibre.points[:, None] - mesh.nodes[None], axis=2).min(axis=1)
         worst = int(np.argmax(distances))
         if distances[worst] > reach:
-            x, y, z = fibre.points[worst] / unit
+            x, y, z = frame.capture_points(fibre.points[worst])
             raise UserError(
-                f"{where}: the point [{x:g}, {y:g}, {z:g}] is {distances[worst] / unit:.3g} units away from the body; "
-                "give points inside it, in the capture's own coordinates"
+                f"{where}: the point [{x:g}, {y:g}, {z:g}] is {distances[worst] / frame.scale:.3g} units away"
+                " from the body; give points inside it, in the capture's own coordinates"
             )
         if np.linalg.norm(np.diff(fibre.points, axis=0), axis=1).min() == 0.0:
             raise UserError(f"{where} has two equal points in a row; remove one")

@@ -148,7 +148,7 @@ def animate(
     report = _report(
         creature, simulation, sequence, film, seed=options.seed, source=source, notes=(*notes, *sequence.cut_short())
     )
-    simulation.trajectory.save(folder / "trajectory.npz")
+    simulation.trajectory.placed(creature.frame).save(folder / "trajectory.npz")
     creature.cage.mesh.write_vtu(folder / "cage.vtu")
     write_report(folder / "report.json", report)
     return report

@@ -9,13 +9,16 @@ import numpy as np
 
 from egs_warp.contact.detection import ContactGeometry, contact_geometry
 from egs_warp.contact.terrain import Solid
+from egs_warp.deformation.rigid import in_body_frame
 from egs_warp.errors import UserError
 from egs_warp.fem.body import DEFAULT_SAG, BodyState, SoftBody, make_body
+from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.rollout import FRAME_RATE, settle, steps_per_frame
 from egs_warp.locomotion.stepper import LocomotionSettings, LocomotionStepper
-from egs_warp.meshing.cage import Cage, build_cage
+from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame
+from egs_warp.meshing.cage import Cage, cage_of_body
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.stance import Ground
 from egs_warp.muscles.files import read_muscles
@@ -26,22 +29,29 @@ SMALLEST_SAG = 0.004
 """A body is not made stiffer than this column's sag, whatever it bends."""
 STEEPEST_SLOPE = 45.0
 """Degrees: nothing stands on a steeper one."""
+FILMED_FROM = (0.35, -1.0, 0.22)
+"""From the body to the camera of a film: ahead, left and up."""
+_DETAIL_CELL = 0.06
+"""Body heights: eyes and noses differ from what is this near, fur and flat paint do not."""
 
 
 @dataclass(frozen=True)
 class Creature:
-    """A capture with a cage, a body, muscles and a ground, standing; metres."""
+    """A capture with a cage, a body, muscles and a ground, standing; metres, all in the body's own frame."""
 
+    frame: BodyFrame
+    """Of the body, in the capture."""
     cloud: GaussianCloud
-    plane: Plane
-    metres_per_unit: float
+    """The capture, in the order of its own."""
+    front: np.ndarray
+    """(3,) unit, along the ground: where it shows most detail."""
     cage: Cage
     stepper: LocomotionStepper
     """Body, muscles and contact."""
     start: BodyState
     """At rest on the ground."""
     solids: tuple[Solid, ...]
-    """All that there is to stand on, the ground first."""
+    """All that there is to stand on, the ground (z = 0) first."""
 
     @property
     def body(self) -> SoftBody:
@@ -74,52 +84,90 @@ def make_creature(
 ) -> Creature:
     """Give a capture (scene units) a body that stands on ``plane``, or on its own base, square to ``up`` (3,).
 
-    ``muscles_file``: see ``body_muscles``. ``solids`` (scene units) are steps and walls beside the ground;
-    ``gravity_up`` (3,) is against gravity if the ground is a slope. ``settings`` of its stepper choose the strategy for
-    the contact states and the QP solver. The body is as stiff as makes it sag by ``sag`` of its height; one that its
-    weight would bend out of shape is made stiffer.
+    All that is given is in the capture's frame and units; what is made is in the body's, so nothing hangs on how the
+    file lies. ``muscles_file``: see ``body_muscles``. ``solids`` are steps and walls beside the ground; ``gravity_up``
+    (3,) is against gravity if the ground is a slope. ``settings`` of its stepper choose the strategy for the contact
+    states and the QP solver. The body is as stiff as makes it sag by ``sag`` of its height; one that its weight would
+    bend out of shape is made stiffer.
     """
-    if plane is None:
-        if up is None:
-            raise UserError("animate: neither up nor a plane is known; give --up or --plane")
-        plane = find_base_plane(cloud, up)
+    normal = plane.normal if plane is not None else up
+    if normal is None:
+        raise UserError("animate: neither up nor a plane is known; give --up or --plane")
     if gravity_up is not None:
-        _check_slope(plane, gravity_up)
-    device = str(cloud.device)
-    cage = build_cage(cloud, plane)
-    scale = metres_per_unit or 1.0 / cage.height(plane)
-    cloud, plane, cage = cloud.scaled(scale), plane.scaled(scale), cage.scaled(scale)
-    solids = tuple(solid.scaled(scale) for solid in solids)
-    geometry = contact_geometry(cloud, cage.mesh, (plane,), solids=solids, friction=friction, device=device)
+        _check_slope(normal / np.linalg.norm(normal), gravity_up)
+    standing = stand(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit)
+    device, frame, cage = str(cloud.device), standing.frame, standing.cage
+    solids = tuple(Solid(tuple(frame.plane(face) for face in solid.faces)) for solid in solids)
+    geometry = contact_geometry(
+        standing.gaussians, cage.mesh, (GROUND,), solids=solids, friction=friction, device=device
+    )
+    against_gravity = None if gravity_up is None else frame.axes @ gravity_up
     while True:
-        body = make_body(cage.mesh, plane, up=gravity_up, sag=sag, device=device)
-        muscles = body_muscles(body, plane, muscles_file, metres_per_unit=scale)
+        body = make_body(cage.mesh, GROUND, up=against_gravity, sag=sag, device=device)
+        muscles = body_muscles(body, muscles_file, frame)
         stepper = LocomotionStepper(body, muscles, geometry, settings=settings, device=device)
         start = settle(stepper)
         if sag < SMALLEST_SAG or _stands(stepper, start):
-            return Creature(cloud, plane, scale, cage, stepper, start, (Solid((plane,)), *solids))
+            everything = (Solid((GROUND,)), *solids)
+            front = _front(standing.gaussians, body.height)
+            return Creature(frame, in_body_frame(cloud, frame), front, cage, stepper, start, everything)
         sag *= 0.5
 
 
-def _check_slope(plane: Plane, up: np.ndarray) -> None:
-    slope = float(np.degrees(np.arccos(np.clip(plane.normal @ up / np.linalg.norm(up), -1.0, 1.0))))
+@dataclass(frozen=True)
+class Standing:
+    """A capture's cage, in metres and in the frame of the body."""
+
+    frame: BodyFrame
+    """Of the body, in the capture."""
+    gaussians: GaussianCloud
+    """What the mechanics sees of the capture (``body_gaussians``)."""
+    cage: Cage
+
+
+def stand(
+    cloud: GaussianCloud,
+    *,
+    up: np.ndarray | None = None,
+    plane: Plane | None = None,
+    metres_per_unit: float | None = None,
+) -> Standing:
+    """Find the body's own frame on ``plane``, or on its base square to ``up`` (3,), and make its cage there.
+
+    Without ``metres_per_unit`` the body is 1 m tall.
+    """
+    near, anchor = centred(cloud)
+    if plane is None:
+        assert up is not None, "make_creature asks for one of both"
+        plane = find_base_plane(near, up)
+    else:
+        plane = plane.moved(-anchor)
+    frame = find_body_frame(near, plane)
+    gaussians = body_gaussians(near, frame)
+    cage = cage_of_body(gaussians)
+    metres = 1.0 / cage.height(GROUND) if metres_per_unit is None else metres_per_unit / frame.scale
+    return Standing(frame.moved(anchor).scaled(metres), gaussians.scaled(metres), cage.scaled(metres))
+
+
+def _check_slope(normal: np.ndarray, up: np.ndarray) -> None:
+    slope = float(np.degrees(np.arccos(np.clip(normal @ up / np.linalg.norm(up), -1.0, 1.0))))
     if slope > STEEPEST_SLOPE:
         raise UserError(
             f"--gravity-up {','.join(f'{x:g}' for x in up)}: that makes the ground a slope of {slope:.0f} degrees;"
             f" give a direction at most {STEEPEST_SLOPE:g} degrees from the ground's normal"
-            f" {','.join(f'{x:.3g}' for x in plane.normal)}"
+            f" {','.join(f'{x:.3g}' for x in normal)}"
         )
 
 
-def body_muscles(body: SoftBody, plane: Plane, file: Path | None, *, metres_per_unit: float) -> MuscleSet:
-    """The muscles that ``file`` (JSON, ``egs_warp.muscles.files``) gives a body on ``plane``;
-    without one, automatic ones.
+def body_muscles(body: SoftBody, file: Path | None, frame: BodyFrame) -> MuscleSet:
+    """The muscles that ``file`` (JSON, ``egs_warp.muscles.files``) gives a body in its ``frame``; without one,
+    automatic ones.
     """
     if file is not None:
-        return read_muscles(file, body.mesh, body_weight=body.weight, metres_per_unit=metres_per_unit)
+        return read_muscles(file, body.mesh, body_weight=body.weight, frame=frame)
     return automatic_muscles(
         body.mesh,
-        plane.normal,
+        GROUND.normal,
         body_weight=body.weight,
         height=body.height,
         strength=4.0 * body.stiffening,
@@ -137,22 +185,21 @@ def _stands(stepper: LocomotionStepper, start: BodyState) -> bool:
 
 
 def first_place(creature: Creature, forward: np.ndarray | None = None, *, step: float | None = None) -> Place:
-    """Where the creature stands at the start; ``forward`` (3,) is the way of its motions, else the long axis of its
-    footprint.
+    """Where the creature stands at the start; ``forward`` (3,) is the way of its motions in the capture, else the long
+    axis of its footprint.
 
     ``step``: seconds of a solver step, if not the usual (DESIGN 4).
     """
     body, start = creature.body, creature.start
     up = -body.gravity / np.linalg.norm(body.gravity)
-    if forward is None:
-        forward = _forward(creature)
-    if np.linalg.norm(np.cross(forward, up)) < 1e-3 * np.linalg.norm(forward):
+    ahead = _forward(creature) if forward is None else creature.frame.axes @ forward
+    if forward is not None and np.linalg.norm(np.cross(ahead, up)) < 1e-3 * np.linalg.norm(ahead):
         raise UserError(
             f"--forward {','.join(f'{x:g}' for x in forward)}: points up or down; give a way along the ground"
         )
     return Place(
         body,
-        Ground.on(creature.plane, forward, body.centre_of_mass(start.positions), up=up),
+        Ground.on(GROUND, ahead, body.centre_of_mass(start.positions), up=up),
         start.positions,
         creature.stepper.detector.points_within(start.positions, 0.01 * body.height),
         step or 1.0 / (FRAME_RATE * steps_per_frame(body)),
@@ -162,12 +209,34 @@ def first_place(creature: Creature, forward: np.ndarray | None = None, *, step: 
 
 
 def _forward(creature: Creature) -> np.ndarray:
-    """(3,) the long axis of the footprint: the direction in which the body is least likely to tip."""
-    local = creature.cage.mesh.nodes
-    sole = local[creature.plane.heights(local) < 0.06 * creature.body.height]
-    first, second = creature.plane.tangents()
-    flat = np.stack([(sole - sole.mean(axis=0)) @ first, (sole - sole.mean(axis=0)) @ second], axis=1)
+    """(3,) the long axis of the footprint: the direction in which the body is least likely to tip, with the body's
+    front to the camera; of a round one, its front.
+    """
+    nodes = creature.cage.mesh.nodes
+    sole = nodes[nodes[:, 2] < 0.06 * creature.body.height, :2]
+    flat = sole - sole.mean(axis=0)
     values, vectors = np.linalg.eigh(flat.T @ flat)
-    axis = vectors[:, 1] if values[1] > 1.2 * values[0] else np.array([1.0, 0.0])
-    axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
-    return axis[0] * first + axis[1] * second
+    if values[1] <= 1.2 * values[0]:
+        return creature.front
+    (x, y), (ahead, left, _) = vectors[:, 1], FILMED_FROM
+    seen = ahead * np.array([x, y]) + left * np.array([-y, x])
+    return np.array([x, y, 0.0]) * (1.0 if seen @ creature.front[:2] >= 0.0 else -1.0)
+
+
+def _front(gaussians: GaussianCloud, height: float) -> np.ndarray:
+    """(3,) unit, along the ground: where a body of ``height`` shows most detail, as faces do.
+
+    Detail is the distance of a Gaussian's colour from the mean of those about it, in cells of ``_DETAIL_CELL`` heights.
+    """
+    means, colours = gaussians.means.numpy().astype(np.float64), gaussians.sh.numpy()[:, 0].astype(np.float64)
+    masses = np.where(means[:, 2] > 0.0, gaussians.opacities(), 0.0)
+    _, cell = np.unique(np.floor(means / (_DETAIL_CELL * height)), axis=0, return_inverse=True)
+    cell = cell.ravel()
+    mass = np.maximum(np.bincount(cell, masses), 1e-300)
+    around = np.stack([np.bincount(cell, masses * colours[:, k]) / mass for k in range(3)], axis=1)
+    detail = masses * np.linalg.norm(colours - around[cell], axis=1)
+    detail -= masses * detail.sum() / max(float(masses.sum()), 1e-300)
+    radius = np.linalg.norm(means[:, :2], axis=1)
+    x, y = (detail / np.maximum(radius, 1e-12)) @ means[:, :2]
+    length = float(np.hypot(x, y))
+    return np.array([x / length, y / length, 0.0]) if length > 0.0 else np.array([1.0, 0.0, 0.0])

@@ -12,13 +12,15 @@ from tqdm import tqdm
 
 from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.embedding import embed_gaussians
+from egs_warp.deformation.rigid import in_body_frame
 from egs_warp.deformation.splitting import split_for_motion
+from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.video import VideoWriter, contact_sheet, write_png
 from egs_warp.locomotion.rollout import Simulation
 from egs_warp.motions.stance import Ground
-from egs_warp.pipelines.creature import Creature
+from egs_warp.pipelines.creature import FILMED_FROM, Creature
 from egs_warp.render.backdrop import Behind, CapturedScene, Floor
 from egs_warp.render.rasteriser import render
 
@@ -51,10 +53,11 @@ def draw_film(
 ) -> Film:
     """Write ``name``.mp4 and sheet.png, ``size`` pixels both ways, into ``folder``.
 
-    ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from``: see ``view_of``.
+    ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
+    the object to the camera, both in the capture's frame.
     """
     trajectory, frames = simulation.trajectory, simulation.frames
-    camera = view_of(simulation, ground, size, view_from)
+    camera = view_of(simulation, ground, size, None if view_from is None else creature.frame.axes @ view_from)
     behind = _behind(creature, simulation, camera, background, shadow=shadow)
     # The whole motion is known, so what it will bend is split before the first frame, and nothing can pop.
     started = time.perf_counter()
@@ -97,12 +100,12 @@ def _behind(
     trajectory, height = simulation.trajectory, creature.body.height
     path = np.einsum("n,fni->fi", trajectory.node_mass, trajectory.positions) / trajectory.node_mass.sum()
     com = path.mean(axis=0)
-    centre = com - creature.plane.heights(com) * creature.plane.normal
+    centre = com * [1.0, 1.0, 0.0]
     reach = 2.2 * (height + float(np.linalg.norm(np.ptp(path, axis=0))))
     if background is None:
-        return Floor(camera, creature.plane, centre=centre, reach=reach, cell=0.25 * height, shadow=shadow)
-    scene = background.scaled(creature.metres_per_unit)
-    return CapturedScene(scene, camera, creature.plane, centre=centre, reach=reach, shadow=shadow)
+        return Floor(camera, GROUND, centre=centre, reach=reach, cell=0.25 * height, shadow=shadow)
+    scene = in_body_frame(background, creature.frame)
+    return CapturedScene(scene, camera, GROUND, centre=centre, reach=reach, shadow=shadow)
 
 
 def view_of(simulation: Simulation, ground: Ground, size: int, view_from: np.ndarray | None = None) -> Camera:
@@ -114,7 +117,7 @@ def view_of(simulation: Simulation, ground: Ground, size: int, view_from: np.nda
     low[2] = min(low[2], 0.0)
     middle = 0.5 * (low + high)
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-    direction = np.array([0.35, -1.0, 0.22]) if view_from is None else ground.axes @ np.asarray(view_from, float)
+    direction = np.array(FILMED_FROM) if view_from is None else ground.axes @ np.asarray(view_from, float)
     direction /= np.linalg.norm(direction)
     distance = float(np.linalg.norm(high - low))
     for _ in range(60):

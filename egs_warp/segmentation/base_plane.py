@@ -8,8 +8,10 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from egs_warp.errors import UserError
+from egs_warp.geometry.body_frame import upright_frame
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
+from egs_warp.meshing.body_gaussians import canonical_order, centred
 
 _COLUMNS = 64
 """Columns across the longer side of the footprint."""
@@ -64,20 +66,22 @@ def find_base_plane(cloud: GaussianCloud, up: np.ndarray) -> Plane:
     """
     normal = np.asarray(up, dtype=np.float64)
     normal = normal / np.linalg.norm(normal)
-    underside = _underside(cloud, normal)
+    near, anchor = centred(cloud)
+    underside = _underside(near, normal)
     level = min(_support_level(underside), _mass_quantile(underside.heights, underside.opacities, _MAX_MASS_BELOW))
-    return Plane(normal, -level)
+    return Plane(normal, -level).moved(anchor)
 
 
 def _underside(cloud: GaussianCloud, normal: np.ndarray) -> _Underside:
-    means, opacities = cloud.means.numpy().astype(np.float64), cloud.opacities()
+    order = canonical_order(cloud)
+    means, opacities = cloud.means.numpy()[order].astype(np.float64), cloud.opacities()[order]
     heights = means @ normal
     low, high = (_mass_quantile(heights, opacities, share) for share in (0.002, 0.998))
     if not high > low:
         raise UserError(
             f"object: its {cloud.count} Gaussians have no height along up, so no plane can be found; check --up"
         )
-    first, second = Plane(normal, 0.0).tangents()
+    first, second, _ = upright_frame(means, opacities, Plane(normal, 0.0)).axes
     across = np.stack([means @ first, means @ second], axis=1)
     box = np.array([[_mass_quantile(across[:, k], opacities, share) for share in (0.002, 0.998)] for k in range(2)])
     width = max(float(np.ptp(box, axis=1).max()) / _COLUMNS, 1e-12 * (high - low))
@@ -133,11 +137,12 @@ def guess_up(cloud: GaussianCloud, capture_format_up: np.ndarray | None = None) 
     if capture_format_up is not None:
         return np.asarray(capture_format_up, dtype=np.float64), "the file format defines it"
     scores = []
+    near, _ = centred(cloud)
     for axis in range(3):
         for sign in (1.0, -1.0):
             up = np.zeros(3)
             up[axis] = sign
-            shape = _support_shape(cloud, up)
+            shape = _support_shape(near, up)
             scores.append((shape.polygon + shape.level + shape.depth + _HABIT[axis], shape, up))
     # Python's sort is stable, so a tie goes to the earlier axis.
     scores.sort(key=lambda entry: -entry[0])

@@ -264,5 +264,5 @@ def test_solid_ignores_order_of_gaussians() -> None:
     """Integer sums: any order of the Gaussians gives the same solid."""
     thing = pawn(gaussian_count=5000)
     shuffled = thing.cloud.subset(np.random.default_rng(0).permutation(thing.cloud.count))
-    first, second = (solid_from_gaussians(cloud, thing.plane) for cloud in (thing.cloud, shuffled))
+    first, second = (solid_from_gaussians(cloud) for cloud in (thing.cloud, shuffled))
     assert np.array_equal(first.inside, second.inside)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from egs_warp.errors import UserError
+from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.muscles.fibres import FibreKind
 from egs_warp.muscles.files import read_muscles
 from egs_warp.muscles.plot import plot_muscles
@@ -55,7 +56,9 @@ def test_stiffness_strain_units_groups_and_partners(tmp_path: Path) -> None:
         "mirror_plane": {"point": [0, 0, 0], "normal": [0, 3, 0]},
         "fibres": [{**doubled, "stiffness": 50}, {**doubled, "name": "other", "mirror": False, "group": "one"}],
     }
-    muscles = read_muscles(write(tmp_path, content), MESH, body_weight=100.0, metres_per_unit=0.5)
+    muscles = read_muscles(
+        write(tmp_path, content), MESH, body_weight=100.0, frame=BodyFrame(np.eye(3), np.zeros(3), 0.5)
+    )
     assert muscles.fibre_partners.tolist() == [1, 0, -1]
     assert muscles.fibre_groups.tolist() == [0, 0, 1]
     np.testing.assert_allclose(muscles.stiffness[:4], 50.0)

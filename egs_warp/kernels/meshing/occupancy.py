@@ -15,7 +15,6 @@ def splat_occupancy_kernel(
     rotations: wp.array[wp.vec4],
     log_scales: wp.array[wp.vec3],
     opacity_logits: wp.array[float],
-    frame: wp.mat33,
     origin: wp.vec3,
     spacing: float,
     max_sigma: float,
@@ -24,15 +23,16 @@ def splat_occupancy_kernel(
 ):
     """Add each Gaussian's opacity to the lattice points within its 2-sigma ellipsoid, blurred by the lattice.
 
-    ``frame`` takes world to lattice axes. Sigmas are capped at ``max_sigma``: huge faint strays must not fill the air.
-    Without the blur of 0.45 spacings flat Gaussians would slip between the points; with it each reaches one.
+    ``origin`` is lattice point (0, 0, 0); the lattice's axes are the cloud's own. Sigmas are capped at ``max_sigma``:
+    huge faint strays must not fill the air. Without the blur of 0.45 spacings flat Gaussians would slip between the
+    points; with it each reaches one.
     """
     i = wp.tid()
     amount = int(float(OPACITY_UNIT) / (1.0 + wp.exp(-opacity_logits[i])) + 0.5)
     if amount <= 0:
         return
     wxyz = rotations[i]
-    axes = frame * wp.quat_to_matrix(wp.quat(wxyz[1], wxyz[2], wxyz[3], wxyz[0]))
+    axes = wp.quat_to_matrix(wp.quat(wxyz[1], wxyz[2], wxyz[3], wxyz[0]))
     blur = 0.45 * spacing
     s = log_scales[i]
     sx = wp.min(wp.exp(s[0]), max_sigma)
@@ -41,7 +41,7 @@ def splat_occupancy_kernel(
     variance = wp.vec3(sx * sx + blur * blur, sy * sy + blur * blur, sz * sz + blur * blur)
     inverse = axes * wp.diag(wp.vec3(1.0 / variance[0], 1.0 / variance[1], 1.0 / variance[2])) * wp.transpose(axes)
     covariance = axes * wp.diag(variance) * wp.transpose(axes)
-    centre = (frame * means[i] - origin) / spacing
+    centre = (means[i] - origin) / spacing
     reach = wp.vec3(
         2.0 * wp.sqrt(covariance[0, 0]) / spacing,
         2.0 * wp.sqrt(covariance[1, 1]) / spacing,

@@ -1,0 +1,166 @@
+"""Cage and frame come from the body itself: the order, unit, place and axes of the file leave no trace."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from egs_warp.assets import pawn, stool
+from egs_warp.errors import UserError
+from egs_warp.geometry.body_frame import GROUND, BodyFrame, upright_frame
+from egs_warp.geometry.plane import Plane
+from egs_warp.io import read_capture
+from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame
+from egs_warp.meshing.cage import Cage, build_cage, cage_of_body
+from egs_warp.segmentation.base_plane import find_base_plane
+from tests.support.frames import Lying
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def body_cage(lying: Lying) -> tuple[BodyFrame, Cage]:
+    """Cage in the body's own frame, about one unit tall."""
+    near, anchor = centred(lying.cloud)
+    frame = find_body_frame(near, lying.plane.moved(-anchor))
+    return frame.moved(anchor), cage_of_body(body_gaussians(near, frame))
+
+
+@pytest.fixture(scope="module", params=["pawn", "stool"])
+def thing(request: pytest.FixtureRequest) -> Lying:
+    """A round body and one with a front, coarse."""
+    made = {"pawn": pawn, "stool": stool}[request.param](gaussian_count=3000)
+    return Lying(made.cloud, made.plane).on_grid()
+
+
+@pytest.fixture(scope="module")
+def its_cage(thing: Lying) -> Cage:
+    return body_cage(thing)[1]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        lambda thing: thing.shuffled(),
+        lambda thing: thing.scaled(2.0**6),
+        lambda thing: thing.scaled(2.0**-3),
+        lambda thing: thing.moved((1000.0, -333.0, 17.0)),
+        lambda thing: thing.moved((8.0, -16.0, 4.0)).shuffled(3).scaled(0.5),
+    ],
+    ids=["shuffled", "x64", "x1/8", "moved", "all three"],
+)
+def test_same_bits_however_the_file_lies(thing: Lying, its_cage: Cage, other) -> None:
+    changed = other(thing)
+    assert not np.array_equal(changed.cloud.means.numpy(), thing.cloud.means.numpy())
+    _, cage = body_cage(changed)
+    assert np.array_equal(cage.mesh.nodes, its_cage.mesh.nodes) and np.array_equal(cage.mesh.tets, its_cage.mesh.tets)
+    assert cage.enclosed_opacity_mass == its_cage.enclosed_opacity_mass
+
+
+@pytest.mark.parametrize(
+    "other",
+    [lambda thing: thing.scaled(0.37), lambda thing: thing.turned(), lambda thing: thing.turned().scaled(0.37)],
+    ids=["x0.37", "turned", "both"],
+)
+def test_same_cage_in_any_unit_and_turned(thing: Lying, its_cage: Cage, other) -> None:
+    """What rounding leaves: the same tetrahedra, nodes within 1e-5 of the height; before, 3e-2."""
+    _, cage = body_cage(other(thing))
+    assert np.array_equal(cage.mesh.tets, its_cage.mesh.tets)
+    assert np.abs(cage.mesh.nodes - its_cage.mesh.nodes).max() < 1e-5 * its_cage.height(GROUND)
+
+
+def test_cage_in_the_capture_goes_along(thing: Lying) -> None:
+    cage, turned = build_cage(thing.cloud, thing.plane), thing.turned()
+    along = build_cage(turned.cloud, turned.plane)
+    turn = np.linalg.lstsq(cage.mesh.nodes, along.mesh.nodes, rcond=None)[0]
+    assert np.abs(along.mesh.nodes - cage.mesh.nodes @ turn).max() < 1e-5
+    assert np.allclose(turn @ turn.T, np.eye(3), atol=1e-5)
+    assert np.abs(turned.plane.heights(along.mesh.nodes)).min() < 1e-12
+
+
+def test_base_plane_goes_along(thing: Lying) -> None:
+    level = find_base_plane(thing.cloud, UP).offset
+    assert find_base_plane(thing.shuffled().cloud, UP).offset == level
+    assert find_base_plane(thing.scaled(4.0).cloud, UP).offset == 4.0 * level
+    assert find_base_plane(thing.moved((8.0, -16.0, 4.0)).cloud, UP).offset == pytest.approx(level - 4.0, abs=1e-14)
+    turned = thing.turned()
+    assert find_base_plane(turned.cloud, turned.up).offset == pytest.approx(level, abs=1e-5)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.integers(0, 10**6),
+    st.floats(1e-3, 1e3),
+    st.floats(0.0, 2.0 * np.pi),
+    st.lists(st.floats(-100.0, 100.0), min_size=3, max_size=3),
+)
+def test_frame_turns_moves_and_grows_with_the_body(seed: int, scale: float, angle: float, shift: list[float]) -> None:
+    """Of random points: what is seen from the frame does not change."""
+    random = np.random.default_rng(seed)
+    points = random.normal(size=(200, 3)) * random.uniform(0.3, 1.0, 3)
+    weights = random.uniform(0.1, 1.0, 200)
+    turn = Rotation.from_rotvec(angle * UP).as_matrix()
+    frame = upright_frame(points, weights, GROUND)
+    assert np.allclose(frame.axes @ frame.axes.T, np.eye(3)) and np.linalg.det(frame.axes) > 0.0
+    plane = GROUND.scaled(scale).moved(np.array(shift))
+    other = scale * points @ turn.T + shift
+    seen = upright_frame(other, weights, plane).points(other)
+    # Among moments that are nearly alike rounding may choose; of 200 random points none are so near.
+    assert np.abs(seen - frame.points(points)).max() < 1e-6 * np.abs(seen).max()
+
+
+@pytest.mark.parametrize("sides", [3, 4, 5])
+def test_round_bodies_face_along_what_they_have_most_of(sides: int) -> None:
+    """A regular star has no long side: x goes through one of its tips, or between two, and turns with it."""
+    random = np.random.default_rng(sides)
+    azimuth = 2.0 * np.pi * np.repeat(np.arange(sides), 50) / sides + np.tile(random.normal(0.0, 0.1, 50), sides)
+    radius = np.tile(random.uniform(0.2, 1.0, 50), sides)
+    star = np.column_stack(
+        [radius * np.cos(azimuth), radius * np.sin(azimuth), np.tile(random.uniform(0, 1, 50), sides)]
+    )
+    facing = []
+    for angle in (0.0, 0.3):
+        turned = star @ Rotation.from_rotvec(angle * UP).as_matrix().T
+        x = upright_frame(turned, np.ones(len(star)), GROUND).axes[0]
+        facing.append(np.arctan2(x[1], x[0]))
+    step = 2.0 * np.pi / sides
+    assert (facing[1] - facing[0] - 0.3 + 0.5 * step) % step - 0.5 * step == pytest.approx(0.0, abs=1e-9)
+
+
+def test_strays_do_not_turn_the_frame() -> None:
+    random = np.random.default_rng(0)
+    points = random.normal(size=(2000, 3)) * [1.0, 0.5, 0.8]
+    strays = np.concatenate([points, [[80.0, 90.0, 0.0], [1e4, -1e4, 50.0]]])
+    clean = upright_frame(points, np.ones(2000), GROUND)
+    dirty = upright_frame(strays, np.ones(2002), GROUND)
+    assert abs(clean.axes[0] @ dirty.axes[0]) > 0.9999
+    assert np.linalg.norm(clean.origin - dirty.origin) < 0.01
+    with pytest.raises(UserError, match="object: all of its 5 Gaussians are at one point, so it has no volume"):
+        upright_frame(np.ones((5, 3)), np.ones(5), GROUND)
+
+
+def test_there_and_back() -> None:
+    frame = BodyFrame(Rotation.from_rotvec([0.2, 0.5, -1.0]).as_matrix(), np.array([3.0, -1.0, 2.0]), 2.5)
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    plane = Plane.from_coefficients(0.1, 0.9, -0.3, 0.7)
+    assert np.allclose(frame.capture_points(frame.points(points)), points)
+    assert np.allclose(frame.plane(plane).heights(frame.points(points)), 2.5 * plane.heights(points))
+    assert np.allclose(frame.moved(np.ones(3)).points(points + 1.0), frame.points(points))
+
+
+@pytest.mark.data
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "up"), [("monkey.ply", (0, 1, 0)), ("plush_dog.ply", (0, -1, 0))])
+def test_real_captures(data_dir, name: str, up: tuple[int, int, int]) -> None:
+    """Shuffled and in a unit of a power of two the same bits; turned and in any unit the same tetrahedra."""
+    cloud = read_capture(data_dir / "objects" / name).cloud
+    lying = Lying(cloud, find_base_plane(cloud, np.array(up, float)))
+    _, cage = body_cage(lying)
+    for other in (lying.shuffled(), lying.scaled(0.25)):
+        nodes = body_cage(other)[1].mesh.nodes
+        assert np.array_equal(nodes, cage.mesh.nodes)
+    _, turned = body_cage(lying.turned().scaled(0.37))
+    assert np.array_equal(turned.mesh.tets, cage.mesh.tets)
+    assert np.abs(turned.mesh.nodes - cage.mesh.nodes).max() < 1e-5 * cage.height(GROUND)

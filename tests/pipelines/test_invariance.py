@@ -1,0 +1,146 @@
+"""A creature is the same however its file lies: muscles, contact, first steps bit for bit; a jump and its pictures
+within bands.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.assets import figurine, pawn
+from egs_warp.deformation.deformer import deform
+from egs_warp.deformation.embedding import embed_gaussians
+from egs_warp.geometry.body_frame import GROUND
+from egs_warp.geometry.camera_ring import ring_cameras
+from egs_warp.io import read_capture
+from egs_warp.locomotion.rollout import Simulation, simulate
+from egs_warp.locomotion.trajectory import measure
+from egs_warp.motions.repertoire import longest, parts_of
+from egs_warp.motions.script import parse_script
+from egs_warp.motions.sequence import MotionSequence
+from egs_warp.pipelines.creature import FILMED_FROM, Creature, first_place, make_creature
+from egs_warp.render.rasteriser import render
+from egs_warp.segmentation.base_plane import find_base_plane
+from tests.support.frames import TURN, Lying
+
+
+def jump(lying: Lying, *, frames: int | None = None, by_up: bool = False) -> tuple[Creature, Simulation]:
+    """The first ``frames`` of a jump, or all of it; the plane is given, or found from up alone."""
+    creature = make_creature(lying.cloud, **({"up": lying.up} if by_up else {"plane": lying.plane}))
+    requests = parse_script("jump")
+    sequence = MotionSequence(first_place(creature), parts_of(requests, creature.body.height))
+    simulation = simulate(
+        creature.stepper,
+        creature.geometry,
+        creature.start,
+        sequence,
+        frames=frames or longest(requests),
+        finished=lambda: frames is None and sequence.finished,
+    )
+    return creature, simulation
+
+
+def pictures(creature: Creature, positions: np.ndarray) -> np.ndarray:
+    """(4, H, W, 3) of the creature carried to node ``positions``, from cameras that its own frame holds."""
+    carried = deform(creature.cloud, embed_gaussians(creature.cloud, creature.cage.mesh), positions).cloud
+    cameras = ring_cameras(GROUND, np.array([0.0, 0.0, 0.5]), 0.8, count=4, size=96)
+    return np.stack([render(carried, camera).colour.numpy() for camera in cameras])
+
+
+@pytest.fixture(scope="module")
+def thing() -> Lying:
+    made = pawn(gaussian_count=2500)
+    return Lying(made.cloud, made.plane).on_grid()
+
+
+@pytest.fixture(scope="module")
+def first_steps(thing: Lying) -> tuple[Creature, Simulation]:
+    return jump(thing, frames=2, by_up=True)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        lambda thing: thing.shuffled(),
+        lambda thing: thing.scaled(4.0),
+        lambda thing: thing.moved((1000.0, -333.0, 17.0)),
+    ],
+    ids=["shuffled", "x4", "moved"],
+)
+def test_same_bits_however_the_file_lies(thing: Lying, first_steps: tuple[Creature, Simulation], other) -> None:
+    creature, simulation = first_steps
+    again, simulated = jump(other(thing), frames=2, by_up=True)
+    for mine, its in (
+        (again.cage.mesh, creature.cage.mesh),
+        (again.muscles, creature.muscles),
+        (again.geometry, creature.geometry),
+        (simulated.trajectory, simulation.trajectory),
+    ):
+        for name in mine.__dataclass_fields__:
+            a, b = getattr(mine, name), getattr(its, name)
+            if hasattr(a, "toarray"):
+                a, b = a.toarray(), b.toarray()
+            if isinstance(a, np.ndarray | float | int):
+                assert np.array_equal(a, b), name
+
+
+@pytest.mark.parametrize(
+    "other", [lambda thing: thing.scaled(0.37), lambda thing: thing.turned()], ids=["x0.37", "turned"]
+)
+def test_same_pictures_in_any_unit_and_turned(thing: Lying, first_steps: tuple[Creature, Simulation], other) -> None:
+    creature, simulation = first_steps
+    again, simulated = jump(other(thing), frames=2, by_up=True)
+    truth = pictures(creature, simulation.trajectory.positions[-1])
+    assert truth.std() > 0.05
+    assert np.abs(pictures(again, simulated.trajectory.positions[-1]) - truth).mean() < 1e-3
+
+
+def test_trajectory_leads_back_to_the_capture(thing: Lying, first_steps: tuple[Creature, Simulation]) -> None:
+    """The nodes at the start stand where the Gaussians are, on the capture's plane."""
+    turned = thing.moved((3.0, 1.0, -2.0)).turned().scaled(0.37)
+    creature, simulation = jump(turned, frames=1)
+    trajectory = simulation.trajectory.placed(creature.frame)
+    nodes, means = trajectory.in_capture(trajectory.rest_positions), turned.cloud.means.numpy()
+    assert turned.plane.heights(nodes).min() == pytest.approx(0.0, abs=1e-9)
+    slack = 0.05 * 0.37
+    assert np.abs(nodes.min(axis=0) - means.min(axis=0)).max() < slack
+    assert np.abs(nodes.max(axis=0) - means.max(axis=0)).max() < slack
+    assert trajectory.height / trajectory.metres_per_unit == pytest.approx(0.37, rel=0.05)
+
+
+CHANGES = {
+    "x0.37": lambda thing: thing.scaled(0.37),
+    "turned": lambda thing: thing.turned(),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CHANGES)
+def test_jump_goes_as_far_in_any_unit_and_turned(thing: Lying, name: str) -> None:
+    """Distance and height within 1 %."""
+    reached, again = (measure(jump(one)[1].trajectory) for one in (thing, CHANGES[name](thing)))
+    assert again.distance == pytest.approx(reached.distance, rel=0.01)
+    assert again.height == pytest.approx(reached.height, rel=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.data
+@pytest.mark.parametrize(("name", "up"), [("monkey.ply", (0, 1, 0)), ("plush_dog.ply", (0, -1, 0))])
+def test_jump_of_real_captures_goes_as_far(data_dir, name: str, up: tuple[int, int, int]) -> None:
+    """Turned and in another unit, with nothing but up: distance and height within 1 %."""
+    cloud = read_capture(data_dir / "objects" / name).cloud
+    lying = Lying(cloud, find_base_plane(cloud, np.array(up, float)))
+    reached, again = (measure(jump(one, by_up=True)[1].trajectory) for one in (lying, lying.turned().scaled(0.37)))
+    assert again.distance == pytest.approx(reached.distance, rel=0.01)
+    assert again.height == pytest.approx(reached.height, rel=0.01)
+
+
+def test_front_is_where_the_face_is() -> None:
+    """The figurine looks along -y of its file; its camera stands before it, however the file lies."""
+    made = figurine(gaussian_count=6000)
+    turned = Lying(made.cloud, made.plane).turned()
+    creature = make_creature(turned.cloud, plane=turned.plane)
+    face = creature.frame.axes @ TURN @ [0.0, -1.0, 0.0]
+    assert creature.front @ face > 0.8
+    ground = first_place(creature).ground
+    assert (FILMED_FROM @ ground.axes) @ face > 0.3
