@@ -15,7 +15,7 @@ import numpy as np
 import mesh_scenes as scenes
 from egs_warp.deformation.peers import CarryMethod, carry
 from egs_warp.render import render_gaussians
-from egs_warp.training.finetune import psnr
+from egs_warp.training.likeness import psnr
 from harness import Table, flags, report
 
 

@@ -31,7 +31,8 @@ from egs_warp.io import read_capture
 from egs_warp.io.video import contact_sheet
 from egs_warp.render import render_gaussians
 from egs_warp.segmentation.plane_fit import plane_depth
-from egs_warp.training.finetune import FinetuneOptions, TrainingView, finetune, psnr
+from egs_warp.training.finetune import FinetuneOptions, TrainingView, finetune
+from egs_warp.training.likeness import psnr
 from harness import Row, Table, data_folder, flags, report, timed
 
 AIMS = ("beats_cv2_by_3db", "beats_no_prior_by_3db", "seconds_on_gpu", "hole_size_independent")

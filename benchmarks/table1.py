@@ -33,7 +33,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.meshing.cage import build_cage
 from egs_warp.render import render_gaussians
-from egs_warp.training.finetune import psnr, ssim
+from egs_warp.training.likeness import psnr, ssim
 from harness import Row, Table, flags, report, timed
 from perceptual import lpips_distance
 

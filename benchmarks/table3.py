@@ -28,7 +28,7 @@ from egs_warp.render import render_gaussians
 from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane
 from egs_warp.segmentation.object_mask import ObjectSpec, masks_from_selection
 from egs_warp.segmentation.votes import blending_votes
-from egs_warp.training.finetune import psnr, ssim
+from egs_warp.training.likeness import psnr, ssim
 from harness import Row, Table, data_folder, flags, report, timed
 from perceptual import lpips_distance
 

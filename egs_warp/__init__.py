@@ -41,7 +41,8 @@ if TYPE_CHECKING:
     from egs_warp.render.autograd import render_torch
     from egs_warp.render.rasteriser import render_gaussians
     from egs_warp.segmentation.object_mask import Box, ObjectSpec
-    from egs_warp.training.finetune import FinetuneOptions, Rates, finetune, psnr, views_of_capture
+    from egs_warp.training.finetune import FinetuneOptions, Rates, finetune, views_of_capture
+    from egs_warp.training.likeness import psnr
 
 _HOMES: dict[str, tuple[str, ...]] = {
     "assets.scene": ("BUILT_IN_SCENES", "Scene", "scene"),
@@ -74,7 +75,8 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "render.autograd": ("render_torch",),
     "render.rasteriser": ("render_gaussians",),
     "segmentation.object_mask": ("Box", "ObjectSpec"),
-    "training.finetune": ("FinetuneOptions", "Rates", "finetune", "psnr", "views_of_capture"),
+    "training.finetune": ("FinetuneOptions", "Rates", "finetune", "views_of_capture"),
+    "training.likeness": ("psnr",),
 }
 """Where each public name lives; the imports above say the same to type checkers."""
 _MODULE_OF = {name: f"egs_warp.{module}" for module, names in _HOMES.items() for name in names}

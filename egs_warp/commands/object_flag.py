@@ -10,6 +10,7 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera, camera_rays, shrunk
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.lens import Straightening
 from egs_warp.io.cameras import PosedImage
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.object_mask import Box, ObjectSpec
@@ -46,7 +47,11 @@ def read_object(
         return ObjectSpec(box=Box(low, high))
     if not posed:
         raise UserError(f"--object {text}: a pixel needs cameras; give --cameras, or a point x,y,z")
-    return ObjectSpec(point=point_at(cloud, _view_named(posed, view, text).camera, numbers[0], numbers[1]))
+    one = _view_named(posed, view, text)
+    u, v = float(numbers[0]), float(numbers[1])
+    if one.lens is not None:
+        u, v = Straightening.of(one.camera, one.lens).pixel(u, v)
+    return ObjectSpec(point=point_at(cloud, one.camera, u, v))
 
 
 def point_at(cloud: GaussianCloud, camera: Camera, u: float, v: float) -> np.ndarray:
@@ -93,6 +98,9 @@ def _read_masks(path: Path, posed: Sequence[PosedImage] | None, view: str | None
                 f"{file}: the mask is {mask.shape[1]} x {mask.shape[0]} pixels, the photo {one.name} "
                 f"{camera.width} x {camera.height}; make it at the photo's size"
             )
+        if one.lens is not None:
+            # Drawn on the photo as the lens bent it.
+            mask = Straightening.of(camera, one.lens).mask(mask)
         small = shrunk(camera, MAX_MASK_SIDE)
         factor = camera.width // small.width
         # The middle pixel of each block; a mask's edge is not known better than that.

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.train_capture import TrainResult
 
 _SHEET_PHOTOS = 6
-_DEFAULTS = {"cpu": (2000, 20_000, 360), "cuda": (7000, 200_000, 1600)}
-"""Iterations, Gaussians, longer side in pixels: some ten minutes on two cores, about one on a GPU."""
+_DEFAULTS = {"cpu": (2000, 20_000, 360), "cuda": (7000, None, 1600)}
+"""Iterations, Gaussians, longer side in pixels: a preview on two cores, a capture on a GPU."""
 
 
 def add_parser(commands: Commands) -> None:
@@ -30,9 +30,11 @@ def add_parser(commands: Commands) -> None:
     train.add_argument("posed", help="COLMAP model, transforms.json or cameras.json, or a folder that holds one")
     train.add_argument("--out", required=True, type=Path, help="capture to write: .ply, .compressed.ply, .spz or .sog")
     train.add_argument("--iterations", type=int, help="optimiser steps, one photo each (cpu 2000, cuda 7000)")
-    train.add_argument("--gaussians", type=int, help="at most this many (cpu 20000, cuda 200000)")
+    train.add_argument(
+        "--gaussians", type=int, help="at most this many (cpu 20000, cuda as many as the photos gain by)"
+    )
     train.add_argument("--max-side", type=int, help="photos are reduced to this many pixels (cpu 360, cuda 1600)")
-    train.add_argument("--sh-degree", type=int, default=2, help="how colours depend on the view, 0 to 3 (2)")
+    train.add_argument("--sh-degree", type=int, default=3, help="how colours depend on the view, 0 to 3 (3)")
     train.add_argument(
         "--background", help="r,g,b from 0 to 1 behind the capture (white for photos with alpha, else their border's)"
     )
@@ -93,7 +95,8 @@ def _train(chosen: argparse.Namespace) -> int:
     _write_sheet(folder / f"{stem}.sheet.png", result)
     for which, scores in report["mean"].items():
         if scores:
-            print(f"{which.replace('_', ' ')}: {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f}")
+            values = f"{scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f}"
+            print(f"{which.replace('_', ' ')}: {values} in each photo's exposure")
     print(f"wrote {chosen.out} ({result.cloud.count} Gaussians), {stem}.sheet.png, {stem}.report.json")
     return 0
 
@@ -171,6 +174,7 @@ def _report(chosen: argparse.Namespace, result: TrainResult, progress: _Progress
     }
     return {
         "photos": len(result.views),
+        "left_out": [asdict(one) for one in result.left_out],
         "photo_size": [photo.width, photo.height],
         "gaussians": result.cloud.count,
         "iterations": len(result.losses),
@@ -195,7 +199,6 @@ def _write_sheet(path: Path, result: TrainResult) -> None:
     pairs = list(zip(result.views, result.scores, strict=True))
     judged = [pair for pair in pairs if pair[1].held_out] or pairs
     picked = [judged[i] for i in np.unique(np.linspace(0, len(judged) - 1, _SHEET_PHOTOS).round().astype(int))]
-    size = max(view.image.shape[0] for view, _ in picked), max(view.image.shape[1] for view, _ in picked)
     frames, labels = [], []
     for view, score in picked:
         for kind, picture in (
@@ -205,8 +208,6 @@ def _write_sheet(path: Path, result: TrainResult) -> None:
                 render_gaussians(result.cloud, view.camera, background=result.background).colour_srgb8(),
             ),
         ):
-            frame = np.full((*size, 3), 255, dtype=np.uint8)
-            frame[: picture.shape[0], : picture.shape[1]] = picture
-            frames.append(frame)
+            frames.append(picture)
             labels.append(kind)
     write_png(path, contact_sheet(frames, 4 if len(picked) > 2 else 2, labels))

@@ -12,11 +12,18 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.lens import Lens
 from egs_warp.io.atomic import atomic_write
-from egs_warp.io.colmap import read_colmap_model
+from egs_warp.io.colmap import SparsePoints, read_colmap_model, read_colmap_points
+from egs_warp.io.ply import read_point_ply
 
 _IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".webp")
-_DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
+_DISTORTIONS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_LENSES = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"),
+    *("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"),
+)
+"""Of ``camera_model`` in transforms.json."""
 _JSON_NAMES = ("cameras.json", "transforms.json", "transforms_train.json")
 _COLMAP_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0")
 
@@ -29,6 +36,8 @@ class PosedImage:
     camera: Camera
     image: Path | None
     """The photo's file; None where it is not beside the poses."""
+    lens: Lens | None = None
+    """What bends the photo's lines; ``camera`` is then that of the photo straightened, at the same size."""
 
 
 def read_cameras(path: Path | str) -> list[PosedImage]:
@@ -36,17 +45,11 @@ def read_cameras(path: Path | str) -> list[PosedImage]:
 
     ``path`` is the .json, the folder of a COLMAP model (text or binary), or a folder that holds one of these. Poses are
     kept in the file's world frame; nerfstudio's ``applied_transform`` is not undone. Raises ``UserError`` for missing
-    or malformed files and for cameras with lens distortion.
+    or malformed files and for lenses that are not known here.
     """
-    source = Path(path)
+    source = _pose_file(Path(path))
     if source.is_dir():
-        for folder in (source / name for name in _COLMAP_FOLDERS):
-            if any((folder / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
-                return _from_colmap(folder)
-        found = [source / name for name in _JSON_NAMES if (source / name).is_file()]
-        if not found:
-            raise UserError(f"{source}: no camera poses; give a COLMAP model, a cameras.json or a transforms.json")
-        source = found[0]
+        return _from_colmap(source)
     try:
         tree = json.loads(source.read_bytes())
     except FileNotFoundError as error:
@@ -58,12 +61,44 @@ def read_cameras(path: Path | str) -> list[PosedImage]:
     if isinstance(tree, list):
         posed = [_inria(source, number, entry) for number, entry in enumerate(tree)]
     elif isinstance(tree, dict) and isinstance(tree.get("frames"), list):
-        posed = [_transform(source, number, tree, entry) for number, entry in enumerate(tree["frames"])]
+        frames = tree["frames"]
+        size = _shared_size(source, tree)
+        posed = [_transform(source, number, tree | size, entry) for number, entry in enumerate(frames)]
     else:
         raise UserError(f"{source}: neither a list of cameras nor frames; give a cameras.json or a transforms.json")
     if not posed:
         raise UserError(f"{source}: it has no cameras; export the poses again")
     return posed
+
+
+def read_points(path: Path | str) -> SparsePoints | None:
+    """The points triangulated from the photos of ``path``; None where there are none.
+
+    COLMAP's, or the .ply that nerfstudio (``ply_file_path``) and INRIA (``input.ply``) put beside their poses. Raises
+    ``UserError`` for malformed files.
+    """
+    source = _pose_file(Path(path))
+    if source.is_dir():
+        return read_colmap_points(source)
+    tree = json.loads(source.read_bytes())
+    name = tree.get("ply_file_path") if isinstance(tree, dict) else "input.ply"
+    if not isinstance(name, str) or not os.path.isfile(source.parent / name):
+        return None
+    positions, colours = read_point_ply(source.parent / name)
+    return SparsePoints(positions, colours) if len(positions) else None
+
+
+def _pose_file(source: Path) -> Path:
+    """The folder of a COLMAP model, or the .json, that ``source`` is or holds."""
+    if not source.is_dir():
+        return source
+    for folder in (source / name for name in _COLMAP_FOLDERS):
+        if any((folder / f"images{suffix}").is_file() for suffix in (".bin", ".txt")):
+            return folder
+    found = [source / name for name in _JSON_NAMES if (source / name).is_file()]
+    if not found:
+        raise UserError(f"{source}: no camera poses; give a COLMAP model, a cameras.json or a transforms.json")
+    return found[0]
 
 
 def _from_colmap(folder: Path) -> list[PosedImage]:
@@ -90,7 +125,7 @@ def _from_colmap(folder: Path) -> list[PosedImage]:
         # COLMAP keeps the photos' folder to itself; these are the usual places around sparse/0.
         places = [parent / "images" for parent in (folder, folder.parent, folder.parent.parent)]
         image = next((place / view.name for place in places if os.path.isfile(place / view.name)), None)
-        posed.append(PosedImage(view.name, camera, image))
+        posed.append(PosedImage(view.name, camera, image, view.lens))
     return posed
 
 
@@ -119,15 +154,8 @@ def _transform(source: Path, number: int, shared: dict, entry: object) -> PosedI
     record = _Record(source, f"frame {number}", {**shared, **own})
     name = record.text("file_path")
     image = _find_image(source.parent / name)
-    model = record.fields.get("camera_model", "PINHOLE")
-    bent = [key for key in _DISTORTIONS if record.fields.get(key)]
-    if model not in ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV") or bent:
-        what = ", ".join(bent) or model
-        raise UserError(f"{source}: frame {number} has lens distortion ({what}); undistort the photos first")
-    if "w" in record.fields:
-        width, height = record.size("w"), record.size("h")
-    else:
-        width, height = _image_size(source, number, name, image)
+    lens = _lens(record)
+    width, height = record.size("w"), record.size("h")
     if "fl_x" in record.fields:
         fx = record.focal("fl_x")
     else:
@@ -150,7 +178,18 @@ def _transform(source: Path, number: int, shared: dict, entry: object) -> PosedI
         rotation=rotation,
         translation=-rotation @ matrix[:3, 3],
     )
-    return PosedImage(name, camera, image)
+    return PosedImage(name, camera, image, lens)
+
+
+def _lens(record: _Record) -> Lens | None:
+    model = record.fields.get("camera_model", "OPENCV_FISHEYE" if record.fields.get("is_fisheye") else "OPENCV")
+    if model not in _LENSES:
+        raise UserError(
+            f"{record.source}: {record.where} has the lens model {model!r}, which is not known;"
+            f" give one of {', '.join(_LENSES)}"
+        )
+    given = {key: float(record.numbers(key, ())) for key in _DISTORTIONS if record.fields.get(key)}
+    return Lens.named(model, given)
 
 
 def _find_image(path: Path) -> Path | None:
@@ -158,17 +197,25 @@ def _find_image(path: Path) -> Path | None:
     return next((Path(f"{path}{suffix}") for suffix in _IMAGE_SUFFIXES if os.path.isfile(f"{path}{suffix}")), None)
 
 
-def _image_size(source: Path, number: int, name: str, image: Path | None) -> tuple[int, int]:
+def _shared_size(source: Path, tree: dict) -> dict[str, int]:
+    """``w`` and ``h`` of sets that leave them out: those of the first photo that can be read."""
     from PIL import Image
 
-    if image is None:
-        raise UserError(f"{source}: frame {number} has no w and h, and its photo {name} is missing; add either")
-    try:
-        with Image.open(image) as opened:
-            return opened.size
-    # The decoder is handed a stranger's bytes, and its errors share no base class.
-    except Exception as error:
-        raise UserError(f"{image}: not a readable image; copy it again") from error
+    frames = [frame for frame in tree["frames"] if isinstance(frame, dict)]
+    if "w" in tree or all("w" in frame for frame in frames):
+        return {}
+    for frame in frames:
+        name = frame.get("file_path")
+        image = _find_image(source.parent / name) if isinstance(name, str) and "\0" not in name else None
+        if image is None:
+            continue
+        try:
+            with Image.open(image) as opened:
+                return {"w": opened.width, "h": opened.height}
+        # The decoder is handed a stranger's bytes, and its errors share no base class.
+        except Exception:
+            continue
+    raise UserError(f"{source}: it has no w and h, and none of its photos can be read; add either")
 
 
 class _Record:

@@ -12,26 +12,29 @@ from pathlib import Path
 import numpy as np
 
 from egs_warp.errors import UserError
+from egs_warp.geometry.lens import Lens
 
-# Name and number of parameters of each camera model by its number in the binary format; focal lengths and the principal
-# point come first, distortion after them.
-_MODELS = (
-    ("SIMPLE_PINHOLE", 3),
-    ("PINHOLE", 4),
-    ("SIMPLE_RADIAL", 4),
-    ("RADIAL", 5),
-    ("OPENCV", 8),
-    ("OPENCV_FISHEYE", 8),
-    ("FULL_OPENCV", 12),
-    ("FOV", 5),
-    ("SIMPLE_RADIAL_FISHEYE", 4),
-    ("RADIAL_FISHEYE", 5),
-    ("THIN_PRISM_FISHEYE", 12),
-)
-_ONE_FOCAL_LENGTH = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-# Without distortion these are pinhole cameras; a fisheye never is.
-_PINHOLE_AT_ZERO = (*_ONE_FOCAL_LENGTH, "PINHOLE", "OPENCV", "FULL_OPENCV")
+# Name and parameters of each camera model by its number in the binary format.
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", "f cx cy"),
+    1: ("PINHOLE", "fx fy cx cy"),
+    2: ("SIMPLE_RADIAL", "f cx cy k1"),
+    3: ("RADIAL", "f cx cy k1 k2"),
+    4: ("OPENCV", "fx fy cx cy k1 k2 p1 p2"),
+    5: ("OPENCV_FISHEYE", "fx fy cx cy k1 k2 k3 k4"),
+    6: ("FULL_OPENCV", "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
+    7: ("FOV", "fx fy cx cy omega"),
+    8: ("SIMPLE_RADIAL_FISHEYE", "f cx cy k1"),
+    9: ("RADIAL_FISHEYE", "f cx cy k1 k2"),
+    10: ("THIN_PRISM_FISHEYE", "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1"),
+    14: ("SIMPLE_FISHEYE", "f cx cy"),
+    15: ("FISHEYE", "fx fy cx cy"),
+}
+_PARAMETERS = {name: parameters.split() for name, parameters in _MODELS.values()}
 _POINT_BYTES = 24
+"""Of a point seen in a photo."""
+_TRACK_BYTES = 8
+"""Of a photo that a point is seen in."""
 
 
 @dataclass(frozen=True)
@@ -49,14 +52,29 @@ class ColmapView:
     """(4,) w x y z, world to camera, far from zero."""
     translation: np.ndarray
     """(3,) world to camera."""
+    lens: Lens | None
+    """What bends the photo; None for a pinhole."""
+
+
+@dataclass(frozen=True)
+class SparsePoints:
+    """Points that were triangulated from the photos."""
+
+    positions: np.ndarray
+    """(n, 3) float64, world units."""
+    colours: np.ndarray
+    """(n, 3) float64, 0 to 1."""
 
 
 @dataclass(frozen=True)
 class _Intrinsics:
-    model: str
     width: int
     height: int
-    parameters: tuple[float, ...]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    lens: Lens | None
 
 
 @dataclass(frozen=True)
@@ -69,7 +87,7 @@ class _Pose:
 def read_colmap_model(folder: Path) -> list[ColmapView]:
     """The photos of the model in ``folder``, in the order of its file; binary where both kinds exist.
 
-    Raises ``UserError`` for a model that is incomplete, malformed or has lens distortion.
+    Raises ``UserError`` for a model that is incomplete or malformed, and for lenses that are not known here.
     """
     suffix = ".bin" if (folder / "images.bin").is_file() else ".txt"
     cameras_file, images_file = folder / f"cameras{suffix}", folder / f"images{suffix}"
@@ -86,11 +104,18 @@ def read_colmap_model(folder: Path) -> list[ColmapView]:
         values = np.array(pose.values)
         if not np.isfinite(values).all() or not 1e-3 < np.abs(values[:4]).max() < 1e3:
             raise UserError(f"{images_file}: image {pose.name} has no valid pose; reconstruct the scene again")
-        camera = cameras[pose.camera]
-        one = camera.model in _ONE_FOCAL_LENGTH
-        fx, fy, cx, cy = (camera.parameters[0], *camera.parameters[:3]) if one else camera.parameters[:4]
-        views.append(ColmapView(pose.name, camera.width, camera.height, fx, fy, cx, cy, values[:4], values[4:]))
+        views.append(ColmapView(pose.name, quaternion=values[:4], translation=values[4:], **vars(cameras[pose.camera])))
     return views
+
+
+def read_colmap_points(folder: Path) -> SparsePoints | None:
+    """The points of the model in ``folder``; None where it has none. Raises ``UserError`` for a malformed file."""
+    for name, parse in (("points3D.bin", _binary_points), ("points3D.txt", _text_points)):
+        if (folder / name).is_file():
+            values = parse(_read(folder / name), folder / name)
+            values = values[np.isfinite(values).all(axis=1)]
+            return SparsePoints(values[:, :3], values[:, 3:] / 255.0) if len(values) else None
+    return None
 
 
 def _read(path: Path) -> bytes:
@@ -103,15 +128,17 @@ def _read(path: Path) -> bytes:
 def _intrinsics(
     path: Path, number: int, model: str, width: int, height: int, parameters: tuple[float, ...]
 ) -> _Intrinsics:
-    counts = dict(_MODELS)
-    if model not in counts or len(parameters) != counts[model]:
-        raise UserError(f"{path}: camera {number} of model {model} with {len(parameters)} parameters is not known")
-    first = 3 if model in _ONE_FOCAL_LENGTH else 4
-    if model not in _PINHOLE_AT_ZERO or any(parameters[first:]):
-        raise UserError(f"{path}: camera {number} has lens distortion ({model}); run colmap image_undistorter first")
-    if width < 1 or height < 1 or not np.isfinite(parameters).all() or min(parameters[: first - 2]) <= 0:
+    names = _PARAMETERS.get(model)
+    if names is None or len(parameters) != len(names):
+        raise UserError(
+            f"{path}: camera {number} of model {model} with {len(parameters)} parameters is not known;"
+            f" give one of {', '.join(_PARAMETERS)}"
+        )
+    values = dict(zip(names, parameters, strict=True))
+    fx, fy = values.get("fx", values.get("f", 0.0)), values.get("fy", values.get("f", 0.0))
+    if width < 1 or height < 1 or not np.isfinite(parameters).all() or min(fx, fy) <= 0:
         raise UserError(f"{path}: camera {number} has no valid size and focal length; reconstruct the scene again")
-    return _Intrinsics(model, width, height, parameters)
+    return _Intrinsics(width, height, fx, fy, values["cx"], values["cy"], Lens.named(model, values))
 
 
 def _text_lines(data: bytes, path: Path) -> list[str]:
@@ -194,10 +221,12 @@ def _binary_cameras(data: bytes, path: Path) -> dict[int, _Intrinsics]:
     cameras = {}
     for _ in range(cursor.take("Q")[0]):
         number, model, width, height = cursor.take("iiQQ")
-        if not 0 <= model < len(_MODELS):
-            raise UserError(f"{path}: camera {number} has unknown model {model}; undistort the photos first")
-        name, count = _MODELS[model]
-        cameras[number] = _intrinsics(path, number, name, width, height, cursor.take(f"{count}d"))
+        if model not in _MODELS:
+            raise UserError(
+                f"{path}: camera {number} has model {model}, which is not known; give one of {', '.join(_PARAMETERS)}"
+            )
+        name = _MODELS[model][0]
+        cameras[number] = _intrinsics(path, number, name, width, height, cursor.take(f"{len(_PARAMETERS[name])}d"))
     return cameras
 
 
@@ -210,3 +239,30 @@ def _binary_poses(data: bytes, path: Path) -> list[_Pose]:
         poses.append(_Pose(name, values[8], values[1:8]))
         cursor.skip(_POINT_BYTES * cursor.take("Q")[0])
     return poses
+
+
+def _binary_points(data: bytes, path: Path) -> np.ndarray:
+    """(n, 6) position and colour."""
+    cursor = _Cursor(data, path)
+    count = cursor.take("Q")[0]
+    points = []
+    for _ in range(count):
+        _number, *values = cursor.take("Q3d3Bd")
+        points.append(values[:6])
+        cursor.skip(_TRACK_BYTES * cursor.take("Q")[0])
+    return np.array(points, dtype=float).reshape(-1, 6)
+
+
+def _text_points(data: bytes, path: Path) -> np.ndarray:
+    points = []
+    for line in _text_lines(data, path):
+        words = line.split()
+        if not words:
+            continue
+        try:
+            points.append([float(word) for word in words[1:7]])
+            if len(points[-1]) != 6:
+                raise ValueError
+        except ValueError as error:
+            raise UserError(f"{path}: malformed point line {line[:60]!r}; export the model again") from error
+    return np.array(points, dtype=float).reshape(-1, 6)

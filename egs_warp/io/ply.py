@@ -197,6 +197,27 @@ def decode_ply(data: bytes, header: PlyHeader, source: Path) -> RawCapture:
     )
 
 
+def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (n, 3) float64 and colours (n, 3) float64, 0 to 1, of a .ply of coloured points; grey without colours.
+
+    Raises ``UserError`` for one that is malformed or has no positions.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+    rows = read_elements(data, read_header(data, path), ["vertex"], path).get("vertex")
+    names = () if rows is None else rows.dtype.names or ()
+    if rows is None or not {"x", "y", "z"} <= set(names):
+        raise UserError(f"{path}: it has no points x, y, z; export it again")
+    positions = np.stack([rows[name] for name in ("x", "y", "z")], axis=1).astype(float)
+    colours = np.full(positions.shape, 0.5)
+    if {"red", "green", "blue"} <= set(names):
+        colours = np.stack([rows[name] for name in ("red", "green", "blue")], axis=1) / 255.0
+    finite = np.isfinite(positions).all(axis=1) & np.isfinite(colours).all(axis=1)
+    return positions[finite], colours[finite]
+
+
 def write_ply(path: Path | str, cloud: GaussianCloud) -> None:
     """Write ``cloud`` as an INRIA .ply, binary little-endian, float32: reading it gives the same bits.
 

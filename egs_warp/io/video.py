@@ -29,14 +29,15 @@ def write_png(path: Path | str, image: np.ndarray) -> None:
 
 
 def contact_sheet(frames: Sequence[np.ndarray], columns: int, labels: Sequence[str]) -> np.ndarray:
-    """(rows * H, columns * W, 3) uint8: the frames (H, W, 3) side by side, each with its label in its upper left
-    corner.
+    """(rows * H, columns * W, 3) uint8: the frames side by side, each with its label in its upper left corner.
+
+    Frames of other sizes than the largest height H and width W are laid in the middle of a white cell.
     """
     import cv2
 
     if len(frames) != len(labels) or not frames:
         raise UserError(f"contact sheet: {len(frames)} frames and {len(labels)} labels; give one label to each frame")
-    height, width = frames[0].shape[:2]
+    height, width = (max(frame.shape[axis] for frame in frames) for axis in (0, 1))
     rows = -(-len(frames) // columns)
     sheet = np.full((rows * height, columns * width, 3), 255, dtype=np.uint8)
     size = max(0.35, height / 512 * 0.8)
@@ -53,12 +54,20 @@ def contact_sheet(frames: Sequence[np.ndarray], columns: int, labels: Sequence[s
             cv2.LINE_AA,
         )
         # A light rim under dark letters reads on any background.
-        cell = np.asarray(frame, dtype=np.float32)
+        cell = _in_the_middle(frame, height, width)
         for colour, mask in ((255.0, cv2.dilate(letters, rim)), (20.0, letters)):
             cell = cell + mask[..., None] / 255.0 * (colour - cell)
         row, column = divmod(index, columns)
         sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = np.rint(cell)
     return sheet
+
+
+def _in_the_middle(frame: np.ndarray, height: int, width: int) -> np.ndarray:
+    """(height, width, 3) float32."""
+    cell = np.full((height, width, 3), 255.0, dtype=np.float32)
+    top, left = (height - frame.shape[0]) // 2, (width - frame.shape[1]) // 2
+    cell[top : top + frame.shape[0], left : left + frame.shape[1]] = frame
+    return cell
 
 
 class _AbandonedError(Exception):

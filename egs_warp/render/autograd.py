@@ -108,7 +108,8 @@ class _Forward:
     image: RenderedImage
 
 
-def _torch_stream(device: torch.device) -> AbstractContextManager[Any]:
+def torch_stream(device: torch.device) -> AbstractContextManager[Any]:
+    """Warp works on the stream that torch works on, where there are streams."""
     if device.type != "cuda":
         return nullcontext()
     return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
@@ -145,7 +146,7 @@ class _Render(torch.autograd.Function):
             )
         wp.init()
         tensors = tuple(tensor.detach().contiguous() for tensor in attributes)
-        with _torch_stream(tensors[0].device):
+        with torch_stream(tensors[0].device):
             cloud = _cloud_of(tensors)
             view = view_from_camera(camera)
             threads = task.threads
@@ -166,7 +167,7 @@ class _Render(torch.autograd.Function):
     def backward(ctx: Any, *pixel_gradients: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
         done: _Forward = ctx.forward_pass
         device = wp.device_to_torch(done.cloud.device)
-        with _torch_stream(torch.device(device)):
+        with torch_stream(torch.device(device)):
             by_colour, by_alpha, by_depth = (
                 None if gradient is None else wp.from_torch(gradient.detach().contiguous(), dtype=dtype)
                 for gradient, dtype in zip(pixel_gradients[:3], (wp.vec3, wp.float32, wp.float32), strict=True)

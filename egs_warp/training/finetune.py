@@ -18,10 +18,17 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.render import render_gaussians
 from egs_warp.render.autograd import render_torch
+from egs_warp.training.growth import Growth
+from egs_warp.training.likeness import ssim
+from egs_warp.training.misfits import Misfits
+from egs_warp.training.photo_loss import PhotoLoss, Target
 from egs_warp.training.relocation import Population
+from egs_warp.training.tones import Tones
 
 MIN_LOG_SCALE = -10.0
 """Scales are kept at e^-10 or above, as in the paper."""
+_UNSEEN_STEPS = 20
+"""Steps on a GPU between two looks at the losses."""
 
 
 class Densification(enum.Enum):
@@ -71,8 +78,14 @@ class FinetuneOptions:
     background: tuple[float, float, float] | None = (1.0, 1.0, 1.0)
     """One colour; None draws a random one each step, which needs views with alpha to make sense."""
     densification: Densification = Densification.NONE
-    max_gaussians: int = 100_000
-    """The cap that relocation grows to."""
+    max_gaussians: int | None = 100_000
+    """The cap that relocation grows to; None grows while the pictures gain by it."""
+    sh_steps: int = 0
+    """Steps after which the next degree of SH begins; 0 trains all from the start."""
+    tones: bool = False
+    """Each view has an exposure and white balance of its own, found with the cloud."""
+    leave_out_misfits: bool = False
+    """Views that never fit the others are left out on the way."""
     antialiased: bool = False
     seed: int = 0
     threads: int | None = None
@@ -103,6 +116,10 @@ class FinetuneResult:
     cloud: GaussianCloud
     losses: np.ndarray
     """(iterations,) float64."""
+    tones: np.ndarray | None = None
+    """(views, 3, 4) float64: each view's colours are these times the cloud's and 1; None unless asked for."""
+    misfits: tuple[int, ...] = ()
+    """Numbers of the views that were left out."""
 
 
 ExtraLoss = Callable[[GaussianTensors], torch.Tensor]
@@ -129,48 +146,82 @@ def finetune(
     device = wp.device_to_torch(cloud.device)
     generator = torch.Generator(device=device).manual_seed(options.seed)
     order = np.random.default_rng(options.seed)
-    extent = scene_extent([view.camera for view in views], cloud)
+    relocating = options.densification is Densification.RELOCATION
+    cameras = [view.camera for view in views]
+    extent = cameras_extent(cameras) if relocating else scene_extent(cameras, cloud)
     population = Population(_tensors(cloud, device), vars(options.rates), extent=extent, generator=generator)
     frozen = None if trainable is None else torch.as_tensor(~np.asarray(trainable, bool), device=device)
-    targets = [_Target.of(view, device) for view in views]
+    targets = [_target(view, device) for view in views]
+    tones = Tones(len(views), options.iterations, device) if options.tones else None
+    photo_loss = PhotoLoss(options.ssim_weight, device, options.threads)
+    misfits = Misfits(len(views))
+    growth = Growth(len(views), options.max_gaussians, device)
     losses = np.zeros(options.iterations)
+    pending: list[tuple[int, int, torch.Tensor]] = []
+    # Asking a GPU for a loss waits for it: the losses of many steps are fetched at once.
+    patience = 1 if device == "cpu" else _UNSEEN_STEPS
     queue: list[int] = []
     for step in range(options.iterations):
-        queue = queue or order.permutation(len(views)).tolist()
-        target = targets[queue.pop()]
+        if not queue:
+            kept = [number for number in range(len(views)) if number not in misfits.found]
+            queue = [kept[i] for i in order.permutation(len(kept))]
+        number = queue.pop()
+        target = targets[number]
         background = options.background
         if background is None:
             background = tuple(torch.rand(3, generator=generator, device=device).tolist())
         tensors = GaussianTensors(**population.tensors)
-        picture = render_torch(
+        bands = tensors.sh_rest
+        if options.sh_steps > 0:
+            bands = bands[:, : (step // options.sh_steps + 1) ** 2 - 1]
+        image = render_torch(
             *(tensors.means, tensors.rotations, tensors.log_scales, tensors.opacity_logits),
-            torch.cat([tensors.sh_band_0, tensors.sh_rest], dim=1),
-            target.camera,
+            torch.cat([tensors.sh_band_0, bands], dim=1),
+            views[number].camera,
             background=background,
             antialiased=options.antialiased,
             threads=options.threads,
-        ).colour
-        loss = target.loss(picture, background, options.ssim_weight)
+        )
+        if tones is None:
+            loss = _loss(target, image.colour, background, options.ssim_weight)
+        else:
+            loss = photo_loss(image.colour, image.alpha, tones.of(number), target, background)
+        pending.append((step, number, loss.detach()))
         if extra_loss is not None:
             loss = loss + extra_loss(tensors)
-        if options.densification is Densification.RELOCATION:
-            loss = loss + population.regularisation()
-        losses[step] = float(loss.detach())
-        if not np.isfinite(losses[step]):
-            raise UserError(f"finetune: the loss is not finite at step {step}; lower the rates or check the views")
         loss.backward()
+        if relocating:
+            population.pull()
         if frozen is not None:
             for tensor in population.tensors.values():
                 if tensor.grad is not None:
                     tensor.grad[frozen] = 0.0
-        population.step(decay=0.01 ** (step / max(options.iterations, 1)))
+        population.step(done=step / max(options.iterations, 1), settling=relocating)
+        if tones is not None:
+            tones.step(number, step)
         with torch.no_grad():
             population.tensors["log_scales"].clamp_(min=MIN_LOG_SCALE)
-        if options.densification is Densification.RELOCATION:
-            population.evolve(step, options.iterations, options.max_gaussians)
-        if progress is not None:
-            progress(step, losses[step])
-    return FinetuneResult(_cloud(population.tensors), losses)
+        if len(pending) >= patience or step + 1 == options.iterations:
+            for at, seen, value in zip(
+                *([p[k] for p in pending] for k in (0, 1)), torch.stack([p[2] for p in pending]).tolist(), strict=True
+            ):
+                losses[at] = value
+                if not np.isfinite(value):
+                    raise UserError(
+                        f"finetune: the loss is not finite at step {at}; lower the rates or check the views"
+                    )
+                misfits.see(seen, value)
+                growth.see(value, len(tensors.means))
+                if progress is not None:
+                    progress(at, value)
+            pending.clear()
+            if options.leave_out_misfits:
+                misfits.judge(step / options.iterations)
+        if relocating:
+            population.evolve(step, options.iterations, growth)
+    return FinetuneResult(
+        _cloud(population.tensors), losses, None if tones is None else tones.matrices(), tuple(misfits.found)
+    )
 
 
 def views_of_capture(
@@ -192,6 +243,13 @@ def views_of_capture(
     ]
 
 
+def cameras_extent(cameras: Sequence[Camera]) -> float:
+    """1.1 times the radius in which nine cameras in ten lie: a few wrong poses far away do not blow it up."""
+    centres = np.array([camera.centre for camera in cameras])
+    radius = float(np.quantile(np.linalg.norm(centres - np.median(centres, axis=0), axis=1), 0.9))
+    return 1.1 * radius if radius > 0 else 1.0
+
+
 def scene_extent(cameras: Sequence[Camera], cloud: GaussianCloud) -> float:
     """Length that the step size of the means is measured by:
     1.1 times the cameras' radius, or the cloud's if smaller.
@@ -204,63 +262,29 @@ def scene_extent(cameras: Sequence[Camera], cloud: GaussianCloud) -> float:
     return min(candidates) if candidates else 1.0
 
 
-def ssim(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Mean structural similarity of two pictures (H, W, 3) in 0 to 1:
-    11 x 11 Gaussian window, sigma 1.5, zero padding.
-    """
-    offsets = torch.arange(-5.0, 6.0, device=a.device)
-    line = torch.exp(-(offsets**2) / (2 * 1.5**2))
-    line = line / line.sum()
-    stack = torch.cat([t.permute(2, 0, 1) for t in (a, b, a * a, b * b, a * b)])[None]
-    channels = stack.shape[1]
-    blurred = torch.nn.functional.conv2d(stack, line.expand(channels, 1, 1, 11), padding=(0, 5), groups=channels)
-    blurred = torch.nn.functional.conv2d(
-        blurred, line[:, None].expand(channels, 1, 11, 1), padding=(5, 0), groups=channels
-    )
-    mean_a, mean_b, aa, bb, ab = blurred[0].reshape(5, 3, *a.shape[:2])
-    c1, c2 = 0.01**2, 0.03**2
-    covariance = ab - mean_a * mean_b
-    variances = aa - mean_a**2 + bb - mean_b**2
-    return (
-        (2 * mean_a * mean_b + c1) * (2 * covariance + c2) / ((mean_a**2 + mean_b**2 + c1) * (variances + c2))
-    ).mean()
+def _target(view: TrainingView, device: str) -> Target:
+    def upload(values: np.ndarray | None) -> torch.Tensor | None:
+        return None if values is None else torch.as_tensor(values, dtype=torch.float32, device=device).contiguous()
+
+    image = upload(view.image)
+    assert image is not None
+    return Target(image, upload(view.alpha), upload(view.weight))
 
 
-def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    """Peak signal to noise ratio in dB of two pictures in 0 to 1; at most 100."""
-    return float(-10.0 * np.log10(max(float(np.mean((a.astype(np.float64) - b) ** 2)), 1e-10)))
-
-
-@dataclass(frozen=True)
-class _Target:
-    camera: Camera
-    image: torch.Tensor
-    alpha: torch.Tensor | None
-    weight: torch.Tensor | None
-
-    @classmethod
-    def of(cls, view: TrainingView, device: str) -> _Target:
-        def upload(values: np.ndarray | None) -> torch.Tensor | None:
-            return None if values is None else torch.as_tensor(values, dtype=torch.float32, device=device)
-
-        image = upload(view.image)
-        assert image is not None
-        return cls(view.camera, image, upload(view.alpha), upload(view.weight))
-
-    def loss(self, picture: torch.Tensor, background: Sequence[float], ssim_weight: float) -> torch.Tensor:
-        image = self.image
-        if self.alpha is not None:
-            alpha = self.alpha[:, :, None]
-            image = image * alpha + (1 - alpha) * torch.tensor(background, device=image.device)
-        off = (picture - image).abs()
-        if self.weight is not None:
-            off = off * self.weight[:, :, None]
-            # What does not count must not reach the windows of the similarity either.
-            picture = torch.where(self.weight[:, :, None] > 0, picture, image)
-        loss = (1 - ssim_weight) * off.mean()
-        if ssim_weight > 0:
-            loss = loss + ssim_weight * (1 - ssim(picture, image))
-        return loss
+def _loss(target: Target, picture: torch.Tensor, background: Sequence[float], ssim_weight: float) -> torch.Tensor:
+    image = target.image
+    if target.alpha is not None:
+        alpha = target.alpha[:, :, None]
+        image = image * alpha + (1 - alpha) * torch.tensor(background, device=image.device)
+    off = (picture - image).abs()
+    if target.weight is not None:
+        off = off * target.weight[:, :, None]
+        # What does not count must not reach the windows of the similarity either.
+        picture = torch.where(target.weight[:, :, None] > 0, picture, image)
+    loss = (1 - ssim_weight) * off.mean()
+    if ssim_weight > 0:
+        loss = loss + ssim_weight * (1 - ssim(picture, image))
+    return loss
 
 
 def _check(

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from egs_warp.errors import UserError
 from egs_warp.geometry.camera import shrunk
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.cameras import PosedImage
+from egs_warp.io.photos import read_photo
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.training import has_torch
 
@@ -36,16 +38,22 @@ def photographs_in_colours_of(cloud: GaussianCloud, posed: Sequence[PosedImage])
 
     views = []
     for one in posed:
-        picture = None if one.image is None else cv2.imread(str(one.image), cv2.IMREAD_COLOR)
-        # Photos that do not fit their cameras have been replaced by something else.
-        if picture is None or picture.shape[:2] != (one.camera.height, one.camera.width):
+        try:
+            picture = read_photo(one)
+        except UserError:
+            # Whoever wants to know why asks ``train``.
             continue
-        small = shrunk(one.camera, _PHOTO_SIDE)
-        reduced = cv2.resize(picture, (small.width, small.height), interpolation=cv2.INTER_AREA)
+        small = shrunk(picture.camera, _PHOTO_SIDE)
+        size = (small.width, small.height)
+        whole = np.rint(picture.colour * 255.0).astype(np.uint8)
+        photo = cv2.resize(whole, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
+        known = np.ones(photo.shape[:2], bool)
+        if picture.known is not None:
+            known = cv2.resize(picture.known.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
         image = render_gaussians(cloud, small, background=(0.0, 0.0, 0.0))
-        photo = reduced[..., ::-1].astype(np.float32) / 255.0
-        matched = in_colours_of(np.clip(image.colour.numpy(), 0.0, 1.0), photo, image.alpha.numpy() > _OPAQUE)
-        views.append(TrainingView(small, matched))
+        shared = (image.alpha.numpy() > _OPAQUE) & known
+        matched = in_colours_of(np.clip(image.colour.numpy(), 0.0, 1.0), photo, shared)
+        views.append(TrainingView(small, matched, weight=None if known.all() else known.astype(np.float32)))
     return views
 
 

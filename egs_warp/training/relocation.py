@@ -9,6 +9,12 @@ import math
 from collections.abc import Mapping
 
 import torch
+import warp as wp
+
+from egs_warp.kernels.training.population import jitter_kernel, pull_kernel
+from egs_warp.launching import launch_rows
+from egs_warp.render.autograd import torch_stream
+from egs_warp.training.growth import Growth
 
 _FAINT = 0.005
 """Opacity below which a Gaussian is moved."""
@@ -17,6 +23,12 @@ _EVERY = 100
 """Steps between relocations."""
 _GROWTH = 1.05
 """Least factor by which the number of Gaussians grows at each."""
+_PULL = 0.01
+"""Weight of the mean opacity and of the mean scale over the extent."""
+_JITTER = 5e5
+"""Noise over the rate of the means."""
+_SETTLING_FROM, _SETTLED = 0.5, 0.1
+"""Share of the steps from which the rates of all but the means fall, and to which part."""
 
 
 class Population:
@@ -32,29 +44,47 @@ class Population:
     ) -> None:
         self.tensors = tensors
         self._rates = {name: rates[name] * (extent if name == "means" else 1.0) for name in tensors}
+        self._extent = extent
         self._generator = generator
+        on_gpu = next(iter(tensors.values())).is_cuda
         self._optimiser = torch.optim.Adam(
-            [{"params": [tensor], "lr": self._rates[name], "name": name} for name, tensor in tensors.items()], eps=1e-15
+            [{"params": [tensor], "lr": self._rates[name], "name": name} for name, tensor in tensors.items()],
+            eps=1e-15,
+            fused=on_gpu or None,
         )
 
-    def step(self, *, decay: float) -> None:
-        """One step of Adam; the rate of the means is multiplied by ``decay``."""
+    def step(self, *, done: float, settling: bool = False) -> None:
+        """One step of Adam; the rate of the means falls to a hundredth as ``done`` goes from 0 to 1.
+
+        With ``settling`` the others fall to a tenth over the last part.
+        """
+        late = max(0.0, done - _SETTLING_FROM) / (1 - _SETTLING_FROM) if settling else 0.0
         for group in self._optimiser.param_groups:
-            if group["name"] == "means":
-                group["lr"] = self._rates["means"] * decay
+            group["lr"] = self._rates[group["name"]] * (0.01**done if group["name"] == "means" else _SETTLED**late)
         self._optimiser.step()
         self._optimiser.zero_grad(set_to_none=True)
 
-    def regularisation(self) -> torch.Tensor:
-        """Pull on opacities and scales that lets useless Gaussians fade, so that they can be moved."""
-        return 0.01 * (
-            torch.sigmoid(self.tensors["opacity_logits"]).mean() + torch.exp(self.tensors["log_scales"]).mean()
-        )
+    @torch.no_grad()
+    def pull(self) -> None:
+        """Add to the gradients a pull on opacities and scales: useless Gaussians fade, and can then be moved."""
+        opacities, scales = self.tensors["opacity_logits"], self.tensors["log_scales"]
+        assert opacities.grad is not None and scales.grad is not None
+        count = len(opacities)
+        with torch_stream(opacities.device):
+            launch_rows(
+                pull_kernel,
+                count,
+                inputs=[_PULL / count, _PULL / (3 * count * self._extent), _array(opacities), _array(scales)],
+                outputs=[_array(opacities.grad), _array(scales.grad)],
+                device=wp.device_from_torch(opacities.device),
+            )
 
     @torch.no_grad()
-    def evolve(self, step: int, steps: int, cap: int) -> None:
-        """Jitter the means; now and then move faint Gaussians onto opaque ones and grow,
-        to reach ``cap`` at half time.
+    def evolve(self, step: int, steps: int, growth: Growth) -> None:
+        """Jitter the means; now and then move faint Gaussians onto opaque ones and grow.
+
+        A cap that was asked for is reached by half time; else the number grows at the least pace, while ``growth``
+        lets it.
         """
         self._jitter()
         # The last fifth of the steps settles what is there.
@@ -71,8 +101,8 @@ class Population:
             self._forget(torch.cat([places, chosen]))
         count = len(opacity)
         turns_left = max(1, round((0.5 * steps - step) / _EVERY))
-        growth = max(_GROWTH, (cap / count) ** (1 / turns_left))
-        more = min(cap, int(growth * count) + 1) - count
+        pace = _GROWTH if growth.asked is None else max(_GROWTH, (growth.cap / count) ** (1 / turns_left))
+        more = min(growth.cap, int(pace * count) + 1) - count
         if more > 0:
             chosen = self._draw(torch.sigmoid(self.tensors["opacity_logits"]), more)
             self._share(chosen)
@@ -123,23 +153,23 @@ class Population:
             self.tensors[group["name"]] = new
 
     def _jitter(self) -> None:
-        """Noise of each Gaussian's own shape on the faint ones' means: 5e5 times the rate, as published."""
+        """Noise of each Gaussian's own shape on the faint ones' means, as published for scenes of extent 1."""
         rate = next(group["lr"] for group in self._optimiser.param_groups if group["name"] == "means")
-        opacity = torch.sigmoid(self.tensors["opacity_logits"])
-        gate = torch.sigmoid(-100.0 * (opacity - _FAINT) + 0.0)
-        scales = torch.exp(self.tensors["log_scales"])
-        noise = torch.randn(scales.shape, generator=self._generator, device=scales.device)
-        axes = _rotation_matrices(self.tensors["rotations"])
-        # Sigma noise = R S S R^T noise.
-        local = torch.einsum("nji,nj->ni", axes, noise) * scales**2
-        self.tensors["means"] += torch.einsum("nij,nj->ni", axes, local) * (gate * 5e5 * rate)[:, None]
+        means = self.tensors["means"]
+        noise = torch.randn(means.shape, generator=self._generator, device=means.device)
+        shape = [_array(self.tensors[name]) for name in ("rotations", "log_scales", "opacity_logits")]
+        with torch_stream(means.device):
+            launch_rows(
+                jitter_kernel,
+                len(means),
+                inputs=[_JITTER * rate / self._extent**2, _FAINT, _array(noise), *shape],
+                outputs=[_array(means)],
+                device=wp.device_from_torch(means.device),
+            )
 
 
-def _rotation_matrices(rotations: torch.Tensor) -> torch.Tensor:
-    w, x, y, z = torch.nn.functional.normalize(rotations, dim=1).unbind(1)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+def _array(tensor: torch.Tensor) -> wp.array:
+    """The contiguous ``tensor`` (n,), (n, 3) or (n, 4) as an array of n, without a copy."""
+    dtype = {1: wp.float32, 3: wp.vec3, 4: wp.vec4}[1 if tensor.ndim == 1 else tensor.shape[1]]
+    device = wp.device_from_torch(tensor.device)
+    return wp.array(ptr=tensor.data_ptr(), dtype=dtype, shape=(len(tensor),), device=device)

@@ -9,11 +9,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.io.colmap import SparsePoints
 from egs_warp.training.finetune import TrainingView
+
+LEAST_POINTS = 500
+"""Fewer triangulated points are not a scene to begin with."""
+_SIZE_OF_POINT, _OPACITY_OF_POINT = 1.0, 0.1
+"""Standard deviation over the spacing, and opacity, that a triangulated point begins with."""
 
 
 def middle_of(cameras: Sequence[Camera]) -> np.ndarray:
@@ -63,6 +70,30 @@ def rough_cloud(
         np.tile([1.0, 0, 0, 0], (len(means), 1)),
         np.full((len(means), 3), np.log(spacing)),
         np.full(len(means), np.log(0.1 / 0.9)),
+        sh,
+        device=device,
+    )
+
+
+def cloud_from_points(
+    points: SparsePoints, *, count: int | None, sh_degree: int, seed: int = 0, device: str | None = None
+) -> GaussianCloud:
+    """Round Gaussians at ``points``, at most ``count`` of them, each as large as its three nearest are far."""
+    positions, colours = points.positions, points.colours
+    if count is not None and len(positions) > count:
+        chosen = np.sort(np.random.default_rng(seed).permutation(len(positions))[:count])
+        positions, colours = positions[chosen], colours[chosen]
+    near = KDTree(positions).query(positions, k=4)[0][:, 1:]
+    spacing = np.sqrt(np.mean(near**2, axis=1))
+    # Points on one spot have no room at all.
+    spacing = np.maximum(spacing, 1e-3 * np.median(spacing))
+    sh = np.zeros((len(positions), (sh_degree + 1) ** 2, 3))
+    sh[:, 0] = (colours - 0.5) / SH_BAND_0
+    return GaussianCloud.from_numpy(
+        positions,
+        np.tile([1.0, 0, 0, 0], (len(positions), 1)),
+        np.repeat(np.log(_SIZE_OF_POINT * spacing)[:, None], 3, axis=1),
+        np.full(len(positions), np.log(_OPACITY_OF_POINT / (1 - _OPACITY_OF_POINT))),
         sh,
         device=device,
     )

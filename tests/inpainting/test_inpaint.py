@@ -25,7 +25,7 @@ from egs_warp.io.planes import KnownPlane, write_planes
 from egs_warp.render import render_gaussians
 from egs_warp.segmentation.plane_fit import plane_depth
 from egs_warp.segmentation.votes import MaskedView
-from egs_warp.training.finetune import psnr
+from egs_warp.training.likeness import psnr
 from tests.support.floors import PLANE, floor, on_plane, pattern
 
 RADIUS = 0.22

@@ -11,7 +11,7 @@ import pytest
 from egs_warp.errors import UserError
 from egs_warp.inpainting.offset_labels import _cut, labelled_sources
 from egs_warp.inpainting.patch_synthesis import PatchSynthesis, meld
-from egs_warp.training.finetune import psnr
+from egs_warp.training.likeness import psnr
 from tests.support.floors import pattern
 
 

@@ -76,3 +76,12 @@ def test_contact_sheet_places_frames_and_writes_labels() -> None:
         assert (cell[:24] != 10 * k).any(), "a label"
     with pytest.raises(UserError, match="12 frames and 1 labels"):
         contact_sheet(frames, 4, ["x"])
+
+
+def test_a_sheet_holds_frames_of_different_sizes() -> None:
+    """Portrait and landscape side by side: each in the middle of its cell, white around it."""
+    wide, tall = np.full((20, 40, 3), 7, np.uint8), np.full((60, 30, 3), 9, np.uint8)
+    sheet = contact_sheet([wide, tall], 2, ["", ""])
+    assert sheet.shape == (60, 80, 3)
+    assert (sheet[20:40, :40] == 7).all() and (sheet[:20, :40] == 255).all() and (sheet[40:, :40] == 255).all()
+    assert (sheet[:, 45:75] == 9).all() and (sheet[:, 40:45] == 255).all()

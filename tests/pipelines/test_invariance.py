@@ -19,7 +19,7 @@ from egs_warp.motions.repertoire import longest, parts_of
 from egs_warp.motions.script import parse_script
 from egs_warp.motions.sequence import MotionSequence
 from egs_warp.pipelines.creature import FILMED_FROM, Creature, first_place, make_creature
-from egs_warp.render.rasteriser import render
+from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.base_plane import find_base_plane
 from tests.support.frames import TURN, Lying
 
@@ -44,7 +44,7 @@ def pictures(creature: Creature, positions: np.ndarray) -> np.ndarray:
     """(4, H, W, 3) of the creature carried to node ``positions``, from cameras that its own frame holds."""
     carried = deform(creature.cloud, embed_gaussians(creature.cloud, creature.cage.mesh), positions).cloud
     cameras = ring_cameras(GROUND, np.array([0.0, 0.0, 0.5]), 0.8, count=4, size=96)
-    return np.stack([render(carried, camera).colour.numpy() for camera in cameras])
+    return np.stack([render_gaussians(carried, camera).colour.numpy() for camera in cameras])
 
 
 @pytest.fixture(scope="module")

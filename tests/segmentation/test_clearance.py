@@ -143,7 +143,7 @@ def test_finetuning_clears_the_plane_and_keeps_the_looks() -> None:
     pytest.importorskip("torch")
     from egs_warp.geometry.camera import Camera
     from egs_warp.render import render_gaussians
-    from egs_warp.training.finetune import psnr
+    from egs_warp.training.likeness import psnr
 
     random = np.random.default_rng(2)
     floor = Plane(np.array([0.0, 0.0, 1.0]), 0.0)

@@ -20,10 +20,9 @@ from egs_warp.training.finetune import (  # noqa: E402
     FinetuneOptions,
     TrainingView,
     finetune,
-    psnr,
-    ssim,
     views_of_capture,
 )
+from egs_warp.training.likeness import psnr, ssim  # noqa: E402
 from egs_warp.training.relocation import Population  # noqa: E402
 
 
@@ -190,13 +189,13 @@ def test_photos_become_a_capture(data_dir: Path) -> None:
 def test_impossible_training_is_refused(tmp_path: Path) -> None:
     from egs_warp.pipelines.train_capture import train
 
-    with pytest.raises(UserError, match="train: 0 iterations, 50000 Gaussians and SH degree 2; give at least 1"):
+    with pytest.raises(UserError, match="train: 0 iterations, 50000 Gaussians and SH degree 3; give at least 1"):
         train(tmp_path, iterations=0)
     (tmp_path / "transforms.json").write_text(
         '{"camera_angle_x": 0.7, "w": 8, "h": 8, "frames": [{"file_path": "r_0.png", '
         '"transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,3],[0,0,0,1]]}]}'
     )
-    with pytest.raises(UserError, match="is not beside the poses; put the images there"):
+    with pytest.raises(UserError, match=r"none of its 1 photos can be used; the first: r_0.png: the photo is not"):
         train(tmp_path)
 
 

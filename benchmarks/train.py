@@ -1,0 +1,171 @@
+"""Captures trained from real photos, ours and gsplat's MCMC strategy side by side: held-out PSNR and SSIM, and time.
+
+Both get the same photos (straightened, every eighth held out), the same iterations and the same cap on Gaussians, and
+are judged by the same renderer: once as they are, once after one affine map of colours was fitted to each whole
+held-out photo, the usual way to remove exposure. The means count every held-out photo, a wrongly posed one, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+
+import numpy as np
+
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.io.cameras import read_points
+from egs_warp.io.video import contact_sheet
+from egs_warp.pipelines.train_capture import TrainResult, score_photo, train
+from egs_warp.render import render_gaussians
+from harness import Row, Table, data_folder, flags, report
+from train_peers import has_gsplat, train_with_gsplat
+
+OURS, GSPLAT = "egs_warp", "gsplat MCMC"
+CASES = ("bonsai", "mouse", "plush_dog", "lego")
+_SHOWN = (
+    *("case", "method", "gaussians", "seconds", "held_out_psnr", "held_out_ssim"),
+    *("held_out_plain_psnr", "held_out_plain_ssim", "trained_on_psnr", "trained_on_ssim"),
+)
+"""Columns of the table, by their names in the rows."""
+_WARM_UP = 20
+"""Steps of both before the first timed case, so that kernels are compiled."""
+
+
+def row_of(case: str, method: str, cloud: GaussianCloud, seconds: float, result: TrainResult) -> Row:
+    """Scores of one cloud on the photos of ``result``."""
+    scores = [
+        score_photo(cloud, view, result.background, held_out=score.held_out)
+        for view, score in zip(result.views, result.scores, strict=True)
+    ]
+    row: Row = {"case": case, "method": method, "gaussians": cloud.count, "seconds": seconds}
+    for which, out in (("held_out", True), ("trained_on", False)):
+        chosen = [score for score in scores if score.held_out is out]
+        for name in ("psnr", "ssim", "plain_psnr", "plain_ssim"):
+            row[f"{which}_{name}"] = float(np.mean([getattr(score, name) for score in chosen]))
+    row["held_out_photos"] = {score.name: [score.psnr, score.plain_psnr] for score in scores if score.held_out}
+    return row
+
+
+def run_case(case: str, options: argparse.Namespace, table: Table) -> tuple[list[Row], np.ndarray]:
+    """Rows of both methods, and a strip of photo and renders."""
+    folder = data_folder() / "posed" / case
+    marks: dict[str, float] = {}
+    has_peer = options.device.startswith("cuda") and has_gsplat()
+
+    def stage(text: str) -> None:
+        marks[text.split()[0]] = time.perf_counter()
+
+    result = train(
+        folder,
+        iterations=options.iterations,
+        max_gaussians=options.gaussians,
+        max_side=options.max_side,
+        seed=options.seed,
+        device=options.device,
+        stage=stage,
+    )
+    clouds = {OURS: result.cloud}
+    rows = [row_of(case, OURS, result.cloud, marks["judging"] - marks["training"], result)]
+    rows[0]["left_out"] = [one.name for one in result.left_out]
+    if has_peer:
+        trained = [
+            view
+            for view, score in zip(result.photos if result.cut_out else result.views, result.scores, strict=True)
+            if not score.held_out
+        ]
+        peer = train_with_gsplat(
+            trained,
+            read_points(folder),
+            iterations=options.iterations,
+            max_gaussians=options.gaussians,
+            seed=options.seed,
+            device=options.device,
+        )
+        clouds[GSPLAT] = peer.cloud
+        rows.append(row_of(case, GSPLAT, peer.cloud, peer.seconds, result))
+    for row in rows:
+        table.row(*(row[name] for name in _SHOWN))
+    shown = next(number for number, score in enumerate(result.scores) if score.held_out)
+    view = result.views[shown]
+    frames = [np.rint(view.image * 255).astype(np.uint8)]
+    frames += [
+        render_gaussians(cloud, view.camera, background=result.background).colour_srgb8() for cloud in clouds.values()
+    ]
+    return rows, contact_sheet(frames, len(frames), [f"{case}: photo", *clouds])
+
+
+def warm_up(options: argparse.Namespace) -> None:
+    """Compile every kernel outside of the timed runs."""
+    folder = data_folder() / "posed" / options.cases[0]
+    result = train(folder, iterations=_WARM_UP, max_gaussians=1000, max_side=120, device=options.device)
+    if options.device.startswith("cuda") and has_gsplat():
+        train_with_gsplat(
+            result.views,
+            read_points(folder),
+            iterations=_WARM_UP,
+            max_gaussians=options.gaussians,
+            device=options.device,
+        )
+
+
+def judge(rows: list[Row]) -> tuple[dict[str, bool | None], dict[str, str]]:
+    """The aims, from the rows."""
+    aims: dict[str, bool | None] = {"psnr_vs_gsplat": None, "not_slower": None}
+    cases = {row["case"] for row in rows if row["method"] == GSPLAT}
+    if not cases:
+        return aims, dict.fromkeys(aims, "gsplat needs a GPU and is not installed here")
+    pairs = [
+        [next(row for row in rows if row["case"] == case and row["method"] == method) for method in (OURS, GSPLAT)]
+        for case in sorted(cases)
+    ]
+    aims["psnr_vs_gsplat"] = all(a["held_out_psnr"] >= b["held_out_psnr"] for a, b in pairs)
+    aims["not_slower"] = all(a["seconds"] <= b["seconds"] for a, b in pairs)
+    return aims, {}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run, print, write."""
+    parser = flags(__doc__, quick="300 iterations, 3,000 Gaussians, 120 pixels", plot="file for photo beside renders")
+    parser.add_argument("--cases", nargs="+", default=list(CASES))
+    parser.add_argument("--iterations", type=int, help="7000")
+    parser.add_argument("--gaussians", type=int, help="cap for both (200000)")
+    parser.add_argument("--max-side", type=int, help="photos are reduced to this many pixels (as they are)")
+    options = parser.parse_args(arguments)
+    options.iterations = options.iterations or (300 if options.quick else 7000)
+    options.gaussians = options.gaussians or (3000 if options.quick else 200_000)
+    options.max_side = options.max_side or (120 if options.quick else None)
+    missing = [case for case in options.cases if not (data_folder() / "posed" / case).is_dir()]
+    if missing:
+        print(f"not on this machine: {', '.join(missing)}")
+    options.cases = [case for case in options.cases if case not in missing]
+    rows: list[Row] = []
+    strips = []
+    if options.cases:
+        warm_up(options)
+    formats = ("<10", "<12", "9d", "8.1f", "8.2f", "6.3f", "8.2f", "6.3f", "8.2f", "6.3f")
+    heads = ("case", "method", "Gaussians", "seconds", "held_out", "SSIM", "as_it_is", "SSIM_", "trained_on", "SSIM__")
+    table = Table(**dict(zip(heads, formats, strict=True)))
+    for case in options.cases:
+        part, strip = run_case(case, options, table)
+        rows += part
+        strips.append(strip)
+    aims, why_null = judge(rows)
+    report(
+        options,
+        rows,
+        picture=contact_sheet(strips, 1, [""] * len(strips)) if strips else None,
+        aims=aims,
+        why_null=why_null,
+        packages=("torch", "gsplat") if has_gsplat() else ("torch",),
+        conditions={
+            "iterations": options.iterations,
+            "gaussians": options.gaussians,
+            "max_side": options.max_side,
+            "missing": missing,
+        },
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,83 @@
+"""Frames of a video that are worth a photo: sharp, and evenly spread over its time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from egs_warp.errors import UserError
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp")
+_JUDGED_SIDE = 480
+"""Pixels: a frame's sharpness is judged at this size, where noise counts less than edges."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame of a video."""
+
+    number: int
+    """From 0."""
+    pixels: np.ndarray
+    """(H, W, 3) uint8, BGR, upright."""
+    sharpness: float
+    """Variance of the Laplacian."""
+
+
+def sharp_frames(video: Path, count: int) -> Iterator[Frame]:
+    """The sharpest frame of each of ``count`` equal parts of the ``video``; all frames where it has fewer.
+
+    Raises ``UserError`` for a file that is no video.
+    """
+    length = _length(video)
+    parts = min(count, length)
+    best: Frame | None = None
+    part = 0
+    for number, pixels in enumerate(_frames(video)):
+        if number * parts // length > part and part < parts - 1:
+            if best is not None:
+                yield best
+            part, best = part + 1, None
+        sharpness = _sharpness(pixels)
+        if best is None or sharpness > best.sharpness:
+            best = Frame(number, pixels, sharpness)
+    if best is not None:
+        yield best
+
+
+def _frames(video: Path) -> Iterator[np.ndarray]:
+    reader = cv2.VideoCapture(str(video))
+    try:
+        while True:
+            ok, pixels = reader.read()
+            if not ok:
+                return
+            yield pixels
+    finally:
+        reader.release()
+
+
+def _length(video: Path) -> int:
+    """Number of frames, counted: what the header says may be wrong."""
+    reader = cv2.VideoCapture(str(video))
+    try:
+        length = 0
+        while reader.grab():
+            length += 1
+    finally:
+        reader.release()
+    if length == 0:
+        raise UserError(f"{video}: no video that can be read; give an .mp4 or .mov, or a folder of photos")
+    return length
+
+
+def _sharpness(pixels: np.ndarray) -> float:
+    grey = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+    factor = _JUDGED_SIDE / max(grey.shape)
+    if factor < 1:
+        grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    return float(cv2.Laplacian(grey, cv2.CV_32F).var())

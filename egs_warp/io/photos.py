@@ -1,0 +1,178 @@
+"""Photos as pinhole cameras would have taken them, whatever the file and the lens are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.lens import Straightening
+from egs_warp.io.cameras import PosedImage
+
+_ORIENTATION = 0x0112
+"""The EXIF tag that says how a viewer must turn the picture."""
+_SAME_ASPECT = 0.01
+"""Relative difference up to which a photo is its camera's at another size."""
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One photo, straightened and upright as its camera has it."""
+
+    camera: Camera
+    """At the photo's size."""
+    colour: np.ndarray
+    """(H, W, 3) float32, 0 to 1, display-referred."""
+    alpha: np.ndarray | None
+    """(H, W) float32: the photo's own, or that of its mask; None without either."""
+    known: np.ndarray | None
+    """(H, W) bool: False where the straightened photo shows what the lens did not see; None where it sees all."""
+
+
+def read_photo(posed: PosedImage, *, max_side: int | None = None) -> Photo:
+    """The photo of ``posed``; one larger than ``max_side`` pixels is reduced.
+
+    Pixels are turned as EXIF says where only then they fit the camera. Alpha is the photo's own or, as COLMAP has it,
+    that of ``masks/PHOTO.png`` (or ``masks/`` with the photo's own name) beside the photos' folder: white is kept.
+    Raises ``UserError`` for a photo that is missing, unreadable or of another shape than its camera.
+    """
+    if posed.image is None:
+        raise UserError(f"{posed.name}: the photo is not beside the poses; put it there")
+    pixels = decoded(posed.image)
+    turn = _turn_to_fit(posed, pixels.shape[:2])
+    shape = pixels.shape[:2]
+    pixels = turned(pixels, turn)
+    full = {"uint8": 255.0, "uint16": 65535.0}.get(pixels.dtype.name, 1.0)
+    values = np.atleast_3d(np.asarray(pixels, dtype=np.float32)) / full
+    colour = values[:, :, :3][:, :, ::-1] if values.shape[2] >= 3 else np.repeat(values[:, :, :1], 3, axis=2)
+    colour = np.ascontiguousarray(colour)
+    alpha = values[:, :, 3] if values.shape[2] == 4 else _mask_of(posed.image, posed.name, shape, turn)
+    camera = at_size(posed.camera, colour.shape[1], colour.shape[0])
+    known = None
+    if posed.lens is not None:
+        straight = Straightening.of(camera, posed.lens)
+        colour = straight.picture(colour)
+        alpha = None if alpha is None else straight.picture(np.ascontiguousarray(alpha))
+        known = None if straight.known.all() else straight.known
+    side = max(camera.width, camera.height)
+    if max_side is not None and side > max_side:
+        width, height = (max(1, round(s * max_side / side)) for s in (camera.width, camera.height))
+        camera = at_size(camera, width, height)
+        cover = None if alpha is None and known is None else np.ones(colour.shape[:2], np.float32)
+        if cover is not None:
+            # Transparent and unknown pixels hold any colour: it must not bleed into their neighbours.
+            cover = cover * (1.0 if alpha is None else alpha) * (1.0 if known is None else known)
+            reduced = cv2.resize(cover, (width, height), interpolation=cv2.INTER_AREA)
+            colour = cv2.resize(colour * cover[:, :, None], (width, height), interpolation=cv2.INTER_AREA)
+            colour = colour / np.maximum(reduced, 1e-6)[:, :, None]
+        else:
+            colour = cv2.resize(colour, (width, height), interpolation=cv2.INTER_AREA)
+        if alpha is not None:
+            alpha = cv2.resize(alpha, (width, height), interpolation=cv2.INTER_AREA)
+        if known is not None:
+            known = cv2.resize(known.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
+    return Photo(camera, np.ascontiguousarray(colour, dtype=np.float32), alpha, known)
+
+
+def at_size(camera: Camera, width: int, height: int) -> Camera:
+    """The camera for its photo at another size; poses are often of the full photo and images reduced."""
+    x, y = width / camera.width, height / camera.height
+    return replace(
+        camera,
+        width=width,
+        height=height,
+        fx=camera.fx * x,
+        fy=camera.fy * y,
+        cx=camera.cx * x,
+        cy=camera.cy * y,
+    )
+
+
+def orientation(image: Path) -> int:
+    """How the file asks to be turned: EXIF's 1 (as it is) to 8."""
+    from PIL import Image
+
+    try:
+        with Image.open(image) as opened:
+            turn = opened.getexif().get(_ORIENTATION, 1)
+    # The decoder is handed a stranger's bytes, and its errors share no base class.
+    except Exception:
+        return 1
+    return turn if turn in range(1, 9) else 1
+
+
+def turned(pixels: np.ndarray, turn: int) -> np.ndarray:
+    """``pixels`` (H, W, ...) as EXIF's orientation ``turn`` wants them shown."""
+    if turn >= 5:
+        pixels = pixels.swapaxes(0, 1)
+    # Which axes run backwards after the swap.
+    rows = -1 if turn in (3, 4, 7, 8) else 1
+    columns = -1 if turn in (2, 3, 6, 7) else 1
+    return np.ascontiguousarray(pixels[::rows, ::columns])
+
+
+def decoded(image: Path) -> np.ndarray:
+    """(H, W) or (H, W, C) as stored, BGR, not turned. Raises ``UserError`` for what is not a whole picture."""
+    from PIL import Image
+
+    pixels = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise UserError(f"{image}: not a readable picture; export it again as PNG or JPEG")
+    if image.suffix.lower() in (".jpg", ".jpeg"):
+        try:
+            # OpenCV fills the rest of a JPEG that ends early with grey.
+            with Image.open(image) as opened:
+                opened.load()
+        except Exception as error:
+            raise UserError(f"{image}: the picture is cut short; copy it again") from error
+    return pixels
+
+
+def _turn_to_fit(posed: PosedImage, shape: tuple[int, ...]) -> int:
+    """EXIF orientation to apply; raises ``UserError`` where the photo fits its camera neither way."""
+    assert posed.image is not None
+    camera, (height, width) = posed.camera, shape
+    if _same_aspect(camera, width, height):
+        return 1
+    turn = orientation(posed.image)
+    if turn >= 5 and _same_aspect(camera, height, width):
+        return turn
+    raise UserError(
+        f"{posed.image}: {width} x {height} pixels, but its camera has {camera.width} x {camera.height};"
+        " use the photos that the poses were made from"
+    )
+
+
+def _same_aspect(camera: Camera, width: int, height: int) -> bool:
+    return abs(width / camera.width / (height / camera.height) - 1) <= _SAME_ASPECT
+
+
+def _mask_of(image: Path, name: str, shape: tuple[int, ...], turn: int) -> np.ndarray | None:
+    """(H, W) float32 from the photo's mask file, if there is one; ``shape`` is the photo's as stored."""
+    # COLMAP's names may hold folders, which the masks repeat.
+    depth = min(len(Path(name).parts), len(image.parents) - 1)
+    relative = image.relative_to(image.parents[depth - 1])
+    places = (
+        place
+        for folder, file in ((image.parents[depth] / "masks", relative), (image.parent.parent / "masks", image.name))
+        for place in (folder / f"{file}.png", (folder / file).with_suffix(".png"), folder / file)
+    )
+    path = next((place for place in places if place.is_file()), None)
+    if path is None:
+        return None
+    pixels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels is None:
+        raise UserError(f"{path}: not a readable picture; export the mask again")
+    if pixels.shape == shape:
+        # Drawn on the photo as stored.
+        pixels = turned(pixels, turn)
+    elif pixels.shape != (shape if turn < 5 else shape[::-1]):
+        raise UserError(
+            f"{path}: {pixels.shape[1]} x {pixels.shape[0]} pixels, but its photo has {shape[1]} x {shape[0]};"
+            " make the mask from the same photo"
+        )
+    return pixels.astype(np.float32) / 255.0

@@ -1,0 +1,56 @@
+"""What happens to every Gaussian at every step of training besides the step of Adam."""
+
+import warp as wp
+
+from egs_warp.kernels.deformation.decomposition import turn_of
+
+wp.set_module_options({"enable_backward": False})
+
+STEEPNESS = wp.constant(wp.float32(100.0))
+
+
+@wp.func
+def sigmoid(x: wp.float32) -> wp.float32:
+    """1 / (1 + exp(-x))."""
+    return 1.0 / (1.0 + wp.exp(-x))
+
+
+@wp.kernel
+def pull_kernel(
+    first_row: wp.int32,
+    by_opacity: wp.float32,
+    by_scale: wp.float32,
+    opacity_logits: wp.array[wp.float32],
+    log_scales: wp.array[wp.vec3],
+    opacity_gradient_out: wp.array[wp.float32],
+    scale_gradient_out: wp.array[wp.vec3],
+):
+    """Add the derivatives of ``by_opacity`` times the opacities and ``by_scale`` times the scales."""
+    n = first_row + wp.tid()
+    opacity = sigmoid(opacity_logits[n])
+    opacity_gradient_out[n] = opacity_gradient_out[n] + by_opacity * opacity * (1.0 - opacity)
+    s = log_scales[n]
+    scale_gradient_out[n] = scale_gradient_out[n] + by_scale * wp.vec3(wp.exp(s[0]), wp.exp(s[1]), wp.exp(s[2]))
+
+
+@wp.kernel
+def jitter_kernel(
+    first_row: wp.int32,
+    size: wp.float32,
+    faint: wp.float32,
+    noise: wp.array[wp.vec3],
+    rotations: wp.array[wp.vec4],
+    log_scales: wp.array[wp.vec3],
+    opacity_logits: wp.array[wp.float32],
+    means_out: wp.array[wp.vec3],
+):
+    """Move a mean by ``size`` times its covariance times ``noise``, the less the more opaque it is."""
+    n = first_row + wp.tid()
+    gate = sigmoid(-STEEPNESS * (sigmoid(opacity_logits[n]) - faint))
+    # Above this the gate moves nothing that can be seen.
+    if gate > 1.0e-6:
+        turn = turn_of(rotations[n])
+        local = wp.transpose(turn) * noise[n]
+        s = log_scales[n]
+        local = wp.vec3(wp.exp(2.0 * s[0]) * local[0], wp.exp(2.0 * s[1]) * local[1], wp.exp(2.0 * s[2]) * local[2])
+        means_out[n] = means_out[n] + size * gate * (turn * local)

@@ -1,0 +1,247 @@
+"""Where photos were taken from: what ``egs-warp pose`` calls. The reconstruction is COLMAP's, by pycolmap."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+import tempfile
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from egs_warp.errors import UserError
+from egs_warp.io.atomic import writable_folder
+from egs_warp.io.frames import VIDEO_SUFFIXES, sharp_frames
+from egs_warp.io.photos import decoded, orientation, turned
+
+_PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+_MAX_EXHAUSTIVE = 400
+"""More photos than this are matched with their neighbours in the order of their names alone."""
+_NEIGHBOURS = 20
+_LEAST_PHOTOS = 3
+_CAMERA_MODEL = "SIMPLE_RADIAL"
+_LOOKS_EACH_SECOND = 2.0
+
+
+@dataclass(frozen=True)
+class PoseResult:
+    """What the reconstruction gave."""
+
+    photos: int
+    """That could be read."""
+    registered: int
+    """That have a pose."""
+    without_pose: tuple[str, ...]
+    """Names of the rest."""
+    unreadable: tuple[str, ...]
+    """Reasons, one a file."""
+    points: int
+    error: float
+    """Mean reprojection error, pixels."""
+
+
+def pose_photos(
+    source: Path | str,
+    out: Path | str,
+    *,
+    frames: int = 150,
+    max_side: int = 1600,
+    seed: int = 0,
+    stage: Callable[[str], None] | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> PoseResult:
+    """Find the poses of the photos in the folder ``source``, or of ``frames`` sharp frames of the video ``source``.
+
+    ``out`` then holds ``images`` (upright: EXIF's turn is done) and COLMAP's ``sparse/0``: what ``train`` reads.
+    Features are found at no more than ``max_side`` pixels. ``stage`` is called with what begins, ``progress`` with a
+    stage's name, how much of it is done, and of how much. Raises ``UserError`` where pycolmap is not installed, where
+    ``out`` has photos already, and where fewer than three photos can be posed.
+    """
+    try:
+        import pycolmap  # type: ignore[import-not-found]
+    except ImportError as error:
+        raise UserError("pose: pycolmap is not installed; pip install 'egs-warp[pose]'") from error
+    source, say = Path(source), stage or (lambda _text: None)
+    tell = progress or (lambda _stage, _done, _of: None)
+    is_video = source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES
+    if not source.is_dir() and not is_video:
+        raise UserError(f"{source}: neither a folder of photos nor a video ({', '.join(VIDEO_SUFFIXES)})")
+    out = Path(out)
+    for place in (out / "images", out / "sparse"):
+        if place.exists():
+            raise UserError(f"{place}: is there already; give --out a new folder")
+    out = writable_folder(out)
+    with tempfile.TemporaryDirectory(dir=out, prefix=".pose") as temporary:
+        work = Path(temporary)
+        images = work / "images"
+        images.mkdir()
+        say(f"choosing {frames} frames of {source}" if is_video else f"reading {source}")
+        unreadable = () if is_video else _copied(source, images)
+        if is_video:
+            for frame in sharp_frames(source, frames):
+                cv2.imwrite(str(images / f"frame_{frame.number:06d}.jpg"), frame.pixels, [cv2.IMWRITE_JPEG_QUALITY, 95])
+        for reason in unreadable:
+            say(f"left out {reason}")
+        names = sorted(path.relative_to(images).as_posix() for path in images.rglob("*") if path.is_file())
+        if len(names) < _LEAST_PHOTOS:
+            raise UserError(f"{source}: {len(names)} photos that can be read; give at least {_LEAST_PHOTOS}")
+        model = _reconstructed(
+            pycolmap, work, names, in_order=is_video, max_side=max_side, seed=seed, say=say, tell=tell
+        )
+        (work / "sparse" / "0").mkdir(parents=True)
+        model.write_binary(str(work / "sparse" / "0"))
+        for part in ("images", "sparse"):
+            os.replace(work / part, out / part)
+    posed = {image.name for image in model.images.values() if image.has_pose}
+    return PoseResult(
+        photos=len(names),
+        registered=len(posed),
+        without_pose=tuple(name for name in names if name not in posed),
+        unreadable=tuple(unreadable),
+        points=model.num_points3D(),
+        error=float(model.compute_mean_reprojection_error()),
+    )
+
+
+def _copied(source: Path, images: Path) -> tuple[str, ...]:
+    """Put the photos below ``source`` into ``images``, upright; returns why others are not there."""
+    unreadable = []
+    found = sorted(path for path in source.rglob("*") if path.suffix.lower() in _PHOTO_SUFFIXES and path.is_file())
+    for path in found:
+        if any(part.startswith(".") for part in path.relative_to(source).parts):
+            continue
+        target = images / path.relative_to(source)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            pixels = decoded(path)
+        except UserError as error:
+            unreadable.append(str(error))
+            continue
+        turn = orientation(path)
+        if turn == 1:
+            shutil.copyfile(path, target)
+        else:
+            # Written without the tag: programs differ in whether they heed it.
+            cv2.imwrite(str(target), turned(pixels, turn), [cv2.IMWRITE_JPEG_QUALITY, 97])
+    return tuple(unreadable)
+
+
+def _reconstructed(
+    pycolmap: Any,
+    work: Path,
+    names: list[str],
+    *,
+    in_order: bool,
+    max_side: int,
+    seed: int,
+    say: Callable[[str], None],
+    tell: Callable[[str, int, int], None],
+) -> Any:
+    """The largest model of the photos ``names`` in ``work/images``."""
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+    pycolmap.set_random_seed(seed)
+    images, database = work / "images", work / "database.db"
+    count = len(names)
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.max_image_size = max_side
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = _CAMERA_MODEL
+    sizes = {
+        picture.shape
+        for name in names
+        if (picture := cv2.imread(str(images / name), cv2.IMREAD_REDUCED_GRAYSCALE_8)) is not None
+    }
+    mode = pycolmap.CameraMode.SINGLE if len(sizes) == 1 else pycolmap.CameraMode.PER_IMAGE
+    say(f"finding features in {count} photos")
+    watch = _Watch(database, tell)
+    with watch.count("features", "keypoints", count):
+        pycolmap.extract_features(
+            str(database),
+            str(images),
+            image_names=names,
+            camera_mode=mode,
+            reader_options=reader,
+            extraction_options=extraction,
+        )
+    if in_order or count > _MAX_EXHAUSTIVE:
+        say("matching neighbours in the order of their names")
+        pairing = pycolmap.SequentialPairingOptions()
+        pairing.overlap, pairing.quadratic_overlap = _NEIGHBOURS, True
+        with watch.count("matches", "two_view_geometries", count * _NEIGHBOURS):
+            pycolmap.match_sequential(str(database), pairing_options=pairing)
+    else:
+        say("matching every photo with every other")
+        with watch.count("matches", "two_view_geometries", count * (count - 1) // 2):
+            pycolmap.match_exhaustive(str(database))
+    say("finding poses")
+    placed = 0
+
+    def one_more() -> None:
+        nonlocal placed
+        placed += 1
+        tell("poses", min(placed + 2, count), count)
+
+    models_folder = work / "models"
+    models_folder.mkdir()
+    mapping = pycolmap.IncrementalPipelineOptions()
+    mapping.random_seed = seed
+    models = pycolmap.incremental_mapping(
+        str(database), str(images), str(models_folder), mapping, next_image_callback=one_more
+    )
+    if not models:
+        raise UserError(
+            "pose: no photo could be posed; take more photos that overlap, of something with texture, from places apart"
+        )
+    best = max(models.values(), key=lambda model: model.num_reg_images())
+    if best.num_reg_images() < _LEAST_PHOTOS:
+        raise UserError(f"pose: only {best.num_reg_images()} photos could be posed; take more photos that overlap")
+    return best
+
+
+class _Watch:
+    """Tells how far pycolmap is, which says nothing itself, by the rows of its database."""
+
+    def __init__(self, database: Path, tell: Callable[[str, int, int], None]) -> None:
+        self._database = database
+        self._tell = tell
+
+    def count(self, stage: str, table: str, expected: int) -> _Counting:
+        """A context in which the rows of ``table`` are told."""
+        return _Counting(self._database, table, lambda done: self._tell(stage, min(done, expected), expected))
+
+
+class _Counting:
+    def __init__(self, database: Path, table: str, tell: Callable[[int], None]) -> None:
+        self._query = f"select count(*) from {table}"
+        self._database = database
+        self._tell = tell
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._look, daemon=True)
+
+    def __enter__(self) -> None:
+        self._thread.start()
+
+    def __exit__(self, *_error: object) -> None:
+        self._ended.set()
+        self._thread.join()
+        self._once()
+
+    def _look(self) -> None:
+        while not self._ended.wait(1.0 / _LOOKS_EACH_SECOND):
+            self._once()
+
+    def _once(self) -> None:
+        try:
+            reader = sqlite3.connect(f"file:{self._database}?mode=ro", uri=True, timeout=0.1)
+            try:
+                self._tell(int(reader.execute(self._query).fetchone()[0]))
+            finally:
+                reader.close()
+        except sqlite3.Error:
+            # Not made yet, or being written.
+            return

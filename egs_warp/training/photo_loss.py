@@ -1,0 +1,176 @@
+"""The loss of a render against a photo, in the photo's exposure: L1 and SSIM with their derivative in five launches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import warp as wp
+
+from egs_warp.kernels.training.photo_loss import (
+    blur_derivatives_kernel,
+    blur_products_kernel,
+    gradient_kernel,
+    likeness_kernel,
+    tone_kernel,
+)
+from egs_warp.launching import launch_rows
+from egs_warp.render.autograd import torch_stream
+
+_PICTURES = (
+    *("toned", "photo", "front", "mean_a", "mean_b", "aa", "bb", "ab"),
+    *("by_mean", "by_square", "by_product", "by_mean_rows", "by_square_rows", "by_product_rows", "by_toned"),
+)
+
+
+@dataclass(frozen=True)
+class Target:
+    """A photo on the device of the training."""
+
+    image: torch.Tensor
+    """(H, W, 3) float32."""
+    alpha: torch.Tensor | None
+    """(H, W) float32; where given, the photo is laid over the backdrop of the step."""
+    weight: torch.Tensor | None
+    """(H, W) float32, how much each pixel counts in L1; one of 0 does not count in SSIM either."""
+
+
+class PhotoLoss:
+    """(1 - w) L1 + w (1 - SSIM), its scratch memory kept from step to step."""
+
+    def __init__(self, ssim_weight: float, device: str, threads: int | None) -> None:
+        wp.init()
+        self.ssim_weight = ssim_weight
+        self.threads = threads
+        line = torch.exp(-(torch.arange(-5.0, 6.0) ** 2) / (2 * 1.5**2))
+        self.window = (line / line.sum()).to(device)
+        self._none = torch.zeros((1, 3), device=device)
+        self._scratch: dict[int, dict[str, torch.Tensor]] = {}
+
+    def __call__(
+        self,
+        colour: torch.Tensor,
+        alpha: torch.Tensor,
+        tone: torch.Tensor,
+        target: Target,
+        backdrop: tuple[float, ...],
+    ) -> torch.Tensor:
+        """Loss () of a render, ``colour`` (H, W, 3) over ``backdrop`` with ``alpha`` (H, W), in the ``tone`` (3, 4).
+
+        Gradients flow to the first three. The backdrop keeps its colour where the photo has alpha.
+        """
+        return _Loss.apply(colour, alpha, tone, target, backdrop, self)  # type: ignore[return-value]
+
+    def scratch(self, pixels: int) -> dict[str, torch.Tensor]:
+        """Memory for pictures of ``pixels``."""
+        if pixels not in self._scratch:
+            device = self.window.device
+            self._scratch[pixels] = {name: torch.empty((pixels, 3), device=device) for name in _PICTURES} | {
+                name: torch.empty(pixels, device=device) for name in ("off", "loss")
+            }
+        return self._scratch[pixels]
+
+    @property
+    def nothing(self) -> torch.Tensor:
+        """Stands for an array that is not there."""
+        return self._none
+
+
+class _Loss(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        colour: torch.Tensor,
+        alpha: torch.Tensor,
+        tone: torch.Tensor,
+        target: Target,
+        backdrop: tuple[float, ...],
+        task: PhotoLoss,
+    ) -> torch.Tensor:
+        height, width = colour.shape[:2]
+        pixels = height * width
+        cut_out = int(target.alpha is not None)
+        device = wp.device_from_torch(colour.device)
+        held = task.scratch(pixels)
+        tone = tone.detach().contiguous()
+        by_colour = torch.empty((pixels, 3), device=colour.device)
+        by_alpha = torch.empty(pixels if cut_out else 1, device=colour.device)
+        behind = torch.tensor([backdrop], device=colour.device) if cut_out else task.nothing
+
+        def of(given: torch.Tensor | None, dtype: Any = wp.vec3) -> wp.array:
+            tensor = task.nothing if given is None else given
+            count = tensor.numel() // (3 if dtype is wp.vec3 else 1)
+            return wp.array(ptr=tensor.data_ptr(), dtype=dtype, shape=(count,), device=device)
+
+        at = {name: of(tensor, wp.vec3 if tensor.ndim == 2 else wp.float32) for name, tensor in held.items()}
+        window, tones, backdrops = of(task.window, wp.float32), of(tone, wp.float32), of(behind)
+        weight = (
+            of(target.weight, wp.float32)
+            if target.weight is not None
+            else wp.array(ptr=task.nothing.data_ptr(), dtype=wp.float32, shape=(1,), device=device)
+        )
+        colour, alpha = colour.detach().contiguous(), alpha.detach().contiguous()
+        walk = {"device": device, "threads": task.threads}
+        w = task.ssim_weight
+        with torch_stream(colour.device):
+            launch_rows(
+                tone_kernel,
+                pixels,
+                inputs=[
+                    *(cut_out, backdrops, tones, of(colour), of(alpha, wp.float32)),
+                    *(of(target.image), of(target.alpha, wp.float32), weight),
+                ],
+                outputs=[at["toned"], at["photo"], at["front"], at["off"]],
+                **walk,
+            )
+            launch_rows(
+                blur_products_kernel,
+                pixels,
+                inputs=[width, window, at["toned"], at["photo"]],
+                outputs=[at["mean_a"], at["mean_b"], at["aa"], at["bb"], at["ab"]],
+                **walk,
+            )
+            launch_rows(
+                likeness_kernel,
+                pixels,
+                inputs=[
+                    *(width, height, w, window, at["mean_a"], at["mean_b"], at["aa"], at["bb"], at["ab"], at["off"])
+                ],
+                outputs=[at["loss"], at["by_mean"], at["by_square"], at["by_product"]],
+                **walk,
+            )
+            launch_rows(
+                blur_derivatives_kernel,
+                pixels,
+                inputs=[width, window, at["by_mean"], at["by_square"], at["by_product"]],
+                outputs=[at["by_mean_rows"], at["by_square_rows"], at["by_product_rows"]],
+                **walk,
+            )
+            launch_rows(
+                gradient_kernel,
+                pixels,
+                inputs=[
+                    *(width, height, w, cut_out, window, backdrops, tones, weight, at["toned"], at["photo"]),
+                    *(at["by_mean_rows"], at["by_square_rows"], at["by_product_rows"]),
+                ],
+                outputs=[at["by_toned"], of(by_colour), of(by_alpha, wp.float32)],
+                **walk,
+            )
+        # Before the scratch is used again.
+        mixing = held["by_toned"].T @ held["front"]
+        shift = held["by_toned"].T @ (alpha.reshape(-1, 1) if cut_out else torch.ones_like(held["off"][:, None]))
+        by_tone = torch.cat([mixing, shift], dim=1)
+        ctx.gradients = (
+            by_colour.reshape(height, width, 3),
+            by_alpha.reshape(height, width) if cut_out else None,
+            by_tone,
+        )
+        return held["loss"].mean()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *by_loss: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        by_colour, by_alpha, by_tone = ctx.gradients
+        (by,) = by_loss
+        return by_colour * by, None if by_alpha is None else by_alpha * by, by_tone * by, None, None, None

@@ -1,0 +1,51 @@
+"""Exposure and white balance of each photo, found together with what the photos show."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+_RATE, _LAST_RATE = 1e-2, 1e-4
+"""Step of Adam at the start and at the end."""
+_PULL = 1e-2
+"""Weight of the squared distance from the mean tone: what all photos share belongs to the cloud."""
+
+
+class Tones:
+    """One affine map of colours (3, 4) for each view, their mean held at the identity.
+
+    Without that gauge a darker cloud under brighter tones would be as good. The views are stepped by Adam one by one:
+    one that is not seen does not drift.
+    """
+
+    def __init__(self, count: int, steps: int, device: str) -> None:
+        self._offsets = torch.zeros((count, 3, 4), device=device)
+        self._first, self._second = torch.zeros_like(self._offsets), torch.zeros_like(self._offsets)
+        self._visits = [0] * count
+        self._leaf = torch.zeros((3, 4), device=device)
+        self._steps = steps
+        self._identity = torch.eye(3, 4, device=device)
+
+    def of(self, number: int) -> torch.Tensor:
+        """(3, 4) the tone of view ``number``, a leaf whose gradient ``step`` takes."""
+        self._leaf = leaf = (self._identity + self._offsets[number]).requires_grad_()
+        return leaf
+
+    @torch.no_grad()
+    def step(self, number: int, step: int) -> None:
+        """Move the tone of view ``number`` along its gradient, and all such that their mean stays."""
+        gradient = self._leaf.grad
+        assert gradient is not None
+        gradient = gradient + 2 * _PULL * self._offsets[number]
+        self._visits[number] += 1
+        visits = self._visits[number]
+        first = self._first[number].lerp_(gradient, 0.1)
+        second = self._second[number].lerp_(gradient.square(), 0.01)
+        rate = _RATE * (_LAST_RATE / _RATE) ** (step / max(self._steps, 1))
+        size = (second / (1 - 0.99**visits)).sqrt() + 1e-12
+        self._offsets[number] -= rate / (1 - 0.9**visits) * first / size
+        self._offsets -= self._offsets.mean(dim=0)
+
+    def matrices(self) -> np.ndarray:
+        """(views, 3, 4) float64."""
+        return (self._identity + self._offsets).double().cpu().numpy()

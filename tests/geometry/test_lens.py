@@ -1,0 +1,148 @@
+"""Lenses: against OpenCV's, and photos made through them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from egs_warp.assets import pawn
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.lens import Lens, Straightening
+from egs_warp.render import render_gaussians
+
+POINTS = np.random.default_rng(0).uniform(-0.6, 0.6, (40, 2))
+MODELS = {
+    "SIMPLE_RADIAL": {"k1": -0.12},
+    "RADIAL": {"k1": -0.12, "k2": 0.03},
+    "OPENCV": {"k1": -0.12, "k2": 0.03, "p1": 0.01, "p2": -0.02},
+    "FULL_OPENCV": {"k1": 0.1, "k2": 0.03, "p1": 0.01, "p2": -0.02, "k3": 0.02, "k4": 0.2, "k5": 0.01, "k6": 0.03},
+    "OPENCV_FISHEYE": {"k1": 0.05, "k2": -0.02, "k3": 0.01, "k4": 0.002},
+    "SIMPLE_RADIAL_FISHEYE": {"k1": 0.05},
+    "RADIAL_FISHEYE": {"k1": 0.05, "k2": -0.02},
+    "FISHEYE": {},
+}
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_lenses_are_opencvs(model: str) -> None:
+    numbers = MODELS[model]
+    lens = Lens.named(model, numbers)
+    assert lens is not None
+    if "FISHEYE" in model:
+        k = np.array([numbers.get(name, 0.0) for name in ("k1", "k2", "k3", "k4")])
+        expected = cv2.fisheye.distortPoints(POINTS[:, None], np.eye(3), k)[:, 0]
+    else:
+        k = np.array([numbers.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")])
+        rays = np.column_stack([POINTS, np.ones(len(POINTS))])
+        expected = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), k)[0][:, 0]
+    np.testing.assert_allclose(lens.distorted(POINTS), expected, atol=1e-9)
+
+
+def test_thin_prisms_and_the_fov_model_by_hand() -> None:
+    """COLMAP's THIN_PRISM_FISHEYE at one point, term by term; FOV against its inverse in closed form."""
+    numbers = {"k1": 0.1, "k2": 0.2, "p1": 0.01, "p2": 0.02, "k3": 0.03, "k4": 0.04, "sx1": 0.05, "sy1": 0.06}
+    lens = Lens.named("THIN_PRISM_FISHEYE", numbers)
+    assert lens is not None
+    theta = np.arctan(0.5)
+    u, v = theta * 0.6, theta * 0.8
+    r2 = theta**2
+    radial = 1 + 0.1 * r2 + 0.2 * r2**2 + 0.03 * r2**3 + 0.04 * r2**4
+    x = u * radial + 2 * 0.01 * u * v + 0.02 * (r2 + 2 * u * u) + 0.05 * r2
+    y = v * radial + 2 * 0.02 * u * v + 0.01 * (r2 + 2 * v * v) + 0.06 * r2
+    np.testing.assert_allclose(lens.distorted(np.array([0.3, 0.4])), [x, y], atol=1e-12)
+    fov = Lens.named("FOV", {"omega": 0.8})
+    assert fov is not None
+    radius = np.linalg.norm(fov.distorted(POINTS), axis=1)
+    np.testing.assert_allclose(
+        np.tan(0.8 * radius) / (2 * np.tan(0.4)), np.linalg.norm(POINTS, axis=1), rtol=1e-9, atol=1e-12
+    )
+
+
+def test_a_lens_that_bends_nothing_is_none() -> None:
+    assert Lens.named("OPENCV", {"k1": 0.0, "p2": 0.0}) is None
+    assert Lens.named("PINHOLE", {}) is None
+
+
+def photographed(picture: np.ndarray, pinhole: Camera, taken: Camera, lens: Lens) -> np.ndarray:
+    """What ``taken`` sees through ``lens`` of the scene that ``picture`` shows to ``pinhole`` at the same place."""
+    columns, rows = np.meshgrid(np.arange(taken.width) + 0.5, np.arange(taken.height) + 0.5)
+    wanted = np.stack([(columns - taken.cx) / taken.fx, (rows - taken.cy) / taken.fy], axis=-1)
+    rays = wanted.copy()
+    for _ in range(60):
+        rays += wanted - lens.distorted(rays)
+    at = rays * [pinhole.fx, pinhole.fy] + [pinhole.cx, pinhole.cy] - 0.5
+    where = at.astype(np.float32)
+    return cv2.remap(picture, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+@pytest.mark.parametrize(
+    ("model", "numbers"),
+    [
+        ("SIMPLE_RADIAL", {"k1": -0.25}),
+        ("OPENCV", {"k1": 0.2, "k2": 0.05, "p1": 0.02, "p2": -0.01}),
+        ("OPENCV_FISHEYE", {"k1": 0.05, "k2": -0.02, "k3": 0.0, "k4": 0.0}),
+    ],
+)
+def test_a_photo_through_a_lens_is_straightened(model: str, numbers: dict[str, float]) -> None:
+    """A render bent by the lens and straightened is the render; unstraightened it is not."""
+    lens = Lens.named(model, numbers)
+    assert lens is not None
+    size = 192
+    camera = Camera.look_at(
+        np.array([0.0, 1.2, 2.2]), np.array([0.0, 0.5, 0.0]), np.array([0.0, 1.0, 0.0]), width=size, height=size
+    )
+    # Seen finer and wider than the photo, so that bending it loses little.
+    fine = replace(
+        camera, width=4 * size, height=4 * size, fx=2 * camera.fx, fy=2 * camera.fy, cx=2 * size, cy=2 * size
+    )
+    cloud = pawn(gaussian_count=3000, device="cpu").cloud
+    picture = render_gaussians(cloud, fine).colour.numpy()
+    straight = photographed(picture, fine, camera, Lens())
+    bent = photographed(picture, fine, camera, lens)
+    way = Straightening.of(camera, lens)
+    back = way.picture(bent)
+    inner = way.known & (np.abs(straight - 1).sum(axis=2) > 0.05)
+    assert inner.mean() > 0.05
+    error, unbent = (np.abs(one - straight)[inner].mean() for one in (back, bent))
+    assert error < 0.02
+    assert unbent > 3 * error
+    assert not back[~way.known].any()
+
+
+def test_pixels_without_a_source_are_known_and_clicks_find_their_way() -> None:
+    """A pincushion's pinhole photo has corners that the lens did not see; a barrel's has none."""
+    camera = Camera(60, 40, 50.0, 50.0, 30.0, 20.0, np.eye(3), np.zeros(3))
+    wide = Straightening.of(camera, Lens(radial=(0.3, 0.0, 0.0, 0.0)))
+    assert not wide.known[[0, 0, -1, -1], [0, -1, 0, -1]].any()
+    assert wide.known[20, 30]
+    lens = Lens(radial=(-0.1, 0.0, 0.0, 0.0))
+    barrel = Straightening.of(camera, lens)
+    assert barrel.known.all()
+    ray = np.array([0.3, -0.2])
+    u, v = lens.distorted(ray) * 50.0 + [30.0, 20.0]
+    np.testing.assert_allclose(barrel.pixel(u, v), ray * 50.0 + [30.0, 20.0], atol=0.6)
+
+
+def test_a_polynomial_that_folds_back_shows_nothing_twice() -> None:
+    """Beyond r = 1 / sqrt(1.5) the radius r - 0.5 r^3 falls again: what lies there is not known."""
+    lens = Lens(radial=(-0.5, 0.0, 0.0, 0.0))
+    assert lens.reach(3.0) == pytest.approx(1 / np.sqrt(1.5), abs=0.01)
+    camera = Camera(200, 200, 50.0, 50.0, 100.0, 100.0, np.eye(3), np.zeros(3))
+    known = Straightening.of(camera, lens).known
+    rows, columns = np.mgrid[:200, :200] + 0.5
+    radius = np.hypot(columns - 100, rows - 100) / 50
+    assert not known[radius > 0.83].any()
+    assert known[radius < 0.8].all()
+
+
+def test_masks_stay_masks() -> None:
+    camera = Camera(60, 40, 50.0, 50.0, 30.0, 20.0, np.eye(3), np.zeros(3))
+    way = Straightening.of(camera, Lens(radial=(0.3, 0.0, 0.0, 0.0)))
+    mask = np.zeros((40, 60), bool)
+    mask[:, 30:] = True
+    moved = way.mask(mask)
+    assert moved.dtype == bool
+    assert moved[20, 31:55].all() and not moved[:, :29].any()

@@ -1,0 +1,35 @@
+"""Frames of a video: the sharp ones, evenly in time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from egs_warp.errors import UserError
+from egs_warp.io.frames import sharp_frames
+from egs_warp.io.video import VideoWriter
+
+
+def test_the_sharpest_frame_of_each_part_is_taken(tmp_path: Path) -> None:
+    """Forty frames, every fifth sharp: eight parts give those eight."""
+    random = np.random.default_rng(0)
+    texture = random.integers(0, 255, (48, 64, 3)).astype(np.uint8)
+    with VideoWriter(tmp_path / "v.mp4", 64, 48, frames_per_second=30) as video:
+        for number in range(40):
+            frame = np.roll(texture, number, axis=1)
+            video.write(frame if number % 5 == 2 else cv2.GaussianBlur(frame, (0, 0), 3))
+    taken = list(sharp_frames(tmp_path / "v.mp4", 8))
+    assert [frame.number for frame in taken] == list(range(2, 40, 5))
+    assert taken[0].pixels.shape == (48, 64, 3)
+    assert len(list(sharp_frames(tmp_path / "v.mp4", 100))) == 40
+
+
+def test_no_video_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "v.mp4").write_bytes(b"no video")
+    with pytest.raises(
+        UserError, match=r"v.mp4: no video that can be read; give an .mp4 or .mov, or a folder of photos"
+    ):
+        list(sharp_frames(tmp_path / "v.mp4", 5))

@@ -1,0 +1,95 @@
+"""Photos as files are: turned by a tag, reduced, cut short, with masks drawn either way up."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image, ImageOps
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.lens import Lens
+from egs_warp.io.cameras import PosedImage
+from egs_warp.io.photos import orientation, read_photo, turned
+
+# No two corners alike, smooth enough for JPEG.
+ROWS, COLUMNS = np.mgrid[:40, :60]
+PICTURE = np.stack([4 * COLUMNS, 6 * ROWS, 255 - 2 * COLUMNS - 3 * ROWS], axis=-1).astype(np.uint8)
+
+
+def camera(width: int, height: int) -> Camera:
+    return Camera(width, height, 50.0, 50.0, width / 2, height / 2, np.eye(3), np.zeros(3))
+
+
+def saved(path: Path, pixels: np.ndarray, turn: int = 1) -> Path:
+    exif = Image.Exif()
+    exif[0x0112] = turn
+    Image.fromarray(pixels).save(path, exif=exif, quality=100)
+    return path
+
+
+@pytest.mark.parametrize("turn", range(1, 9))
+def test_turns_are_pillows(turn: int, tmp_path: Path) -> None:
+    path = saved(tmp_path / "a.png", PICTURE, turn)
+    assert orientation(path) == turn
+    with Image.open(path) as opened:
+        expected = np.asarray(ImageOps.exif_transpose(opened))
+    np.testing.assert_array_equal(turned(PICTURE, turn), expected)
+
+
+@pytest.mark.parametrize("turn", [5, 6, 7, 8])
+def test_pixels_are_turned_only_where_that_fits_the_camera(turn: int, tmp_path: Path) -> None:
+    path = saved(tmp_path / "a.png", PICTURE, turn)
+    as_stored = read_photo(PosedImage("a.png", camera(60, 40), path))
+    np.testing.assert_allclose(as_stored.colour, PICTURE / 255.0, atol=1e-6)
+    upright = read_photo(PosedImage("a.png", camera(40, 60), path))
+    np.testing.assert_allclose(upright.colour, turned(PICTURE, turn) / 255.0, atol=1e-6)
+    assert (upright.camera.width, upright.camera.height) == (40, 60)
+
+
+def test_a_photo_of_another_shape_is_refused_and_one_of_another_size_scaled(tmp_path: Path) -> None:
+    path = saved(tmp_path / "a.png", PICTURE)
+    with pytest.raises(UserError, match=r"a.png: 60 x 40 pixels, but its camera has 40 x 60; use the photos that"):
+        read_photo(PosedImage("a.png", camera(40, 60), path))
+    photo = read_photo(PosedImage("a.png", camera(240, 160), path))
+    assert (photo.camera.width, photo.camera.height, photo.camera.fx) == (60, 40, 12.5)
+
+
+def test_a_photo_cut_short_or_broken_or_missing_is_refused(tmp_path: Path) -> None:
+    path = saved(tmp_path / "a.jpg", np.kron(PICTURE, np.ones((8, 8, 1), np.uint8)))
+    assert read_photo(PosedImage("a.jpg", camera(60, 40), path)).colour.shape == (320, 480, 3)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(UserError, match=r"a.jpg: the picture is cut short; copy it again"):
+        read_photo(PosedImage("a.jpg", camera(60, 40), path))
+    path.write_bytes(b"\xff\xd8 not a picture")
+    with pytest.raises(UserError, match=r"a.jpg: not a readable picture"):
+        read_photo(PosedImage("a.jpg", camera(60, 40), path))
+    with pytest.raises(UserError, match=r"b.jpg: the photo is not beside the poses; put it there"):
+        read_photo(PosedImage("b.jpg", camera(60, 40), None))
+
+
+@pytest.mark.parametrize("drawn_upright", [False, True])
+def test_masks_of_turned_photos_fit_either_way(drawn_upright: bool, tmp_path: Path) -> None:
+    for folder in ("images", "masks"):
+        (tmp_path / folder).mkdir()
+    path = saved(tmp_path / "images" / "a.png", PICTURE, 6)
+    mask = np.where(PICTURE[..., 0] > 100, 255, 0).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "masks" / "a.png.png"), turned(mask, 6) if drawn_upright else mask)
+    photo = read_photo(PosedImage("a.png", camera(40, 60), path))
+    np.testing.assert_array_equal(photo.alpha, turned(mask, 6) / 255.0)
+
+
+def test_what_the_lens_did_not_see_stays_unknown_when_reduced(tmp_path: Path) -> None:
+    """Black beyond the lens's field must not darken the pixels beside it."""
+    white = np.full((80, 120, 3), 255, np.uint8)
+    path = saved(tmp_path / "a.png", white)
+    posed = PosedImage("a.png", camera(120, 80), path, Lens(radial=(0.2, 0.0, 0.0, 0.0)))
+    full, half = read_photo(posed), read_photo(posed, max_side=60)
+    for photo in (full, half):
+        assert photo.known is not None
+        assert 0.3 < photo.known.mean() < 1.0
+        np.testing.assert_allclose(photo.colour[photo.known], 1.0, atol=1e-3)

@@ -1,0 +1,88 @@
+"""Poses of photos, by pycolmap."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from egs_warp.cli import main
+from egs_warp.io import read_cameras
+from egs_warp.io.cameras import read_points
+
+
+def fails(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(["pose", *arguments]) == 2
+    error = capsys.readouterr().err.splitlines()
+    assert error[-1].startswith("egs-warp: ")
+    return error[-1].removeprefix("egs-warp: ")
+
+
+def test_without_pycolmap_one_line_says_what_to_install(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    error = fails(capsys, str(tmp_path), "--out", str(tmp_path / "out"))
+    assert error == "pose: pycolmap is not installed; pip install 'egs-warp[pose]'"
+    assert not (tmp_path / "out").exists()
+
+
+def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pycolmap")
+    out = tmp_path / "out"
+    assert "neither a folder of photos nor a video" in fails(capsys, str(tmp_path / "no"), "--out", str(out))
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.jpg").write_bytes(b"no photo")
+    assert "0 photos that can be read; give at least 3" in fails(capsys, str(tmp_path / "photos"), "--out", str(out))
+    assert not list(out.iterdir())
+    for number in range(3):
+        Image.new("RGB", (64, 48), (0, 0, 90 * number)).save(tmp_path / "photos" / f"{number}.png")
+    assert "no photo could be posed; take more photos" in fails(capsys, str(tmp_path / "photos"), "--out", str(out))
+    assert not list(out.iterdir())
+    (out / "images").mkdir()
+    assert "images: is there already; give --out a new folder" in fails(
+        capsys, str(tmp_path / "photos"), "--out", str(out)
+    )
+
+
+@pytest.mark.data
+@pytest.mark.slow
+def test_photos_of_a_room_get_the_poses_that_they_had(
+    data_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Twelve neighbours of the bonsai, one of them turned by its tag: all are posed, as far apart as before."""
+    pytest.importorskip("pycolmap")
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    known = {
+        view.name: view.camera for view in sorted(read_cameras(data_dir / "posed/bonsai"), key=lambda v: v.name)[:12]
+    }
+    for number, name in enumerate(known):
+        original = data_dir / "posed/bonsai/images" / name
+        if number == 4:
+            exif = Image.Exif()
+            exif[0x0112] = 6
+            with Image.open(original) as opened:
+                opened.transpose(Image.Transpose.ROTATE_90).save(photos / name, exif=exif, quality=97)
+        else:
+            shutil.copy(original, photos / name)
+    out = tmp_path / "posed"
+    assert main(["pose", str(photos), "--out", str(out), "--max-side", "800"]) == 0
+    printed = capsys.readouterr()
+    assert "posed 12 of 12 photos (100 %)" in printed.out
+    assert "features 12/12" in printed.err and "matches 66/66" in printed.err
+    found = {view.name: view for view in read_cameras(out)}
+    assert all(view.image is not None and view.camera.width == 800 for view in found.values())
+    points = read_points(out)
+    assert points is not None and len(points.positions) > 500
+    # Up to a similarity: distances between camera centres keep their ratios.
+    distances = []
+    for cameras in ({name: found[name].camera for name in known}, known):
+        centres = np.array([camera.centre for camera in cameras.values()])
+        between = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+        distances.append(between / between.mean())
+    assert np.abs(distances[0] - distances[1]).max() < 0.1

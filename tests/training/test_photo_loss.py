@@ -1,0 +1,56 @@
+"""The photo loss in kernels equals its plain twin in torch, value and derivatives."""
+
+from __future__ import annotations
+
+import pytest
+
+torch = pytest.importorskip("torch")
+from egs_warp.training.likeness import ssim  # noqa: E402
+from egs_warp.training.photo_loss import PhotoLoss, Target  # noqa: E402
+
+
+def twin(colour, alpha, tone, target, backdrop, weight):
+    """The same in plain torch, differentiated by torch."""
+    behind = torch.tensor(backdrop)
+    image = target.image
+    if target.alpha is None:
+        toned = colour @ tone[:, :3].T + tone[:, 3]
+    else:
+        front = colour - (1 - alpha)[:, :, None] * behind
+        toned = front @ tone[:, :3].T + alpha[:, :, None] * tone[:, 3] + (1 - alpha)[:, :, None] * behind
+        image = image * target.alpha[:, :, None] + (1 - target.alpha)[:, :, None] * behind
+    off = (toned - image).abs()
+    if target.weight is not None:
+        off = off * target.weight[:, :, None]
+        toned = torch.where(target.weight[:, :, None] > 0, toned, image)
+    return (1 - weight) * off.mean() + weight * (1 - ssim(toned, image))
+
+
+@pytest.mark.parametrize("cut_out", [False, True])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_loss_and_gradients_equal_the_twins(cut_out: bool, weighted: bool, device: str) -> None:
+    generator = torch.Generator().manual_seed(0)
+
+    def random(*shape: int) -> torch.Tensor:
+        return torch.rand(shape, generator=generator)
+
+    weight = random(19, 23) if weighted else None
+    if weight is not None:
+        weight[5:9, 4:12] = 0.0
+    target = Target(random(19, 23, 3), random(19, 23) if cut_out else None, weight)
+    given = [random(19, 23, 3), random(19, 23), torch.eye(3, 4) + 0.1 * random(3, 4)]
+    plain = [value.clone().requires_grad_() for value in given]
+    fast = [value.clone().to("cuda" if device != "cpu" else "cpu").requires_grad_() for value in given]
+    backdrop = (0.2, 0.9, 0.4)
+    wanted = twin(*plain, target, backdrop, 0.2)
+    there = Target(*(None if v is None else v.to(fast[0].device) for v in vars(target).values()))
+    got = PhotoLoss(0.2, str(fast[0].device), None)(*fast, there, backdrop)
+    assert float(got) == pytest.approx(float(wanted), rel=1e-5)
+    (3 * wanted).backward()
+    (3 * got).backward()
+    for a, b in zip(fast, plain, strict=True):
+        if b.grad is None or not b.grad.any():
+            assert a.grad is None
+            continue
+        assert a.grad is not None
+        torch.testing.assert_close(a.grad.cpu(), b.grad, rtol=2e-4, atol=1e-7)
