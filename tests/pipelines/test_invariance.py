@@ -13,12 +13,11 @@ from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.io import read_capture
-from egs_warp.locomotion.rollout import Simulation, simulate
+from egs_warp.locomotion.rollout import Simulation
 from egs_warp.locomotion.trajectory import measure
-from egs_warp.motions.repertoire import longest, parts_of
-from egs_warp.motions.script import parse_script
-from egs_warp.motions.sequence import MotionSequence
+from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import FILMED_FROM, Creature, first_place, make_creature
+from egs_warp.pipelines.performance import simulate
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.base_plane import find_base_plane
 from tests.support.frames import TURN, Lying
@@ -27,17 +26,7 @@ from tests.support.frames import TURN, Lying
 def jump(lying: Lying, *, frames: int | None = None, by_up: bool = False) -> tuple[Creature, Simulation]:
     """The first ``frames`` of a jump, or all of it; the plane is given, or found from up alone."""
     creature = make_creature(lying.cloud, **({"up": lying.up} if by_up else {"plane": lying.plane}))
-    requests = parse_script("jump")
-    sequence = MotionSequence(first_place(creature), parts_of(requests, creature.body.height))
-    simulation = simulate(
-        creature.stepper,
-        creature.geometry,
-        creature.start,
-        sequence,
-        frames=frames or longest(requests),
-        finished=lambda: frames is None and sequence.finished,
-    )
-    return creature, simulation
+    return creature, simulate(creature, motion("jump"), frames=frames).simulation
 
 
 def pictures(creature: Creature, positions: np.ndarray) -> np.ndarray:
