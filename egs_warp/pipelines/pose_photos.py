@@ -74,7 +74,7 @@ def pose_photos(
     out = Path(out)
     for place in (out / "images", out / "sparse"):
         if place.exists():
-            raise UserError(f"{place}: is there already; give --out a new folder")
+            raise UserError(f"{place}: is there already; give a new folder")
     out = writable_folder(out)
     with tempfile.TemporaryDirectory(dir=out, prefix=".pose") as temporary:
         work = Path(temporary)

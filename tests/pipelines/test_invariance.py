@@ -16,7 +16,7 @@ from egs_warp.io import read_capture
 from egs_warp.locomotion.rollout import Simulation
 from egs_warp.locomotion.trajectory import measure
 from egs_warp.motions.script import motion
-from egs_warp.pipelines.creature import Creature, make_creature
+from egs_warp.pipelines.creature import FILMED_FROM, Creature, first_place, make_creature
 from egs_warp.pipelines.performance import simulate
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.base_plane import find_base_plane
@@ -26,8 +26,7 @@ from tests.support.frames import TURN, Lying
 def jump(lying: Lying, *, frames: int | None = None, by_up: bool = False) -> tuple[Creature, Simulation]:
     """The first ``frames`` of a jump, or all of it; the plane is given, or found from up alone."""
     creature = make_creature(lying.cloud, **({"up": lying.up} if by_up else {"plane": lying.plane}))
-    simulation = simulate(creature, motion("jump"), frames=frames).simulation
-    return creature, simulation
+    return creature, simulate(creature, motion("jump"), frames=frames).simulation
 
 
 def pictures(creature: Creature, positions: np.ndarray) -> np.ndarray:

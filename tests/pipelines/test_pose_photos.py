@@ -44,9 +44,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, capsys: pytest
     assert "no photo could be posed; take more photos" in fails(capsys, str(tmp_path / "photos"), "--out", str(out))
     assert not list(out.iterdir())
     (out / "images").mkdir()
-    assert "images: is there already; give --out a new folder" in fails(
-        capsys, str(tmp_path / "photos"), "--out", str(out)
-    )
+    assert "images: is there already; give a new folder" in fails(capsys, str(tmp_path / "photos"), "--out", str(out))
 
 
 @pytest.mark.data
