@@ -9,7 +9,7 @@ from itertools import count as counter
 
 import numpy as np
 
-from egs_warp.locomotion.complementarity import SEPARATE, states_of_pairs
+from egs_warp.locomotion.complementarity import SEPARATE, Pairs, states_of_pairs
 from egs_warp.locomotion.program import ContactProgram
 from egs_warp.locomotion.solvers import QpSolution, QpSolver, quadratic_program
 
@@ -178,11 +178,7 @@ def _bounds(program: ContactProgram, branches: tuple[_Branch, ...]) -> tuple[np.
 
 def _most_violated(program: ContactProgram, branches: tuple[_Branch, ...], y: np.ndarray) -> int | None:
     """Undecided contact whose pairs are furthest from complementary."""
-    n, nd = program.layout.contacts, program.layout.directions
-    x, w = program.pairs(y)
-    gaps = np.minimum(x, w)
-    worst = np.maximum(gaps[:n], gaps[n + n * nd :])
-    worst = np.maximum(worst, gaps[n : n + n * nd].reshape(n, nd).max(axis=1))
+    worst = Pairs.of(program.layout, *program.pairs(y)).violation
     worst[[branch.decided in _LEAVES for branch in branches]] = 0.0
     pick = int(np.argmax(worst))
     return pick if worst[pick] > 1e-7 else None

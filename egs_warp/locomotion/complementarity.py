@@ -6,6 +6,7 @@ See docs/concepts/locomotion.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -16,8 +17,15 @@ STATIC = -1
 """A state is SEPARATE, STATIC, or slide k: friction along +D_k and slip along -D_k for 0 <= k < n_d; n_d + k: friction
 anywhere between D_k and D_(k+1), slip midway."""
 
-Pivot = tuple[float, int, int]
-"""(gain, contact, new state)."""
+
+class Pivot(NamedTuple):
+    """A contact's move to another state."""
+
+    gain: float
+    """How strongly the multipliers ask for it."""
+    contact: int
+    state: int
+    """The new one."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +91,37 @@ class ContactLayout:
         return lower, upper
 
 
+@dataclass(frozen=True)
+class Pairs:
+    """Both sides of Eq. (9) by contact, 0 <= x and 0 <= w of which one is zero; or the multipliers of their rows."""
+
+    normal: np.ndarray
+    """(n,) x: f_n."""
+    friction: np.ndarray
+    """(n, n_d) x: f_t along each D."""
+    slip: np.ndarray
+    """(n,) x: lambda."""
+    gap: np.ndarray
+    """(n,) w of ``normal``: the normal measure c."""
+    drift: np.ndarray
+    """(n, n_d) w of ``friction``: D^T u' + lambda."""
+    cone: np.ndarray
+    """(n,) w of ``slip``: mu f_n less the sum of f_t."""
+
+    @classmethod
+    def of(cls, layout: ContactLayout, x: np.ndarray, w: np.ndarray) -> Pairs:
+        """From x and w (pairs,) as ``ContactProgram.pairs`` gives them."""
+        n, nd = layout.contacts, layout.directions
+        middle = slice(n, n + n * nd)
+        return cls(x[:n], x[middle].reshape(n, nd), x[middle.stop :], w[:n], w[middle].reshape(n, nd), w[middle.stop :])
+
+    @property
+    def violation(self) -> np.ndarray:
+        """(n,) the largest smaller side of each contact's pairs: zero where Eq. (9) holds."""
+        normal, slip = np.minimum(self.normal, self.gap), np.minimum(self.slip, self.cone)
+        return np.maximum(np.maximum(normal, slip), np.minimum(self.friction, self.drift).max(axis=1))
+
+
 def states_from_prediction(
     normal_forces: np.ndarray, tangential: np.ndarray, velocities: np.ndarray, friction: float, directions: int
 ) -> np.ndarray:
@@ -95,18 +134,16 @@ def states_from_prediction(
 
 def states_of_pairs(layout: ContactLayout, x: np.ndarray, w: np.ndarray) -> np.ndarray:
     """(n,) states of the larger side of each pair: x and w (pairs,) as ``ContactProgram.pairs`` gives them."""
-    n, nd = layout.contacts, layout.directions
-    f_n, f_t, lam = x[:n], x[n : n + n * nd].reshape(n, nd), x[n + n * nd :]
-    c, w_t, cone = w[:n], w[n : n + n * nd].reshape(n, nd), w[n + n * nd :]
-    side = f_t - w_t
+    pairs, nd = Pairs.of(layout, x, w), layout.directions
+    side = pairs.friction - pairs.drift
     first = np.argmax(side, axis=1)
-    states, rows, rounding = first.copy(), np.arange(n), 1e-9
+    states, rows, rounding = first.copy(), np.arange(layout.contacts), 1e-9
     after, before = side[rows, (first + 1) % nd], side[rows, (first - 1) % nd]
     between = nd + np.where(after >= before, first, (first - 1) % nd)
     both = (np.maximum(after, before) > rounding) & (side[rows, first] > rounding)
     states[both] = between[both]
-    states[cone >= lam - rounding] = STATIC
-    states[f_n <= c + rounding] = SEPARATE
+    states[pairs.cone >= pairs.slip - rounding] = STATIC
+    states[pairs.normal <= pairs.gap + rounding] = SEPARATE
     return states
 
 
@@ -119,67 +156,76 @@ def proposed_pivots(
     *,
     zero: float = 1e-4,
 ) -> list[Pivot]:
-    """(gain, contact, new state), best first, read from the multipliers (rows,) of the rows held at zero.
-
-    See docs/concepts/locomotion.md.
+    """Moves of contacts, best first, read from the multipliers (rows,) of the rows held at zero
+    (docs/concepts/locomotion.md).
 
     ``x`` and ``w`` (pairs,) as ``ContactProgram.pairs`` gives them. Only states that the point itself obeys are
     proposed, so no proposal is infeasible, nor are several contacts' proposals together. ``zero`` is the accuracy of x,
     w and the multipliers.
     """
-    n, nd = layout.contacts, layout.directions
-    table = tangent_directions(nd)
-    friction, slip = slice(n, n + n * nd), slice(n + n * nd, None)
-    f_n, f_t, lam = x[:n], x[friction].reshape(n, nd), x[slip]
-    c, w_t, cone = w[:n], w[friction].reshape(n, nd), w[slip]
-    y_x, y_w = multipliers[layout.activations : layout.variables], multipliers[layout.variables :]
-    y_force, y_friction = y_x[:n], y_x[friction].reshape(n, nd)
-    y_normal, y_slip, y_cone = y_w[:n], y_w[friction].reshape(n, nd), y_w[slip]
+    point, held = Pairs.of(layout, x, w), _multipliers(layout, multipliers)
     pivots: list[Pivot] = []
-
-    def propose(gain: float, contact: int, state: int) -> None:
-        if gain > zero:
-            pivots.append((float(gain), contact, int(state)))
-
     for i, state in enumerate(states):
         if state == SEPARATE:
-            if c[i] <= zero:
-                along = w_t[i] - lam[i]
-                propose(y_force[i], i, int(np.argmin(along)) if along.min() < -zero else STATIC)
+            moves = _moves_of_separate(i, point, held, zero)
         elif state == STATIC:
-            # The rows of a static contact are redundant: only their sum along D means something.
-            pull = y_slip[i] @ table
-            size = float(np.linalg.norm(pull))
-            if f_n[i] <= zero:
-                propose(max(y_normal[i], size), i, SEPARATE)
-                propose(size, i, int(np.argmin(table @ pull)))
-            elif cone[i] <= zero:
-                k = int(np.argmax(f_t[i]))
-                along = float(table[k] @ pull)
-                across = float(np.linalg.norm(pull - along * table[k]))
-                after, before = (k + 1) % nd, (k - 1) % nd
-                beside = after if f_t[i, after] >= f_t[i, before] else before
-                if f_t[i, beside] > zero:
-                    middle = table[k] + table[beside]
-                    if middle @ pull < 0.0:
-                        propose(-float(middle @ pull), i, nd + (k if beside == after else before))
-                elif along < np.tan(np.pi / nd) * across:
-                    propose(size, i, k)
+            moves = _moves_of_static(i, point, held, zero, layout.directions)
         else:
-            k = int(state % nd)
-            if lam[i] <= zero:
-                propose(max(y_cone[i], y_friction[i].max(initial=0.0)), i, STATIC)
-            if f_n[i] <= zero:
-                propose(y_normal[i], i, SEPARATE)
-            if state < nd:
-                for between, other in ((nd + k, (k + 1) % nd), (nd + (k - 1) % nd, (k - 1) % nd)):
-                    if w_t[i, other] <= zero:
-                        propose(y_friction[i, other], i, between)
-            else:
-                for held, other in ((k, (k + 1) % nd), ((k + 1) % nd, k)):
-                    if f_t[i, held] <= zero:
-                        propose(y_slip[i, held], i, other)
-    return sorted(pivots, key=lambda p: -p[0])
+            moves = _moves_of_sliding(i, int(state), point, held, zero, layout.directions)
+        pivots += [Pivot(float(gain), i, int(new)) for gain, new in moves if gain > zero]
+    return sorted(pivots, key=lambda pivot: -pivot.gain)
+
+
+def _multipliers(layout: ContactLayout, multipliers: np.ndarray) -> Pairs:
+    return Pairs.of(layout, multipliers[layout.activations : layout.variables], multipliers[layout.variables :])
+
+
+_Moves: TypeAlias = list[tuple[float, int]]
+"""Gains and new states of one contact."""
+
+
+def _moves_of_separate(i: int, point: Pairs, held: Pairs, zero: float) -> _Moves:
+    if point.gap[i] > zero:
+        return []
+    along = point.drift[i] - point.slip[i]
+    return [(held.normal[i], int(np.argmin(along)) if along.min() < -zero else STATIC)]
+
+
+def _moves_of_static(i: int, point: Pairs, held: Pairs, zero: float, nd: int) -> _Moves:
+    table = tangent_directions(nd)
+    # The rows of a static contact are redundant: only their sum along D means something.
+    pull = held.drift[i] @ table
+    size = float(np.linalg.norm(pull))
+    if point.normal[i] <= zero:
+        return [(max(held.gap[i], size), SEPARATE), (size, int(np.argmin(table @ pull)))]
+    if point.cone[i] > zero:
+        return []
+    k = int(np.argmax(point.friction[i]))
+    along = float(table[k] @ pull)
+    across = float(np.linalg.norm(pull - along * table[k]))
+    after, before = (k + 1) % nd, (k - 1) % nd
+    beside = after if point.friction[i, after] >= point.friction[i, before] else before
+    if point.friction[i, beside] > zero:
+        middle = table[k] + table[beside]
+        return [(-float(middle @ pull), nd + (k if beside == after else before))] if middle @ pull < 0.0 else []
+    return [(size, k)] if along < np.tan(np.pi / nd) * across else []
+
+
+def _moves_of_sliding(i: int, state: int, point: Pairs, held: Pairs, zero: float, nd: int) -> _Moves:
+    k, moves = state % nd, []
+    if point.slip[i] <= zero:
+        moves.append((max(held.cone[i], held.friction[i].max(initial=0.0)), STATIC))
+    if point.normal[i] <= zero:
+        moves.append((held.gap[i], SEPARATE))
+    if state < nd:
+        for between, other in ((nd + k, (k + 1) % nd), (nd + (k - 1) % nd, (k - 1) % nd)):
+            if point.drift[i, other] <= zero:
+                moves.append((held.friction[i, other], between))
+    else:
+        for left, other in ((k, (k + 1) % nd), ((k + 1) % nd, k)):
+            if point.friction[i, left] <= zero:
+                moves.append((held.drift[i, left], other))
+    return moves
 
 
 def plain_pivots(
@@ -196,26 +242,20 @@ def plain_pivots(
     A contact whose free side is zero goes to the state in which the multiplier's row is free: static to separate or
     slide k, slide k to static, separate or slide j, separate to static. For the baseline.
     """
-    n, nd = layout.contacts, layout.directions
-    friction, slip = slice(n, n + n * nd), slice(n + n * nd, None)
-    f_n, f_t, lam = x[:n], x[friction].reshape(n, nd), x[slip]
-    c, w_t, cone = w[:n], w[friction].reshape(n, nd), w[slip]
-    y_x, y_w = multipliers[layout.activations : layout.variables], multipliers[layout.variables :]
-    y_force, y_friction, y_lambda = y_x[:n], y_x[friction].reshape(n, nd), y_x[slip]
-    y_normal, y_slip, y_cone = y_w[:n], y_w[friction].reshape(n, nd), y_w[slip]
+    point, held, nd = Pairs.of(layout, x, w), _multipliers(layout, multipliers), layout.directions
     pivots: list[Pivot] = []
     for i, state in enumerate(states):
         k = int(state)
         if state == SEPARATE:
-            gains = [(y_force[i], STATIC)] if c[i] <= zero else []
+            gains = [(held.normal[i], STATIC)] if point.gap[i] <= zero else []
         elif state == STATIC:
-            gains = [(y_normal[i], SEPARATE)] if f_n[i] <= zero else []
-            if cone[i] <= zero:
+            gains = [(held.gap[i], SEPARATE)] if point.normal[i] <= zero else []
+            if point.cone[i] <= zero:
                 # Raising lambda opens every direction's row; friction stays where it is largest.
-                gains.append((max(y_lambda[i], y_slip[i].max()), int(np.argmax(f_t[i]))))
+                gains.append((max(held.slip[i], held.drift[i].max()), int(np.argmax(point.friction[i]))))
         else:
-            gains = [(y_cone[i], STATIC)] if lam[i] <= zero else []
-            gains += [(y_normal[i], SEPARATE)] if f_n[i] <= zero else []
-            gains += [(y_friction[i, j], j) for j in range(nd) if j != k and w_t[i, j] <= zero]
-        pivots += [(float(gain), i, int(new)) for gain, new in gains if gain > zero]
-    return sorted(pivots, key=lambda p: -p[0])
+            gains = [(held.cone[i], STATIC)] if point.slip[i] <= zero else []
+            gains += [(held.gap[i], SEPARATE)] if point.normal[i] <= zero else []
+            gains += [(held.friction[i, j], j) for j in range(nd) if j != k and point.drift[i, j] <= zero]
+        pivots += [Pivot(float(gain), i, int(new)) for gain, new in gains if gain > zero]
+    return sorted(pivots, key=lambda pivot: -pivot.gain)

@@ -248,6 +248,6 @@ def _move(search: _Search, *, together: bool) -> None:
 
 def _moved(states: np.ndarray, pivots: list[Pivot]) -> np.ndarray:
     moved = states.copy()
-    for _, contact, state in pivots:
-        moved[contact] = state
+    for pivot in pivots:
+        moved[pivot.contact] = pivot.state
     return moved
