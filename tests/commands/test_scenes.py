@@ -28,7 +28,7 @@ from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene, viewin
 from egs_warp.render import render
 from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane, reach_across
 from egs_warp.segmentation.object_mask import ObjectSpec, masks_from_selection
-from tests.segmentation.test_object_mask import FLOOR, ball_on_floor
+from tests.support.scenes import FLOOR, ball_on_floor
 
 
 @pytest.fixture(scope="module")

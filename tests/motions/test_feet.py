@@ -12,8 +12,7 @@ from egs_warp.errors import UserError
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.feet import feet_around, find_feet, foot_of_node
 from egs_warp.motions.footfalls import footfalls
-from tests.muscles.test_skeleton import figure, stool
-from tests.support.meshes import block_mesh
+from tests.support.meshes import block_mesh, figure, stool
 
 STOOL = stool()
 FEET = find_feet(STOOL, STOOL.nodes[:, 2], 0.8)

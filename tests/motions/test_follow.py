@@ -17,8 +17,7 @@ from egs_warp.motions.follow import Follow, FollowPhase
 from egs_warp.motions.keyframes import Key, Quantity
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.stance import Ground
-from tests.muscles.test_skeleton import figure, stool
-from tests.support.meshes import block_mesh
+from tests.support.meshes import block_mesh, figure, stool
 
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 DT = 1 / 60

@@ -18,7 +18,7 @@ from egs_warp.motions.sequence import Place
 from egs_warp.motions.stance import Ground
 from egs_warp.motions.walk import Walk, WalkPhase
 from egs_warp.muscles.muscle_set import automatic_muscles
-from tests.muscles.test_skeleton import UP, figure, stool
+from tests.support.meshes import UP, figure, stool
 
 FLOOR = Plane(UP, 0.0)
 DT = 1 / 60

@@ -16,23 +16,7 @@ from egs_warp.geometry.tetmesh import TetMesh, edge_graph
 from egs_warp.muscles.attachments import attachment_rows
 from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.muscle_set import MuscleColumns, MuscleSet, attach_fibres, automatic_muscles, muscle_columns
-
-
-def box_mesh(counts: tuple[int, int, int], size: tuple[float, float, float]) -> TetMesh:
-    """A box with its base centred at the origin, each of its cells cut into six tetrahedra."""
-    grid = np.stack(np.meshgrid(*[np.arange(n + 1) for n in counts], indexing="ij"), axis=-1)
-    nodes = (grid / np.array(counts) * np.array(size) - [size[0] / 2, size[1] / 2, 0.0]).reshape(-1, 3)
-    index = np.arange(len(nodes)).reshape(grid.shape[:3])
-    cells = np.stack(
-        [index[a : a + counts[0], b : b + counts[1], c : c + counts[2]].ravel() for a, b, c in np.ndindex(2, 2, 2)],
-        axis=1,
-    )
-    # Cells mirror their neighbours, so that the mesh prefers no diagonal and mirrors in x = 0 and y = 0.
-    odd = np.stack(np.meshgrid(*[np.arange(n) % 2 for n in counts], indexing="ij"), axis=-1).reshape(-1, 3) @ [4, 2, 1]
-    cells = np.take_along_axis(cells, np.arange(8)[None] ^ odd[:, None], axis=1)
-    paths = [(0, 1, 3, 7), (0, 1, 5, 7), (0, 2, 3, 7), (0, 2, 6, 7), (0, 4, 5, 7), (0, 4, 6, 7)]
-    return TetMesh.oriented(nodes, np.concatenate([cells[:, path] for path in paths]))
-
+from tests.support.meshes import box_mesh
 
 COLUMN = box_mesh((4, 4, 10), (0.4, 0.4, 1.0))
 

@@ -13,7 +13,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.muscle_set import MuscleSet, attach_fibres, muscle_columns
 from egs_warp.muscles.tension import MuscleTension
-from tests.muscles.test_muscle_set import box_mesh
+from tests.support.meshes import box_mesh
 
 ROD = box_mesh((2, 2, 14), (0.08, 0.08, 1.0))
 

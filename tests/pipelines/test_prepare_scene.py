@@ -16,7 +16,7 @@ from egs_warp.io import read_capture, write_ply
 from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene
 from egs_warp.segmentation.clearance import Clearing
 from egs_warp.segmentation.object_mask import ObjectSpec
-from tests.segmentation.test_object_mask import ball_on_floor
+from tests.support.scenes import ball_on_floor
 
 
 @pytest.fixture(scope="module")
