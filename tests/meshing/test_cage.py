@@ -190,11 +190,24 @@ def test_target_nodes() -> None:
         build_cage(thing.cloud, thing.plane, target_nodes=3)
 
 
-@pytest.mark.slow
 def test_tetwild() -> None:
-    """fTetWild keeps the same promises where it is chosen."""
+    """fTetWild itself, not the lattice it falls back to, keeps the same promises and fills the same solid."""
     thing = pawn(gaussian_count=6000)
-    _check(build_cage(thing.cloud, thing.plane, method=CageMethod.TETWILD), thing.plane)
+    cage = build_cage(thing.cloud, thing.plane, method=CageMethod.TETWILD)
+    _check(cage, thing.plane)
+    assert cage.method is CageMethod.TETWILD
+    lattice = build_cage(thing.cloud, thing.plane)
+    assert cage.mesh.volumes().sum() == pytest.approx(lattice.mesh.volumes().sum(), rel=0.1)
+    assert not np.array_equal(cage.mesh.tets, lattice.mesh.tets)
+
+
+def test_where_tetwild_fails_the_lattice_stands_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The cage says who made it."""
+    monkeypatch.setattr("egs_warp.meshing.cage.tetwild", lambda *_: None)
+    thing = pawn(gaussian_count=6000)
+    cage = build_cage(thing.cloud, thing.plane, method=CageMethod.TETWILD)
+    assert cage.method is CageMethod.VOXEL
+    assert np.array_equal(cage.mesh.tets, build_cage(thing.cloud, thing.plane).mesh.tets)
 
 
 @settings(max_examples=25, deadline=None)
