@@ -49,7 +49,7 @@ def test_a_wrong_formula_is_noticed(copy: Path, mutation: Mutation) -> None:
     command = [sys.executable, "-m", "pytest", "-q", "-x", "--tb=native", "-p", "no:cacheprovider", mutation.test]
     environment = os.environ | {"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
     try:
-        run = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, timeout=300)
+        run = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, timeout=900)
     finally:
         place.write_text(right)
     assert run.returncode == 1 and "AssertionError" in run.stdout, f"{mutation.test} does not notice\n{run.stdout}"

@@ -164,7 +164,7 @@ BESIDE_THE_PAPER: list[Mutation] = [
             "training/test_finetune.py::test_the_noise_of_mcmc_has_the_covariance_of_the_shape_squared",
         ),
         (
-            *("MCMC's noise: the axes", "training/relocation.py", '"nji,nj->ni", axes', '"nij,nj->ni", axes'),
+            *("MCMC's noise: the axes", "training/relocation.py", '"nij,nj->ni", axes', '"nji,nj->ni", axes'),
             "training/test_finetune.py::test_the_noise_of_mcmc_has_the_covariance_of_the_shape_squared",
         ),
         (
