@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ def _third_axes(cloud: GaussianCloud) -> np.ndarray:
 
 
 @pytest.mark.parametrize("make", _OBJECTS)
-def test_object_stands_on_its_plane(make, device: str) -> None:
+def test_object_stands_on_its_plane(make: Callable[..., BuiltInObject], device: str) -> None:
     """One unit tall, SH with a view-dependent part, flat splats, a base that straddles the plane by a little."""
     thing: BuiltInObject = make(device=device)
     cloud = thing.cloud
@@ -48,7 +49,7 @@ def test_object_stands_on_its_plane(make, device: str) -> None:
 
 
 @pytest.mark.parametrize("make", _OBJECTS)
-def test_object_has_a_cage(make) -> None:
+def test_object_has_a_cage(make: Callable[..., BuiltInObject]) -> None:
     """Every built-in object gets a cage that keeps all promises."""
     thing: BuiltInObject = make()
     cage = build_cage(thing.cloud, thing.plane)

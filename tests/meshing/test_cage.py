@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -101,7 +102,7 @@ def test_same_bits_in_another_process() -> None:
 @pytest.mark.parametrize(
     ("name", "up"), [("monkey.ply", (0, 1, 0)), ("plush_dog.ply", (0, -1, 0)), ("robot.spz", (0, 1, 0))]
 )
-def test_real_captures(data_dir, name: str, up: tuple[int, int, int]) -> None:
+def test_real_captures(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:
     """Every real object gets a cage that keeps all promises."""
     cloud = read_capture(data_dir / "objects" / name).cloud
     plane = find_base_plane(cloud, np.array(up, float))

@@ -9,6 +9,8 @@ import pytest
 
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
+from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.leap import Leap
 from egs_warp.motions.repertoire import check_possible, longest, parts_of
 from egs_warp.motions.script import parse_script
@@ -48,7 +50,7 @@ class Waits:
     def __init__(self, place: Place) -> None:
         self.place, self.phase, self.steps = place, Phase.GO, 0
 
-    def objectives(self, state, report, dt):
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
         self.steps += 1
         self.phase = Phase.REST if self.steps >= 3 else Phase.GO
         return []

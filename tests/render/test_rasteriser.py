@@ -144,6 +144,7 @@ def test_median_depth_and_normal(device: str) -> None:
     camera = camera_of()
     image = render(cloud_of(values, device), camera, geometry=True)
     twin = render_twin(values, camera)
+    assert image.normal is not None and image.median_depth is not None
     assert np.abs(image.normal.numpy() - twin["normal"]).mean() < 1e-5
     # A rounding in the transmittance can move the median to the next splat in a few pixels.
     assert (np.abs(image.median_depth.numpy() - twin["median_depth"]) > 1e-4).mean() < 2e-3

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -132,7 +134,7 @@ def test_loss_is_the_sum_over_straddling_gaussians() -> None:
         assert (straddling & (heights > 0.0)).any() and (straddling & (heights < 0.0)).any()
         inputs = [leaves[name] for name in ("means", "rotations", "log_scales")]
 
-        def value(means, rotations, log_scales, reach=reach):
+        def value(means: Any, rotations: Any, log_scales: Any, reach: Reach = reach) -> Any:
             tensors = GaussianTensors(means, rotations, log_scales, leaves["opacity_logits"], **rest)
             return straddling_loss(tensors, near, normal, PLANE.offset, reach)
 
@@ -170,5 +172,6 @@ def test_finetuning_clears_the_plane_and_keeps_the_looks() -> None:
     camera = Camera.look_at(np.array([0.3, -3.0, 1.0]), np.array([0.0, 0.0, 0.5]), floor.normal, width=96, height=96)
     view = views_above(ball, floor, [camera])[0]
     pictures = [render(one, camera, background=(0.0, 0.0, 0.0)).colour.numpy() for one in (ball, tuned)]
+    assert view.weight is not None
     counted = view.weight[..., None] > 0
     assert psnr(np.where(counted, pictures[0], 0.0), np.where(counted, pictures[1], 0.0)) > 30.0
