@@ -47,6 +47,8 @@ class Phase(Enum):
 class Waits:
     """Rests after three steps."""
 
+    phase: Enum
+
     def __init__(self, place: Place) -> None:
         self.place, self.phase, self.steps = place, Phase.GO, 0
 
@@ -70,9 +72,10 @@ def test_motions_follow_each_other_from_where_the_body_is(place: Place) -> None:
         positions = moved(place, 0.1 * k, np.array([0.1 * k, 0.0, 0.0]))
         sequence.objectives(BodyState(positions, 0 * positions, times[-1]), None, DT)
         times.append(times[-1] + DT)
-    first, second = sequence.done
-    assert first.motion.place is place
-    assert np.allclose(second.motion.place.ground.axes[0], [np.cos(0.3), np.sin(0.3), 0.0])
+    first, second = (done.motion for done in sequence.done)
+    assert isinstance(first, Waits) and isinstance(second, Waits)
+    assert first.place is place
+    assert np.allclose(second.place.ground.axes[0], [np.cos(0.3), np.sin(0.3), 0.0])
     assert sequence.spans(np.array(times)) == [(0, 3), (3, 8)]
 
 

@@ -43,8 +43,7 @@ def test_a_walk_goes_along_its_feet_and_refuses_other_bodies() -> None:
         Walk(place, 4, 0.1)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("slope", [0.0, 5.0])
+@pytest.mark.parametrize("slope", [0.0, pytest.param(5.0, marks=pytest.mark.slow)])
 def test_a_coarse_stool_takes_a_step(slope: float) -> None:
     """One step, up a slope too, and the closing one: each foot lands once, none slips 2 % of the stride, the distance
     is met, the audit holds."""

@@ -156,7 +156,7 @@ def static_response(
     force = muscle_columns(muscles, COLUMN.nodes) @ activation
     free = np.flatnonzero(~np.broadcast_to(held, COLUMN.nodes.shape).ravel())
     moved = np.zeros(force.shape)
-    moved[free] = spsolve(stiffness[free][:, free], force[free])
+    moved[free] = np.asarray(spsolve(stiffness[free][:, free], force[free]))
     return moved.reshape(-1, 3)
 
 
