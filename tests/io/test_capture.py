@@ -77,7 +77,7 @@ def test_plush_dog_agrees_with_its_compressed_twin(data_dir: Path) -> None:
     def features(cloud: GaussianCloud) -> np.ndarray:
         return np.concatenate([100.0 * cloud.means.numpy(), cloud.log_scales.numpy(), cloud.sh.numpy()[:, 0]], axis=1)
 
-    _, order = KDTree(features(plain)).query(features(packed))
+    order = np.asarray(KDTree(features(plain)).query(features(packed))[1], np.int64)
     assert len(np.unique(order)) == plain.count
     plain = plain.subset(order)
     chunk_of = np.arange(plain.count) // 256
@@ -182,7 +182,7 @@ def test_sorted_in_space_holds_the_same_gaussians(write: Callable[..., None], tm
     for keep_order in (True, False):
         write(tmp_path / f"{keep_order}{'.sog' if write is write_sog else '.ply'}", cloud, keep_order=keep_order)
     kept, moved = (read_capture(path, device="cpu").cloud for path in sorted(tmp_path.iterdir(), reverse=True))
-    distance, order = KDTree(moved.means.numpy()).query(cloud.means.numpy())
+    distance, order = (np.asarray(found) for found in KDTree(moved.means.numpy()).query(cloud.means.numpy()))
     assert sorted(order) == list(range(3000))
     assert np.median(distance) < 1.2 * np.median(np.linalg.norm(kept.means.numpy() - cloud.means.numpy(), axis=1))
     neighbours = np.linalg.norm(np.diff(moved.means.numpy(), axis=0), axis=1)

@@ -163,7 +163,7 @@ def test_work_is_queued_on_torchs_stream() -> None:
         torch.cuda._sleep(50_000_000)
         for to, tensor in zip(moved, tensors, strict=True):
             to.copy_(tensor)
-        got = render_torch(*moved, camera).colour.clone()
+        got = render_torch(*moved, camera=camera).colour.clone()
     side.synchronize()
     assert torch.equal(got, expected)
 
