@@ -1,7 +1,8 @@
-"""``docs/equations.md`` is complete and true: names exist, no equation of a docstring is missing, and a cited test is one.
+"""``docs/equations.md`` is complete and true: names exist, no equation of a docstring is missing, and a cited test is
+one.
 
-A test that only mentions its equation is none: it must call the code of that row, and for each equation one of the row's tests
-is shown to fail when the code of the row is wrong (``tests/test_teeth.py``).
+A test that only mentions its equation is none: it must call the code of that row, and for each equation one of the
+row's tests is shown to fail when the code of the row is wrong (``tests/test_teeth.py``).
 """
 
 from __future__ import annotations

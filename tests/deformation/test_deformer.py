@@ -148,7 +148,8 @@ def test_arms_go_where_their_ends_go(device: str) -> None:
     positions = bent(mesh.nodes, 1.0) + 0.02 * rng.normal(size=mesh.nodes.shape)
     embedding = embed_gaussians(cloud, mesh)
     result = deform(cloud, embedding, positions, max_stretch=1e9).cloud
-    nodes, weights = np.asarray(embedding.points.nodes.numpy(), np.int32), embedding.points.weights.numpy()
+    nodes = np.asarray(embedding.points.nodes.numpy(), np.int32)
+    weights = np.asarray(embedding.points.weights.numpy(), np.float64)
     ends = np.einsum("pk,pki->pi", weights, positions[nodes]).reshape(-1, 7, 3)
     arms = embedding.arms.numpy().astype(float)
     axes = matrices(cloud)

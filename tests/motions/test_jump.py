@@ -14,7 +14,9 @@ GRAVITY, STEP = 9.81, 1 / 60
 @pytest.mark.parametrize("target", [JumpTarget(0.5, 0.3), JumpTarget(0.0, 0.4), JumpTarget(0.9, 0.35, 0.15)])
 @pytest.mark.parametrize("height", [1.0, 1.7])
 def test_a_body_that_does_as_planned_reaches_height_and_distance(target: JumpTarget, height: float) -> None:
-    """Thrust and flight in implicit Euler steps, each at the speed of its end, and the landing as a linear inverted pendulum."""
+    """Thrust and flight in implicit Euler steps, each at the speed of its end, and the landing as a linear inverted
+    pendulum.
+    """
     com_height, ahead = 0.45 * height, 0.2 * height
     plan = plan_jump(
         target,
@@ -43,13 +45,14 @@ def test_a_body_that_does_as_planned_reaches_height_and_distance(target: JumpTar
     assert apex == pytest.approx(target.height, abs=GRAVITY * STEP**2)
     assert time == pytest.approx(plan.flight_time, abs=1.5 * STEP)
 
-    # Way: the lean, half the speed while thrusting, all of it in flight; the rest is what the feet are put down ahead of the body.
+    # Way: the lean, half the speed while thrusting, all of it in flight; the rest is what the feet are put down ahead
+    # of the body.
     way = plan.lean + plan.speed_forward * (0.5 * plan.thrust_time + plan.flight_time)
     assert way + plan.landing_lag == pytest.approx(target.distance)
     assert 0.0 <= plan.lean <= 0.2 * target.distance + 1e-12
 
-    # Landing: over feet 1.3 times as loaded as at rest the body comes to a stop. In a jump ahead they push from 0.3 of the way to
-    # their front, which saves the body that much of its way.
+    # Landing: over feet 1.3 times as loaded as at rest the body comes to a stop. In a jump ahead they push from 0.3 of
+    # the way to their front, which saves the body that much of its way.
     fall_rate = np.sqrt(1.3 * GRAVITY / com_height)
     pivot = plan.speed_forward / fall_rate - plan.landing_lag
     assert pivot == pytest.approx(0.3 * ahead if target.distance else 0.0, abs=1e-12)

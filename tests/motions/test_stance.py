@@ -18,7 +18,9 @@ GRAVITY, EDGE = 9.81, 0.2
 def test_the_nearest_acceleration_that_does_not_tip(
     place: Place, wanted: tuple[float, float], up: float, margin: float
 ) -> None:
-    """The ground's force on a body that neither turns nor tips points through its centre of mass, from inside the footprint."""
+    """The ground's force on a body that neither turns nor tips points through its centre of mass, from inside the
+    footprint.
+    """
     pose = PoseFamily(place.body, place.ground, place.standing, place.touching)
     positions = place.standing + np.array([0.05, -0.03, 0.1]) * (place.standing[:, 2:] > 1e-9)
     seen = pose.measure(BodyState(positions, np.zeros_like(positions)), None)

@@ -57,10 +57,11 @@ def test_a_slippery_floor_takes_more_jumps(place: Place) -> None:
 
 @pytest.mark.parametrize("points", ["disc", "rim"])
 def test_the_largest_turn_is_that_of_a_disc_that_twists_on_rough_ground(place: Place, points: str) -> None:
-    """DESIGN 9: a disc pressed down by N resists twisting by 2/3 mu N R; its impulse while thrusting turns the flying body.
+    """DESIGN 9: a disc pressed down by N resists twisting by 2/3 mu N R; its impulse while thrusting turns the flying
+    body.
 
-    Of Coulomb's cone a pyramid of four edges gives 1 / (|cos| + |sin|) in each direction. The body is off the ground for nine
-    tenths of the planned time, within a twentieth.
+    Of Coulomb's cone a pyramid of four edges gives 1 / (|cos| + |sin|) in each direction. The body is off the ground
+    for nine tenths of the planned time, within a twentieth.
     """
     radius, mu = 0.15, 0.5
     angle = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)

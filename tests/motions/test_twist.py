@@ -27,10 +27,11 @@ def inertia_about_up(place: Place, positions: np.ndarray) -> float:
 
 @pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.0 * np.pi])
 def test_a_twist_asks_friction_for_the_spin_that_is_left(place: Place, turn: float) -> None:
-    """In the thrust: the spin that turns the standing body by what is left while it flies, whatever its shape now, and a reserve.
+    """In the thrust: the spin that turns the standing body by what is left while it flies, whatever its shape now, and
+    a reserve.
 
-    What is asked falls in proportion to the angle turned and is nothing a few degrees, which the feet slide on by, before the end.
-    Its own turning is counted beyond half turns.
+    What is asked falls in proportion to the angle turned and is nothing a few degrees, which the feet slide on by,
+    before the end. Its own turning is counted beyond half turns.
     """
     twist = Twist(place, JumpTarget(0.0, 0.2), turn)
     twist.phase = JumpPhase.THRUST
@@ -52,9 +53,11 @@ def test_a_twist_asks_friction_for_the_spin_that_is_left(place: Place, turn: flo
 
 
 def test_in_the_air_the_body_takes_the_width_with_which_its_spin_makes_the_turn(place: Place) -> None:
-    """Angular momentum L is kept: the inertia I (arms in or out) that turns by the angle left in the time left is L t / angle.
+    """Angular momentum L is kept: the inertia I (arms in or out) that turns by the angle left in the time left is L t /
+    angle.
 
-    Nodes are asked to approach that shape at one rate; at the spin that fits the body as it stands they are asked for nothing.
+    Nodes are asked to approach that shape at one rate; at the spin that fits the body as it stands they are asked for
+    nothing.
     """
     turn, speed = 1.5, 2.5
     left = turn - SLIDE

@@ -148,7 +148,9 @@ def free_response(body: SoftBody, muscles: MuscleSet, segments: np.ndarray, shar
 def static_response(
     body: SoftBody, muscles: MuscleSet, segments: np.ndarray, share: float, held: np.ndarray
 ) -> np.ndarray:
-    """(N, 3) linear displacement under a contraction by ``share``, where the freedoms ``held`` (N, 3) or (N, 1) do not move."""
+    """(N, 3) linear displacement under a contraction by ``share``, where the freedoms ``held`` (N, 3) or (N, 1) do not
+    move.
+    """
     upper = body.assembly.matrix(body.assembly.matrix_entries(COLUMN.nodes))
     stiffness = (upper + sparse.triu(upper, 1).T).tocsc()
     activation = np.zeros(muscles.segment_count)
@@ -192,10 +194,11 @@ def test_longitudinal_fibres_shorten_and_on_one_side_bend(column_body: SoftBody,
 
 
 def test_radial_fibres_lengthen_by_poissons_ratio(column_body: SoftBody, column_muscles: MuscleSet) -> None:
-    """Eq. (7), DESIGN 6: a free body that radial fibres thin grows by nu sum(T L) / (E V), exactly, and clamped its top rises.
+    """Eq. (7), DESIGN 6: a free body that radial fibres thin grows by nu sum(T L) / (E V), exactly, and clamped its top
+    rises.
 
-    Forces in equilibrium have the mean stress sum(f x^T) / V, which is -T L along each segment of length L that pulls with T; the
-    mean axial strain is -nu / E times the two lateral stresses.
+    Forces in equilibrium have the mean stress sum(f x^T) / V, which is -T L along each segment of length L that pulls
+    with T; the mean axial strain is -nu / E times the two lateral stresses.
     """
     radial = column_muscles.segments_of_kind(FibreKind.RADIAL)
     share = 0.002
@@ -216,7 +219,9 @@ def test_radial_fibres_lengthen_by_poissons_ratio(column_body: SoftBody, column_
 
 
 def test_radial_fibres_are_diameters_spread_over_length_and_directions(column_muscles: MuscleSet) -> None:
-    """DESIGN 6: level, through the axis, from 0.7 of the way to one side to as far on the other; as many each way on each level."""
+    """DESIGN 6: level, through the axis, from 0.7 of the way to one side to as far on the other; as many each way on
+    each level.
+    """
     ends = column_muscles.end_points(COLUMN.nodes)[
         column_muscles.segments[column_muscles.segments_of_kind(FibreKind.RADIAL)]
     ]

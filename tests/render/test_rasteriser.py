@@ -305,7 +305,7 @@ def test_sorted_lists_equal_counted_ones(spread: float) -> None:
         assert np.array_equal(lists[0].tile_start.numpy(), other.tile_start.numpy())
         for name in ("gaussian_from_intersection", "slot_from_intersection"):
             assert np.array_equal(getattr(lists[0], name).numpy()[:pairs], getattr(other, name).numpy()[:pairs])
-    order = np.asarray(lists[0].gaussian_from_intersection.numpy(), np.int32)[:pairs]
+    order = np.asarray(lists[0].gaussian_from_intersection.numpy()[:pairs], np.int32)
     depth = projected.colour_depth.numpy()[order, 3]
     inner = np.setdiff1d(np.arange(1, pairs), lists[0].tile_start.numpy())
     assert (depth[inner] >= depth[inner - 1]).all()

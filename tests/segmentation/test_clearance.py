@@ -112,7 +112,9 @@ def test_removing_leaves_nothing_across_the_plane() -> None:
 
 
 def test_loss_is_the_sum_over_straddling_gaussians() -> None:
-    """Eq. (21): the sum of eta_seg - |d0| where it is positive, on both sides, with gradients that finite differences confirm."""
+    """Eq. (21): the sum of eta_seg - |d0| where it is positive, on both sides, with gradients that finite differences
+    confirm.
+    """
     torch = pytest.importorskip("torch")
     from egs_warp.segmentation.clearance import straddling_loss
     from egs_warp.training.finetune import GaussianTensors

@@ -1,6 +1,7 @@
 """Deliberately wrong formulas, each with the test that must notice: what ``tests/test_teeth.py`` tries one by one.
 
-A formula of the package that is rewritten has its line rewritten here too: the mutation must still be the formula, wrong.
+A formula of the package that is rewritten has its line rewritten here too: the mutation must still be the formula,
+wrong.
 """
 
 from __future__ import annotations

@@ -115,7 +115,9 @@ def test_relocated_copies_together_look_as_the_one_did(copies: int) -> None:
 
 
 def test_ssim_equals_scikit_images() -> None:
-    """Pixel by pixel the published index: a window of sigma 1.5 and zeros beyond the rim, which scikit-image is given as pixels."""
+    """Pixel by pixel the published index: a window of sigma 1.5 and zeros beyond the rim, which scikit-image is given
+    as pixels.
+    """
     from skimage.metrics import structural_similarity
 
     random = np.random.default_rng(0)
