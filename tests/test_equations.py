@@ -85,7 +85,7 @@ def contents(path: Path) -> tuple[dict[str, ast.stmt], dict[str, tuple[Path, str
 
 
 def names_reached(path: Path, name: str) -> Reached:
-    """Follows calls, fixtures, imports and re-exports by name, as far as they are written in the package and its tests."""
+    """Follows calls, fixtures, imports and re-exports by name, within the package and its tests."""
     reached, open_ends = Reached(), [(path, name)]
     while open_ends:
         path, name = open_ends.pop()

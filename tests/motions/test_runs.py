@@ -66,7 +66,10 @@ def test_a_coarse_run_ends_at_rest_with_all_motions_done(coarse_run: Run) -> Non
 
 
 def run(script: str, **ground: Any) -> tuple[MotionSequence, list[Reached], np.ndarray]:
-    """Simulate ``script``; returns the sequence, what each motion reached, and the nodes at its end. Asserts the audit."""
+    """Simulate ``script``; returns the sequence, what each motion reached, and the nodes at its end.
+
+    Asserts the audit.
+    """
     thing = pawn(device="cpu")
     creature = make_creature(thing.cloud, plane=thing.plane, **ground)
     requests = parse_script(script)
@@ -117,7 +120,10 @@ def test_hops_land_on_their_squares(script: str, ground: dict) -> None:
 
 @pytest.mark.slow
 def test_the_head_follows_its_key_and_the_body_comes_to_rest(tmp_path: Path) -> None:
-    """The key asks for 0.05; measured on two cores, it is missed by 0.0002. A body that only stands misses it by 0.05."""
+    """The key asks for 0.05; measured on two cores, it is missed by 0.0002.
+
+    A body that only stands misses it by 0.05.
+    """
     file = tmp_path / "keys.csv"
     file.write_text("time,part,quantity,x,y,z\n0.5,head,position,0.05,0,0\n")
     sequence, (reached,), (end,) = run(f"trajectory {file}")
