@@ -79,7 +79,7 @@ def test_colour_turns_exactly_where_euler_angles_are_arbitrary(device: str) -> N
             3,
         ],
         outputs=[result],
-        device=result.device,
+        device=wp.get_device(device),
     )
     turned = result.numpy().astype(np.float64)
     turned[:, 0] = sh[:, 0]
