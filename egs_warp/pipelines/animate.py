@@ -106,7 +106,7 @@ def animate(
     ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.motions.script``).
     ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
     the object to the camera. ``muscles_file``, ``solids``, ``gravity_up`` and ``settings``: see ``make_creature``;
-    ``forward`` (3,): see ``first_place``. Returns what it wrote as ``report.json`` (docs/report.md). Raises
+    ``forward`` (3,): see ``first_place``. Returns what it wrote as ``report.json`` (docs/guide/report.md). Raises
     ``UserError`` for bad input, before any file of an earlier run is touched.
     """
     options = options or AnimateOptions()

@@ -4,6 +4,9 @@ within bands.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -13,38 +16,30 @@ from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.io import read_capture
-from egs_warp.locomotion.rollout import Simulation, simulate
+from egs_warp.locomotion.rollout import Simulation
 from egs_warp.locomotion.trajectory import measure
-from egs_warp.motions.repertoire import longest, parts_of
-from egs_warp.motions.script import parse_script
-from egs_warp.motions.sequence import MotionSequence
+from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import FILMED_FROM, Creature, first_place, make_creature
-from egs_warp.render.rasteriser import render
+from egs_warp.pipelines.performance import simulate
+from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.base_plane import find_base_plane
 from tests.support.frames import TURN, Lying
 
 
 def jump(lying: Lying, *, frames: int | None = None, by_up: bool = False) -> tuple[Creature, Simulation]:
     """The first ``frames`` of a jump, or all of it; the plane is given, or found from up alone."""
-    creature = make_creature(lying.cloud, **({"up": lying.up} if by_up else {"plane": lying.plane}))
-    requests = parse_script("jump")
-    sequence = MotionSequence(first_place(creature), parts_of(requests, creature.body.height))
-    simulation = simulate(
-        creature.stepper,
-        creature.geometry,
-        creature.start,
-        sequence,
-        frames=frames or longest(requests),
-        finished=lambda: frames is None and sequence.finished,
-    )
-    return creature, simulation
+    if by_up:
+        creature = make_creature(lying.cloud, up=lying.up)
+    else:
+        creature = make_creature(lying.cloud, plane=lying.plane)
+    return creature, simulate(creature, motion("jump"), frames=frames).simulation
 
 
 def pictures(creature: Creature, positions: np.ndarray) -> np.ndarray:
     """(4, H, W, 3) of the creature carried to node ``positions``, from cameras that its own frame holds."""
     carried = deform(creature.cloud, embed_gaussians(creature.cloud, creature.cage.mesh), positions).cloud
     cameras = ring_cameras(GROUND, np.array([0.0, 0.0, 0.5]), 0.8, count=4, size=96)
-    return np.stack([render(carried, camera).colour.numpy() for camera in cameras])
+    return np.stack([render_gaussians(carried, camera).colour.numpy() for camera in cameras])
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +62,9 @@ def first_steps(thing: Lying) -> tuple[Creature, Simulation]:
     ],
     ids=["shuffled", "x4", "moved"],
 )
-def test_same_bits_however_the_file_lies(thing: Lying, first_steps: tuple[Creature, Simulation], other) -> None:
+def test_same_bits_however_the_file_lies(
+    thing: Lying, first_steps: tuple[Creature, Simulation], other: Callable[[Lying], Lying]
+) -> None:
     creature, simulation = first_steps
     again, simulated = jump(other(thing), frames=2, by_up=True)
     for mine, its in (
@@ -87,7 +84,9 @@ def test_same_bits_however_the_file_lies(thing: Lying, first_steps: tuple[Creatu
 @pytest.mark.parametrize(
     "other", [lambda thing: thing.scaled(0.37), lambda thing: thing.turned()], ids=["x0.37", "turned"]
 )
-def test_same_pictures_in_any_unit_and_turned(thing: Lying, first_steps: tuple[Creature, Simulation], other) -> None:
+def test_same_pictures_in_any_unit_and_turned(
+    thing: Lying, first_steps: tuple[Creature, Simulation], other: Callable[[Lying], Lying]
+) -> None:
     creature, simulation = first_steps
     again, simulated = jump(other(thing), frames=2, by_up=True)
     truth = pictures(creature, simulation.trajectory.positions[-1])
@@ -126,7 +125,7 @@ def test_jump_goes_as_far_in_any_unit_and_turned(thing: Lying, name: str) -> Non
 @pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "up"), [("monkey.ply", (0, 1, 0)), ("plush_dog.ply", (0, -1, 0))])
-def test_jump_of_real_captures_goes_as_far(data_dir, name: str, up: tuple[int, int, int]) -> None:
+def test_jump_of_real_captures_goes_as_far(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:
     """Turned and in another unit, with nothing but up: distance and height within 1 %."""
     cloud = read_capture(data_dir / "objects" / name).cloud
     lying = Lying(cloud, find_base_plane(cloud, np.array(up, float)))

@@ -15,7 +15,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io import read_capture
 from egs_warp.render import render_gaussians
-from tests.training.test_finetune import ball, ring
+from tests.support.training_views import ball, ring
 
 pytest.importorskip("torch")
 from egs_warp.pipelines.train_capture import train
