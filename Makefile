@@ -6,7 +6,7 @@ FRAMES ?=
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test setup lint types docs pictures build examples clean
+.PHONY: demo test test-rest test-all setup lint types docs pictures build examples clean
 
 demo: $(VENV)/demo.stamp
 	$(BIN)/python examples/jump.py --out out/jump $(FRAMES:%=--frames %)
@@ -17,8 +17,17 @@ examples: setup
 	done
 	$(BIN)/python examples/finetune.py --out out/finetune $(FRAMES:%=--steps %)
 
+# Two processes, each with one thread: tests that share a simulated run go to the same one.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadgroup
+
 test: setup
-	$(BIN)/python -m pytest
+	$(PYTEST) -m "not (slow or data or example)"
+
+# What "make test" leaves out: long runs, real captures, the examples.
+test-rest: setup
+	$(PYTEST) -m "slow or data or example"
+
+test-all: test test-rest
 
 setup: $(VENV)/setup.stamp
 

@@ -1,12 +1,19 @@
-"""``docs/equations.md`` is complete: names exist, cited tests name their equation,
-no equation of a docstring is missing.
+"""``docs/equations.md`` is complete and true: names exist, no equation of a docstring is missing, and a cited test is
+one.
+
+A test that only mentions its equation is none: it must call the code of that row, and for each equation one of the
+row's tests is shown to fail when the code of the row is wrong (``tests/test_teeth.py``).
 """
 
 from __future__ import annotations
 
 import ast
 import re
+from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
+
+from tests.support.mutations import EQUATIONS
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "equations.md").read_text()
@@ -47,7 +54,63 @@ def definitions(path: Path) -> dict[str, str]:
     return found
 
 
+@dataclass
+class Reached:
+    """What a test uses, directly or through what it uses."""
+
+    definitions: set[tuple[Path, str]] = field(default_factory=set)
+    """(file, function, class or variable)."""
+    words: set[str] = field(default_factory=set)
+    """Every name and attribute in them."""
+
+
+@cache
+def contents(path: Path) -> tuple[dict[str, ast.stmt], dict[str, tuple[Path, str]]]:
+    """The definitions of a file by name, and where its imports come from: (file, name)."""
+    defined: dict[str, ast.stmt] = {}
+    imported: dict[str, tuple[Path, str]] = {}
+    tree = ast.parse(path.read_text())
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            defined[node.name] = node
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+                defined.update({part.id: node for part in ast.walk(target) if isinstance(part, ast.Name)})
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in ("egs_warp", "tests"):
+            base = ROOT.joinpath(*node.module.split("."))
+            file = base / "__init__.py" if base.is_dir() else base.with_suffix(".py")
+            imported.update({alias.asname or alias.name: (file, alias.name) for alias in node.names})
+    return defined, imported
+
+
+def names_reached(path: Path, name: str) -> Reached:
+    """Follows calls, fixtures, imports and re-exports by name, within the package and its tests."""
+    reached, open_ends = Reached(), [(path, name)]
+    while open_ends:
+        path, name = open_ends.pop()
+        if (path, name) in reached.definitions or not path.is_file():
+            continue
+        defined, imported = contents(path)
+        if name in imported:
+            open_ends.append(imported[name])
+        if name not in defined:
+            continue
+        reached.definitions.add((path, name))
+        for node in ast.walk(defined[name]):
+            word = {ast.Name: "id", ast.Attribute: "attr", ast.arg: "arg"}.get(type(node))
+            if word:
+                reached.words.add(getattr(node, word))
+                open_ends.append((path, getattr(node, word)))
+            elif isinstance(node, ast.Assert):
+                reached.words.add("assert")
+        reached.words.add(name)
+    return reached
+
+
 ROWS = table(PAGE)
+PLACE = re.compile(r"`(egs_warp/[\w/]+\.py):([\w.]+)`")
+TEST = re.compile(r"`(tests/[\w/]+\.py)::(\w+)`")
 
 
 def test_the_reader_of_mentions_reads_lists_and_ranges() -> None:
@@ -62,7 +125,7 @@ def test_every_equation_of_the_paper_has_a_row() -> None:
 
 def test_every_place_exists() -> None:
     for number, row in ROWS.items():
-        places = re.findall(r"`(egs_warp/[\w/]+\.py):([\w.]+)`", row)
+        places = PLACE.findall(row)
         assert places, f"Eq. ({number}) names no function"
         for file, name in places:
             assert (ROOT / file).is_file(), f"Eq. ({number}): {file} does not exist"
@@ -71,7 +134,7 @@ def test_every_place_exists() -> None:
 
 def test_every_test_exists_and_names_its_equation() -> None:
     for number, row in ROWS.items():
-        tests = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", row)
+        tests = TEST.findall(row)
         assert tests, f"Eq. ({number}) has no test"
         for file, name in tests:
             known = definitions(ROOT / file)
@@ -79,6 +142,49 @@ def test_every_test_exists_and_names_its_equation() -> None:
             assert number in mentioned(known[name]) | mentioned(known[""]), (
                 f"{file}::{name} does not say Eq. ({number})"
             )
+
+
+def test_every_cited_test_asserts_and_calls_the_code_of_its_row() -> None:
+    for number, row in ROWS.items():
+        places = PLACE.findall(row)
+        for file, name in TEST.findall(row):
+            reached = names_reached(ROOT / file, name)
+            assert {"assert", "raises"} & reached.words or any(w.startswith("assert") for w in reached.words), (
+                f"{file}::{name} asserts nothing"
+            )
+            called = [
+                place
+                for place in places
+                if (ROOT / place[0], place[1].split(".")[0]) in reached.definitions
+                and place[1].split(".")[-1] in reached.words
+            ]
+            assert called, f"{file}::{name} calls none of {places}, so it is no test of Eq. ({number})"
+
+
+def test_the_reader_of_calls_sees_through_helpers_and_knows_a_mention_from_a_call(tmp_path: Path) -> None:
+    file = tmp_path / "test_it.py"
+    file.write_text(
+        "from egs_warp.segmentation.plane_fit import fit_plane\n"
+        "from egs_warp.render import render_gaussians\n"
+        "def helper():\n    return fit_plane([])\n"
+        'def test_mentions():\n    """Eq. (19) fit_plane"""\n    assert True\n'
+        "def test_calls():\n    assert helper()\n"
+    )
+    place = (ROOT / "egs_warp/segmentation/plane_fit.py", "fit_plane")
+    assert place in names_reached(file, "test_calls").definitions
+    assert place not in names_reached(file, "test_mentions").definitions
+
+
+def test_every_equation_has_a_test_that_a_wrong_formula_fails() -> None:
+    for number, row in ROWS.items():
+        mutation = EQUATIONS[number]
+        # A function that a place of the row is made of may be what is wrong.
+        assert mutation.file in {file for file, _ in PLACE.findall(row)}, (
+            f"Eq. ({number}): {mutation.file} is not in its row"
+        )
+        assert tuple(mutation.test.split("::")) in TEST.findall(row), (
+            f"Eq. ({number}): {mutation.test} is not in its row"
+        )
 
 
 def test_every_equation_that_the_package_mentions_has_a_row() -> None:

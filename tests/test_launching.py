@@ -26,7 +26,7 @@ def scaled_kernel(
     more = wp.float32(0.0)
     if extra.shape[0] > 0:
         more = extra[i]
-    result_out[i] = offset + wp.vec3(1.0, 1.0, 1.0) * (values[i] * factor + more)
+    result_out[i] = offset + wp.vec3(1.0, 1.0, 1.0) * (values[i] * factor + more)  # pyright: ignore[reportIndexIssue]
 
 
 def expected(values: np.ndarray, factor: float, offset: tuple, extra: np.ndarray | None) -> np.ndarray:

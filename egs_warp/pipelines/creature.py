@@ -194,7 +194,7 @@ def first_place(creature: Creature, forward: np.ndarray | None = None, *, step: 
     """Where the creature stands at the start; ``forward`` (3,) is the way of its motions in the capture, else the long
     axis of its footprint.
 
-    ``step``: seconds of a solver step, if not the usual (docs/concepts/conventions.md).
+    ``step``: seconds of a solver step, if not the usual (docs/concepts/body.md).
     """
     body, start = creature.body, creature.start
     up = -body.gravity / np.linalg.norm(body.gravity)

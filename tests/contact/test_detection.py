@@ -65,7 +65,8 @@ def test_hull_points_hold_the_lowest_of_all_points(device: str) -> None:
     all_points = embed_points(mesh, seven_points(cloud).reshape(-1, 3), device="cpu")
     assert len(geometry.weights) < 0.25 * all_points.count
     detector = ContactDetector(geometry, device=device)
-    weights, corners = all_points.weights.numpy(), all_points.nodes.numpy()
+    weights = np.asarray(all_points.weights.numpy(), np.float64)
+    corners = np.asarray(all_points.nodes.numpy(), np.int32)
     rng = np.random.default_rng(1)
     for _ in range(50):
         x = mesh.nodes @ rng.standard_normal((3, 3)) + 0.1 * rng.standard_normal(mesh.nodes.shape)

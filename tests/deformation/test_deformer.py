@@ -79,7 +79,7 @@ def test_colour_turns_exactly_where_euler_angles_are_arbitrary(device: str) -> N
             3,
         ],
         outputs=[result],
-        device=result.device,
+        device=wp.get_device(device),
     )
     turned = result.numpy().astype(np.float64)
     turned[:, 0] = sh[:, 0]
@@ -148,7 +148,8 @@ def test_arms_go_where_their_ends_go(device: str) -> None:
     positions = bent(mesh.nodes, 1.0) + 0.02 * rng.normal(size=mesh.nodes.shape)
     embedding = embed_gaussians(cloud, mesh)
     result = deform(cloud, embedding, positions, max_stretch=1e9).cloud
-    nodes, weights = embedding.points.nodes.numpy(), embedding.points.weights.numpy()
+    nodes = np.asarray(embedding.points.nodes.numpy(), np.int32)
+    weights = np.asarray(embedding.points.weights.numpy(), np.float64)
     ends = np.einsum("pk,pki->pi", weights, positions[nodes]).reshape(-1, 7, 3)
     arms = embedding.arms.numpy().astype(float)
     axes = matrices(cloud)
@@ -156,7 +157,7 @@ def test_arms_go_where_their_ends_go(device: str) -> None:
     minus = (ends[:, :1] - ends[:, 4:]) / arms[:, 3:, None]
     gradient = 0.5 * (plus + minus).transpose(0, 2, 1) @ axes.transpose(0, 2, 1)
     sigma = gradient @ covariances(cloud) @ gradient.transpose(0, 2, 1)
-    tets = embedding.points.tets.numpy().reshape(-1, 7)
+    tets = np.asarray(embedding.points.tets.numpy(), np.int32).reshape(-1, 7)
     shared = (mesh.tets[tets][:, 1:, :, None] == mesh.tets[tets][:, :1, None, :]).any(axis=3).sum(axis=2)
     assert (shared == 4).any() and (shared == 3).any() and (shared < 3).any()
     # An arm too short for a difference of float32 positions takes the middle of the two gradients instead.
@@ -219,7 +220,7 @@ def test_no_spike_and_no_nan_whatever_the_cage_does(seed: int, noise: float, fla
     corners, rest = positions[mesh.tets], mesh.nodes[mesh.tets]
     edges, rest_edges = ((x[:, 1:] - x[:, :1]).transpose(0, 2, 1) for x in (corners, rest))
     stretch = np.linalg.svd(edges @ np.linalg.inv(rest_edges))[1][:, 0]
-    around = stretch[embedding.points.tets.numpy().reshape(count, 7)].max(axis=1)
+    around = stretch[np.asarray(embedding.points.tets.numpy(), np.int32).reshape(count, 7)].max(axis=1)
     grown = np.exp(result.cloud.log_scales.numpy().max(axis=1) - cloud.log_scales.numpy().max(axis=1))
     # Columns are held to 1.5 times the stretch; three of them can conspire to sqrt(3) times that.
     assert (grown <= 1.5 * np.sqrt(3.0) * around + 1e-3).all()

@@ -58,7 +58,7 @@ def test_points_are_located_as_by_brute_force(device: str) -> None:
     points[20:25] *= 50.0
     embedding = embed_points(mesh, points, device=device)
     weights, least, distance = brute_force(mesh, points)
-    tets, rows = embedding.tets.numpy(), np.arange(len(points))
+    tets, rows = np.asarray(embedding.tets.numpy(), np.int32), np.arange(len(points))
     inside = least.max(axis=1) >= 0
     assert 15 < inside.sum() < 200
     np.testing.assert_array_equal(embedding.inside.numpy(), inside)
@@ -82,7 +82,7 @@ def test_weights_reproduce_points_and_shared_faces_take_the_lowest_tet(device: s
     embedding = embed_points(far, points, device=device)
     weights = embedding.weights.numpy()
     np.testing.assert_allclose(weights.sum(axis=1), 1.0, rtol=0, atol=4e-15)
-    used = np.einsum("pk,pki->pi", weights, far.nodes[embedding.nodes.numpy()])
+    used = np.einsum("pk,pki->pi", weights, far.nodes[np.asarray(embedding.nodes.numpy(), np.int32)])
     np.testing.assert_allclose(used, points, rtol=0, atol=1e-10)
     assert embedding.inside.numpy().all()
     lowest = np.array([np.flatnonzero((far.tets == node).any(axis=1))[0] for node in range(len(far.nodes))])

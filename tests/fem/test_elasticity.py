@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numpy as np
 import pytest
 import scipy.sparse as sparse
 from scipy.spatial.transform import Rotation
 
-from egs_warp.fem.elasticity import ElasticAssembly, Material
+from egs_warp.fem.elasticity import Damping, ElasticAssembly, Material
 from egs_warp.geometry.tetmesh import TetMesh
 from tests.support.meshes import block_mesh
 
@@ -22,8 +24,11 @@ def full(assembly: ElasticAssembly, entries: np.ndarray) -> np.ndarray:
 DT = 1 / 60
 
 
+Bent: TypeAlias = tuple[ElasticAssembly, np.ndarray, Damping]
+
+
 @pytest.fixture
-def bent(device: str) -> tuple[ElasticAssembly, np.ndarray]:
+def bent(device: str) -> Bent:
     mesh = block_mesh()
     rng = np.random.default_rng(1)
     x = mesh.nodes @ Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix().T
@@ -35,7 +40,7 @@ def bent(device: str) -> tuple[ElasticAssembly, np.ndarray]:
 
 
 @pytest.mark.parametrize("damped", [False, True])
-def test_gradient_is_derivative_of_energy(bent, damped: bool) -> None:
+def test_gradient_is_derivative_of_energy(bent: Bent, damped: bool) -> None:
     """Eq. (5), and with damping over a step of dt Eq. (6): central differences in x."""
     assembly, x, damping = bent
     assert assembly.energy(x, damping) > 1.05 * assembly.energy(x)
@@ -49,9 +54,9 @@ def test_gradient_is_derivative_of_energy(bent, damped: bool) -> None:
 
 
 @pytest.mark.parametrize("damped", [False, True])
-def test_hessian_is_derivative_of_gradient(bent, damped: bool) -> None:
-    """Eq. (5), Eq. (6): central differences of the gradient;
-    the projected matrix lies above the true one where damping turns it.
+def test_hessian_is_derivative_of_gradient(bent: Bent, damped: bool) -> None:
+    """Eq. (5), Eq. (6): central differences of the gradient; the projected matrix lies above the true one where damping
+    turns it.
     """
     assembly, x, damping = bent
     damping = damping if damped else None
@@ -96,7 +101,7 @@ def assembly_gram(corners: np.ndarray) -> np.ndarray:
     return gradients @ gradients.T + np.full((4, 4), 1.0 / 16.0)
 
 
-def test_rigid_motion_costs_nothing(bent) -> None:
+def test_rigid_motion_costs_nothing(bent: Bent) -> None:
     """No energy, force or damping from rotation; internal forces carry no net force or torque."""
     assembly, x, damping = bent
     nodes = assembly.mesh.nodes

@@ -111,7 +111,7 @@ def test_factorisation_solves_and_tests_definiteness(body: SoftBody) -> None:
     entries = step.matrix_entries(state.velocities, projected=True)
     upper = body.assembly.matrix(entries)
     full = upper + sparse.triu(upper, 1).T
-    right = np.random.default_rng(3).standard_normal((upper.shape[0], 5))
+    right = np.random.default_rng(3).standard_normal((state.positions.size, 5))
     assert factorisation.update(entries)
     assert np.abs(full @ factorisation.solve(right) - right).max() < 1e-10
     nodal = right[:, 0].reshape(-1, 3)

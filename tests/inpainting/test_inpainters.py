@@ -34,8 +34,14 @@ def holed() -> tuple[np.ndarray, np.ndarray]:
 
 
 def traced(module: torch.nn.Module, path: Path) -> Path:
-    torch.jit.trace(module, (torch.rand(1, 3, 40, 48), torch.ones(1, 1, 40, 48))).save(str(path))
+    save_traced(module, (torch.rand(1, 3, 40, 48), torch.ones(1, 1, 40, 48)), path)
     return path
+
+
+def save_traced(module: torch.nn.Module, inputs: tuple[torch.Tensor, ...], path: Path) -> None:
+    script = torch.jit.trace(module, inputs)
+    assert isinstance(script, torch.jit.ScriptModule)
+    script.save(str(path))
 
 
 def test_torchscript_is_given_padded_pictures(tmp_path: Path) -> None:
@@ -86,7 +92,7 @@ def test_bad_networks(tmp_path: Path) -> None:
         def forward(self, image: torch.Tensor) -> torch.Tensor:
             return image
 
-    torch.jit.trace(One(), torch.rand(1, 3, 8, 8)).save(str(tmp_path / "one.pt"))
+    save_traced(One(), (torch.rand(1, 3, 8, 8),), tmp_path / "one.pt")
     with pytest.raises(UserError, match=r"one\.pt: the network failed on an image") as caught:
         TorchScriptInpainter(tmp_path / "one.pt").fill(image, hole, ~hole)
     assert "\n" not in str(caught.value)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -165,7 +166,7 @@ def colmap_binary(folder: Path, *, model: int = 1) -> None:
 
 
 @pytest.mark.parametrize("write", [colmap_text, colmap_binary])
-def test_colmap_by_hand(write, tmp_path: Path) -> None:
+def test_colmap_by_hand(write: Callable[[Path], None], tmp_path: Path) -> None:
     write(tmp_path / "sparse" / "0")
     (tmp_path / "images" / "sub").mkdir(parents=True)
     (tmp_path / "images" / "sub" / "with space.jpg").write_bytes(b"")

@@ -46,3 +46,21 @@ def test_damage_is_named(tmp_path: Path, facts: dict[str, object], message: str)
     with pytest.raises(UserError) as error:
         read_planes(path)
     assert str(error.value) == f"{path}: {message}"
+
+
+def test_plane_files_are_checked(tmp_path: Path) -> None:
+    path = tmp_path / "plane.json"
+    planes = [FLOOR, Plane.from_coefficients(0.0, 1.0, 0.0, 2.0)]
+    write_planes(path, [KnownPlane(planes[0], noise=0.01), KnownPlane(planes[1])])
+    for one, other in zip((known.plane for known in read_planes(path)), planes, strict=True):
+        np.testing.assert_allclose([*one.normal, one.offset], [*other.normal, other.offset])
+    for text, message in (
+        ("{", "not readable JSON"),
+        ("[]", "it has no planes"),
+        ('{"planes": [{"normal": [1, 2]}]}', "plane 0 needs normal"),
+        ('{"planes": [{"normal": [0, 0, 0], "offset": 1}]}', "a normal that is not zero"),
+        (f'{{"planes": [{{"normal": [0, 0, {401 * "1"}], "offset": 1}}]}}', "give four finite numbers"),
+    ):
+        path.write_text(text)
+        with pytest.raises(UserError, match=message):
+            read_planes(path)

@@ -63,7 +63,8 @@ def test_unwritable_places_are_named(tmp_path: Path) -> None:
 def test_png_is_lossless_and_in_rgb_order(tmp_path: Path) -> None:
     image = smooth_frames(1, 13, 17)[0]
     write_png(tmp_path / "p.png", image)
-    assert np.array_equal(cv2.imread(str(tmp_path / "p.png"))[..., ::-1], image)
+    read = cv2.imread(str(tmp_path / "p.png"))
+    assert read is not None and np.array_equal(read[..., ::-1], image)
 
 
 def test_contact_sheet_places_frames_and_writes_labels() -> None:

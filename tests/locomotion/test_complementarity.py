@@ -12,6 +12,7 @@ from egs_warp.locomotion.complementarity import (
     SEPARATE,
     STATIC,
     ContactLayout,
+    Pivot,
     plain_pivots,
     proposed_pivots,
     states_from_prediction,
@@ -147,7 +148,7 @@ def test_moves_name_the_contact_that_helps() -> None:
     layout = ContactLayout(0, 1, 4)
     zeros, lam = np.zeros(6), slice(5, 6)
 
-    def moves(state: int, x: np.ndarray, w: np.ndarray, **rows: float) -> list[tuple[float, int, int]]:
+    def moves(state: int, x: np.ndarray, w: np.ndarray, **rows: float) -> list[Pivot]:
         y = np.zeros(12)
         for name, value in rows.items():
             y[{"f_n": 0, "f_3": 4, "c": 6, "w_0": 7, "w_1": 8, "cone": 11}[name]] = value

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
@@ -42,7 +45,7 @@ def shaken_state(seed: int = 3) -> BodyState:
     return BodyState(nodes + 0.02 * rng.standard_normal(nodes.shape), rng.standard_normal(nodes.shape))
 
 
-def rate_of(quantity, state: BodyState, velocities: np.ndarray) -> np.ndarray:
+def rate_of(quantity: Callable[[np.ndarray], Any], state: BodyState, velocities: np.ndarray) -> np.ndarray:
     """d quantity(positions) / dt by a central difference along ``velocities`` (N, 3)."""
     return (quantity(state.positions + NEAR * velocities) - quantity(state.positions - NEAR * velocities)) / (2 * NEAR)
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import builtins
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -119,7 +121,7 @@ def test_daqp_is_optional(monkeypatch: pytest.MonkeyPatch) -> None:
     """The engine does not need DAQP; whoever asks for it without having it is told what to do."""
     real = builtins.__import__
 
-    def without(name: str, *rest, **options):
+    def without(name: str, *rest: Any, **options: Any) -> ModuleType:
         if name == "daqp":
             raise ImportError(name)
         return real(name, *rest, **options)

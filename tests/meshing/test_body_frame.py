@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -51,7 +54,7 @@ def its_cage(thing: Lying) -> Cage:
     ],
     ids=["shuffled", "x64", "x1/8", "moved", "all three"],
 )
-def test_same_bits_however_the_file_lies(thing: Lying, its_cage: Cage, other) -> None:
+def test_same_bits_however_the_file_lies(thing: Lying, its_cage: Cage, other: Callable[[Lying], Lying]) -> None:
     changed = other(thing)
     assert not np.array_equal(changed.cloud.means.numpy(), thing.cloud.means.numpy())
     _, cage = body_cage(changed)
@@ -64,7 +67,7 @@ def test_same_bits_however_the_file_lies(thing: Lying, its_cage: Cage, other) ->
     [lambda thing: thing.scaled(0.37), lambda thing: thing.turned(), lambda thing: thing.turned().scaled(0.37)],
     ids=["x0.37", "turned", "both"],
 )
-def test_same_cage_in_any_unit_and_turned(thing: Lying, its_cage: Cage, other) -> None:
+def test_same_cage_in_any_unit_and_turned(thing: Lying, its_cage: Cage, other: Callable[[Lying], Lying]) -> None:
     """What rounding leaves: the same tetrahedra, nodes within 1e-5 of the height; before, 3e-2."""
     _, cage = body_cage(other(thing))
     assert np.array_equal(cage.mesh.tets, its_cage.mesh.tets)
@@ -153,7 +156,7 @@ def test_there_and_back() -> None:
 @pytest.mark.data
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "up"), [("monkey.ply", (0, 1, 0)), ("plush_dog.ply", (0, -1, 0))])
-def test_real_captures(data_dir, name: str, up: tuple[int, int, int]) -> None:
+def test_real_captures(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:
     """Shuffled and in a unit of a power of two the same bits; turned and in any unit the same tetrahedra."""
     cloud = read_capture(data_dir / "objects" / name).cloud
     lying = Lying(cloud, find_base_plane(cloud, np.array(up, float)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -101,7 +102,7 @@ def test_same_bits_in_another_process() -> None:
 @pytest.mark.parametrize(
     ("name", "up"), [("monkey.ply", (0, 1, 0)), ("plush_dog.ply", (0, -1, 0)), ("robot.spz", (0, 1, 0))]
 )
-def test_real_captures(data_dir, name: str, up: tuple[int, int, int]) -> None:
+def test_real_captures(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:
     """Every real object gets a cage that keeps all promises."""
     cloud = read_capture(data_dir / "objects" / name).cloud
     plane = find_base_plane(cloud, np.array(up, float))
@@ -190,11 +191,24 @@ def test_target_nodes() -> None:
         build_cage(thing.cloud, thing.plane, target_nodes=3)
 
 
-@pytest.mark.slow
 def test_tetwild() -> None:
-    """fTetWild keeps the same promises where it is chosen."""
+    """fTetWild itself, not the lattice it falls back to, keeps the same promises and fills the same solid."""
     thing = pawn(gaussian_count=6000)
-    _check(build_cage(thing.cloud, thing.plane, method=CageMethod.TETWILD), thing.plane)
+    cage = build_cage(thing.cloud, thing.plane, method=CageMethod.TETWILD)
+    _check(cage, thing.plane)
+    assert cage.method is CageMethod.TETWILD
+    lattice = build_cage(thing.cloud, thing.plane)
+    assert cage.mesh.volumes().sum() == pytest.approx(lattice.mesh.volumes().sum(), rel=0.1)
+    assert not np.array_equal(cage.mesh.tets, lattice.mesh.tets)
+
+
+def test_where_tetwild_fails_the_lattice_stands_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The cage says who made it."""
+    monkeypatch.setattr("egs_warp.meshing.cage.tetwild", lambda *_: None)
+    thing = pawn(gaussian_count=6000)
+    cage = build_cage(thing.cloud, thing.plane, method=CageMethod.TETWILD)
+    assert cage.method is CageMethod.VOXEL
+    assert np.array_equal(cage.mesh.tets, build_cage(thing.cloud, thing.plane).mesh.tets)
 
 
 @settings(max_examples=25, deadline=None)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from egs_warp.errors import UserError
+from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.feet import feet_around, find_feet, foot_of_node
 from egs_warp.motions.footfalls import footfalls
-from tests.muscles.test_skeleton import figure, stool
-from tests.support.meshes import block_mesh
+from tests.support.meshes import block_mesh, figure, stool
 
 STOOL = stool()
 FEET = find_feet(STOOL, STOOL.nodes[:, 2], 0.8)
@@ -43,7 +43,7 @@ def test_feet_are_named_around_the_body() -> None:
 
 
 @pytest.mark.parametrize(("mesh", "height", "count"), [(block_mesh(), 1.0, 1), (figure(), 1.4, 2)])
-def test_other_bodies_have_other_numbers_of_feet_and_do_not_walk(mesh, height: float, count: int) -> None:
+def test_other_bodies_have_other_numbers_of_feet_and_do_not_walk(mesh: TetMesh, height: float, count: int) -> None:
     feet = find_feet(mesh, mesh.nodes[:, 2], height)
     assert len(feet) == count
     with pytest.raises(UserError, match=f"walk: a walk needs four separate feet, the body has {count}"):

@@ -1,45 +1,21 @@
-"""Motions in a row, and leaps to a place, on a block that is posed by hand:
-geometry and bookkeeping without a simulation.
-"""
+"""Motions in a row on a block that is posed by hand: geometry and bookkeeping without a simulation."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from egs_warp.contact.terrain import Solid, step
 from egs_warp.errors import UserError
-from egs_warp.fem.body import BodyState, make_body
-from egs_warp.geometry.plane import Plane
-from egs_warp.motions.hop import Hop, Squares
-from egs_warp.motions.jump import Jump, JumpPhase
+from egs_warp.fem.body import BodyState
+from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.stepper import StepReport
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence, Part, Place
-from egs_warp.motions.stance import Ground, sole_shares
 from egs_warp.motions.turn import Turn
-from egs_warp.motions.twist import Turning, twist
-from tests.support.meshes import block_mesh
-
-FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
-FORWARD = np.array([1.0, 0.0, 0.0])
-DT = 1 / 60
-
-
-@pytest.fixture
-def place() -> Place:
-    mesh = block_mesh()
-    body = make_body(mesh, FLOOR, device="cpu")
-    standing = mesh.nodes - [0.0, 0.0, mesh.nodes[:, 2].min()]
-    ground = Ground.on(FLOOR, FORWARD, body.centre_of_mass(standing))
-    return Place(body, ground, standing, standing[standing[:, 2] < 1e-9], DT, (Solid((FLOOR,)),))
-
-
-def moved(place: Place, angle: float, shift: np.ndarray) -> np.ndarray:
-    com = place.body.centre_of_mass(place.standing)
-    return com + (place.standing - com) @ place.ground.turn(angle).T + shift
+from tests.support.places import DT, moved
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.7, -2.5, np.pi])
@@ -72,14 +48,14 @@ class Waits:
     def resting(self) -> bool:
         return self.steps >= 3
 
-    def objectives(self, state, report, dt):
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
         self.steps += 1
         return []
 
     def planned(self) -> JumpTarget:
         return JumpTarget(0.0, 0.0)
 
-    def reached(self, trajectory, first, last) -> None:
+    def reached(self, trajectory: Trajectory, first: int, last: int) -> None:
         return None
 
     def notes(self) -> list[str]:
@@ -94,9 +70,10 @@ def test_motions_follow_each_other_from_where_the_body_is(place: Place) -> None:
         positions = moved(place, 0.1 * k, np.array([0.1 * k, 0.0, 0.0]))
         sequence.objectives(BodyState(positions, 0 * positions, times[-1]), None, DT)
         times.append(times[-1] + DT)
-    first, second = sequence.done
-    assert first.motion.place is place
-    assert np.allclose(second.motion.place.ground.axes[0], [np.cos(0.3), np.sin(0.3), 0.0])
+    first, second = (done.motion for done in sequence.done)
+    assert isinstance(first, Waits) and isinstance(second, Waits)
+    assert first.place is place
+    assert np.allclose(second.place.ground.axes[0], [np.cos(0.3), np.sin(0.3), 0.0])
     assert sequence.spans(np.array(times)) == [(0, 3), (3, 8)]
 
 
@@ -131,100 +108,3 @@ def test_a_script_becomes_parts(place: Place) -> None:
     jump = parts[4].begin(place)
     assert isinstance(jump, Jump) and jump.target.distance == pytest.approx(0.5 * place.body.height)
     assert script.frames() == 3 * motion("hop").frames() + motion("twist, jump x2").frames()
-
-
-def test_hops_aim_at_squares_from_where_the_feet_are(place: Place) -> None:
-    """A hop that fell short and went aside is made up by the next; a square on a step is jumped up to."""
-    height = place.body.height
-    row = Squares(0.7, 0.2, 3, {"distance": 0.7})
-    begin = [part.begin for part in row.parts()]
-    first = begin[0](place)
-    assert isinstance(first, Hop) and first.jump.target.distance == pytest.approx(0.7)
-    feet = sole_shares(place.body, place.ground, place.standing) @ place.standing
-    assert np.allclose(first.square, feet + [0.7, 0.0, 0.0])
-    again = begin[1](place.now(moved(place, 0.0, np.array([0.6, 0.1, 0.0]))))
-    assert isinstance(again, Hop) and again.jump.target.distance == pytest.approx(np.hypot(0.8, 0.1))
-    assert np.allclose(again.jump.ground.axes[0] * np.hypot(0.8, 0.1), [0.8, -0.1, 0.0])
-    assert again.miss(moved(place, 0.0, np.array([1.43, 0.04, 0.2]))) == pytest.approx(0.05)
-
-    stair = step(FLOOR, np.array([0.4, 0.0, 0.0]), FORWARD, 0.2 * height)
-    stairs = Place(place.body, place.ground, place.standing, place.touching, DT, (Solid((FLOOR,)), stair))
-    up = Squares(0.7, 0.2, 1, {}).parts()[0].begin(stairs)
-    assert isinstance(up, Hop) and up.jump.target.rise == pytest.approx(0.2 * height)
-    assert up.jump.target.height == pytest.approx(0.2 + 0.2 * height)
-    assert up.jump.plan.flight_time < first.jump.plan.flight_time + np.sqrt(2 * 0.2 * height / 9.81)
-    assert up.jump.plan.speed_up > first.jump.plan.speed_up
-
-
-def test_a_landing_frame_holds_the_landed_body(place: Place) -> None:
-    """From take-off on, a body that stands turned at the target has the coordinates of the start."""
-    target = JumpTarget(0.5, 0.3, 0.1)
-    leap = Jump(place, target, facing=Turning(place, 0.8))
-    start = place.ground.local(place.standing)
-    leap.phase = JumpPhase.THRUST
-    flying = place.standing + [0.2, 0.0, 0.3]
-    leap.objectives(BodyState(flying, np.tile([1.0, 0.0, 2.5], (len(flying), 1)), 0.01), None, DT)
-    assert leap.phase is JumpPhase.FLIGHT and leap.left_ground
-    landed = moved(place, 0.8, np.array([0.5, 0.0, 0.1]))
-    assert np.allclose(leap.ground.local(landed), start)
-    assert leap.pose.measure(BodyState(landed, 0 * landed), None).heading == pytest.approx(0.0, abs=1e-9)
-
-
-@pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.0 * np.pi])
-def test_a_twist_asks_friction_for_the_spin_that_is_left(place: Place, turn: float) -> None:
-    """In the thrust: up x L = I (angle left) / (time in the air) with a reserve;
-    its own turning is counted beyond half turns.
-    """
-    jump = twist(place, JumpTarget(0.0, 0.2), turn)
-    jump.phase = JumpPhase.THRUST
-    still = np.zeros_like(place.standing)
-    inertia = float(place.body.inertia(place.standing)[2, 2])
-    asked = []
-    for angle in np.sign(turn) * np.array([0.0, 0.3, 0.6]):
-        report = jump.objectives(BodyState(moved(place, float(angle), np.zeros(3)), still, 0.0), None, DT)
-        asked.append(report[1].target[2] / inertia)
-    flight = 0.88 * jump.plan.flight_time / 1.27
-    left = abs(turn) - np.radians(5.0) - np.array([0.0, 0.3, 0.6])
-    assert np.allclose(np.abs(asked), left / flight, rtol=1e-2) and np.all(np.sign(asked) == np.sign(turn))
-    for angle in np.linspace(0.6, abs(turn), 12) * np.sign(turn):
-        jump.objectives(BodyState(moved(place, float(angle), np.zeros(3)), still, 0.0), None, DT)
-    assert jump.facing.turned == pytest.approx(turn)
-
-
-def land(jump: Jump, state: BodyState) -> None:
-    """Put a jump where it has landed and come to rest but for the last step."""
-    jump.phase, jump._entered = JumpPhase.LAND, -100.0
-    jump.pose = jump._landing
-
-
-def test_a_turn_that_falls_short_is_made_up_where_it_began(place: Place) -> None:
-    """25 degrees short and 0.1 aside: the next jump turns by the rest and goes back; 5 degrees short is let be."""
-    turn = Turn(place, JumpTarget(0.0, 0.2), np.radians(60.0))
-    short = moved(place, np.radians(35.0), np.array([0.1, 0.0, 0.0]))
-    state = BodyState(short, 0 * short, 10.0)
-    land(turn.jumps[0], state)
-    turn.objectives(state, None, DT)
-    assert len(turn.jumps) == 2
-    second = turn.jumps[1]
-    assert np.degrees(second.facing.turn) == pytest.approx(25.0) and second.target.distance == pytest.approx(0.1)
-    assert np.allclose(second.ground.axes[0], [-1.0, 0.0, 0.0])
-    assert turn.notes() == ["turned in 2 jumps"] and turn.planned().jumps == 2.0
-    there = moved(place, np.radians(55.0), np.zeros(3))
-    land(second, BodyState(there, 0 * there, 20.0))
-    turn.objectives(BodyState(there, 0 * there, 20.0), None, DT)
-    assert len(turn.jumps) == 2 and turn.resting
-
-
-def test_a_slippery_floor_takes_more_jumps(place: Place) -> None:
-    """The largest turn is proportional to friction; a turn beyond it is shared out evenly."""
-    target = JumpTarget(0.0, 0.2)
-    rough, smooth = (Turn(replace(place, friction=mu), target, np.pi) for mu in (0.8, 0.2))
-    assert smooth.most_in_a_jump == pytest.approx(rough.most_in_a_jump / 4.0)
-    count = np.ceil(np.pi / smooth.most_in_a_jump)
-    assert count >= 2.0 and smooth.jumps[0].facing.turn == pytest.approx(np.pi / count)
-    landed = moved(place, smooth.jumps[0].facing.turn, np.zeros(3))
-    state = BodyState(landed, 0 * landed, 10.0)
-    land(smooth.jumps[0], state)
-    smooth.objectives(state, None, DT)
-    assert smooth.jumps[1].facing.turn == pytest.approx(np.pi / count)
-    assert smooth.notes()[0] == f"friction gives a turn of {np.degrees(smooth.most_in_a_jump):.0f} degrees a jump"

@@ -5,48 +5,29 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egs_warp.contact.detection import ContactGeometry
-from egs_warp.deformation.embedding import embed_points
 from egs_warp.errors import UserError
-from egs_warp.fem.body import BodyState, make_body
-from egs_warp.geometry.plane import Plane
+from egs_warp.fem.body import BodyState
 from egs_warp.geometry.tetmesh import TetMesh
-from egs_warp.locomotion.rollout import settle
 from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
 from egs_warp.locomotion.trajectory import audit, measure, record
 from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import Ground
 from egs_warp.motions.walk import Walk, WalkPhase
-from egs_warp.muscles.muscle_set import automatic_muscles
-from tests.muscles.test_skeleton import UP, figure, stool
-
-FLOOR = Plane(UP, 0.0)
-DT = 1 / 60
+from tests.support.creatures import coarse_creature
+from tests.support.meshes import UP, figure, stool
+from tests.support.places import DT
 
 
-def standing(
+def stiff(
     mesh: TetMesh, *, forward: np.ndarray, up: np.ndarray = UP, settled: bool = True
 ) -> tuple[LocomotionStepper, Place, BodyState]:
-    """A stiff body of ``mesh`` on its lowest nodes; ``up`` (3,) is against gravity."""
-    body = make_body(mesh, FLOOR, up=up, sag=0.01, device="cpu")
-    muscles = automatic_muscles(
-        mesh, UP, body_weight=body.weight, height=body.height, young_modulus=body.young_modulus, strength=20.0
-    )
-    soles = embed_points(mesh, mesh.nodes[mesh.nodes[:, 2] == 0.0], device="cpu")
-    geometry = ContactGeometry(mesh, (FLOOR,), 0.8, soles.tets.numpy(), soles.weights.numpy(), 0, 0.0)
-    stepper = LocomotionStepper(body, muscles, geometry, device="cpu")
-    start = settle(stepper) if settled else BodyState(mesh.nodes, np.zeros_like(mesh.nodes))
-    ground = Ground.on(FLOOR, forward, body.centre_of_mass(start.positions), up=up)
-    return (
-        stepper,
-        Place(body, ground, start.positions, stepper.detector.points_within(start.positions, 0.01), DT),
-        start,
-    )
+    """A stiff, strong body of ``mesh`` on its lowest nodes; ``up`` (3,) is against gravity."""
+    made = coarse_creature(mesh, forward=forward, up=up, sag=0.01, strength=20.0, settled=settled)
+    return made.stepper, made.place, made.start
 
 
 def test_a_walk_goes_along_its_feet_and_refuses_other_bodies() -> None:
     """The way forward is turned to the nearest side of the feet; a body on two feet is told that a walk needs four."""
-    _, place, _ = standing(stool(), forward=np.array([0.9, 0.3, 0.0]), settled=False)
+    _, place, _ = stiff(stool(), forward=np.array([0.9, 0.3, 0.0]), settled=False)
     walk = Walk(place, 3, 0.08)
     assert np.allclose(walk.ground.axes[0], [1.0, 0.0, 0.0], atol=1e-9)
     for pair in walk.pairs:
@@ -57,19 +38,18 @@ def test_a_walk_goes_along_its_feet_and_refuses_other_bodies() -> None:
     strides_out = Walk(place, 3, 0.8)
     assert strides_out.gait.step_length == pytest.approx(0.5 * min(foot.length for foot in strides_out.feet))
     assert strides_out.notes()[0].startswith("steps of 1.00 body heights were asked; the legs are long enough for 0.3")
-    _, place, _ = standing(figure(), forward=np.array([1.0, 0.0, 0.0]), settled=False)
+    _, place, _ = stiff(figure(), forward=np.array([1.0, 0.0, 0.0]), settled=False)
     with pytest.raises(UserError, match="walk: a walk needs four separate feet, the body has 2"):
         Walk(place, 4, 0.1)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("slope", [0.0, 5.0])
+@pytest.mark.parametrize("slope", [0.0, pytest.param(5.0, marks=pytest.mark.slow)])
 def test_a_coarse_stool_takes_a_step(slope: float) -> None:
     """One step, up a slope too, and the closing one: each foot lands once, none slips 2 % of the stride, the distance
     is met, the audit holds."""
     tilt = np.radians(slope)
     up = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
-    stepper, place, state = standing(stool(), forward=np.array([1.0, 0.0, 0.0]), up=up)
+    stepper, place, state = stiff(stool(), forward=np.array([1.0, 0.0, 0.0]), up=up)
     body, start, walk = stepper.body, state, Walk(place, 1, 0.06)
     reports: list[StepReport] = []
     memory, air = stepper.initial_memory(), 0.0

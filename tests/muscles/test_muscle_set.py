@@ -16,23 +16,7 @@ from egs_warp.geometry.tetmesh import TetMesh, edge_graph
 from egs_warp.muscles.attachments import attachment_rows
 from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.muscle_set import MuscleColumns, MuscleSet, attach_fibres, automatic_muscles, muscle_columns
-
-
-def box_mesh(counts: tuple[int, int, int], size: tuple[float, float, float]) -> TetMesh:
-    """A box with its base centred at the origin, each of its cells cut into six tetrahedra."""
-    grid = np.stack(np.meshgrid(*[np.arange(n + 1) for n in counts], indexing="ij"), axis=-1)
-    nodes = (grid / np.array(counts) * np.array(size) - [size[0] / 2, size[1] / 2, 0.0]).reshape(-1, 3)
-    index = np.arange(len(nodes)).reshape(grid.shape[:3])
-    cells = np.stack(
-        [index[a : a + counts[0], b : b + counts[1], c : c + counts[2]].ravel() for a, b, c in np.ndindex(2, 2, 2)],
-        axis=1,
-    )
-    # Cells mirror their neighbours, so that the mesh prefers no diagonal and mirrors in x = 0 and y = 0.
-    odd = np.stack(np.meshgrid(*[np.arange(n) % 2 for n in counts], indexing="ij"), axis=-1).reshape(-1, 3) @ [4, 2, 1]
-    cells = np.take_along_axis(cells, np.arange(8)[None] ^ odd[:, None], axis=1)
-    paths = [(0, 1, 3, 7), (0, 1, 5, 7), (0, 2, 3, 7), (0, 2, 6, 7), (0, 4, 5, 7), (0, 4, 6, 7)]
-    return TetMesh.oriented(nodes, np.concatenate([cells[:, path] for path in paths]))
-
+from tests.support.meshes import box_mesh
 
 COLUMN = box_mesh((4, 4, 10), (0.4, 0.4, 1.0))
 
@@ -145,14 +129,36 @@ def column_muscles(column_body: SoftBody) -> MuscleSet:
 
 def linear_response(body: SoftBody, muscles: MuscleSet, segments: np.ndarray) -> np.ndarray:
     """(N, 3) static displacement when ``segments`` contract by 2 % of their lengths and the base is clamped."""
+    return static_response(body, muscles, segments, 0.02, COLUMN.nodes[:, 2:] <= 1e-9)
+
+
+def free_response(body: SoftBody, muscles: MuscleSet, segments: np.ndarray, share: float) -> np.ndarray:
+    """(N, 3) the same of a body that only six freedoms of three corners keep from drifting, contracted by ``share``."""
+    low, ahead, aside = (
+        int(np.argmin(np.linalg.norm(COLUMN.nodes - corner, axis=1)))
+        for corner in ([-0.2, -0.2, 0.0], [0.2, -0.2, 0.0], [-0.2, 0.2, 0.0])
+    )
+    held = np.zeros(COLUMN.nodes.shape, dtype=bool)
+    held[low] = True
+    held[ahead, 1:] = True
+    held[aside, 2] = True
+    return static_response(body, muscles, segments, share, held)
+
+
+def static_response(
+    body: SoftBody, muscles: MuscleSet, segments: np.ndarray, share: float, held: np.ndarray
+) -> np.ndarray:
+    """(N, 3) linear displacement under a contraction by ``share``, where the freedoms ``held`` (N, 3) or (N, 1) do not
+    move.
+    """
     upper = body.assembly.matrix(body.assembly.matrix_entries(COLUMN.nodes))
     stiffness = (upper + sparse.triu(upper, 1).T).tocsc()
     activation = np.zeros(muscles.segment_count)
-    activation[segments] = 0.02 * muscles.rest_lengths[segments]
+    activation[segments] = share * muscles.rest_lengths[segments]
     force = muscle_columns(muscles, COLUMN.nodes) @ activation
-    free = np.flatnonzero(np.repeat(COLUMN.nodes[:, 2] > 1e-9, 3))
+    free = np.flatnonzero(~np.broadcast_to(held, COLUMN.nodes.shape).ravel())
     moved = np.zeros(force.shape)
-    moved[free] = spsolve(stiffness[free][:, free], force[free])
+    moved[free] = np.asarray(spsolve(stiffness[free][:, free], force[free]))
     return moved.reshape(-1, 3)
 
 
@@ -190,11 +196,49 @@ def test_longitudinal_fibres_shorten_and_on_one_side_bend(column_body: SoftBody,
     assert other_side[0] == pytest.approx(-one_sided[0], rel=0.15)
 
 
-def test_radial_fibres_lengthen(column_body: SoftBody, column_muscles: MuscleSet) -> None:
-    """Eq. (7), docs/concepts/muscles.md: thinning the body raises its top (Poisson's ratio)."""
-    moved = linear_response(column_body, column_muscles, column_muscles.segments_of_kind(FibreKind.RADIAL))
+def test_radial_fibres_lengthen_by_poissons_ratio(column_body: SoftBody, column_muscles: MuscleSet) -> None:
+    """Eq. (7), docs/concepts/muscles.md: a free body that radial fibres thin grows by nu sum(T L) / (E V), exactly, and
+    clamped its top rises.
+
+    Forces in equilibrium have the mean stress sum(f x^T) / V, which is -T L along each segment of length L that pulls
+    with T; the mean axial strain is -nu / E times the two lateral stresses.
+    """
+    radial = column_muscles.segments_of_kind(FibreKind.RADIAL)
+    share = 0.002
+    moved = free_response(column_body, column_muscles, radial, share)
+    corners, shift = COLUMN.nodes[COLUMN.tets], moved[COLUMN.tets]
+    volumes = COLUMN.volumes()
+    gradients = np.linalg.solve(corners[:, 1:] - corners[:, :1], shift[:, 1:] - shift[:, :1])
+    axial = float(volumes @ gradients[:, 2, 2]) / volumes.sum()
+    # What the fibre file promises: at the bound of its activation, a strain of 30 %, a segment pulls with its strength.
+    lengths = column_muscles.lengths(COLUMN.nodes)[radial]
+    pull = share / 0.3 * column_muscles.max_forces[radial]
+    material = column_body.assembly.material
+    expected = material.poisson_ratio / material.young_modulus * float(pull @ lengths) / volumes.sum()
+    assert axial == pytest.approx(expected, rel=1e-6)
+    moved = linear_response(column_body, column_muscles, radial)
     assert rise(moved) > 1e-5
     assert np.linalg.norm(lean(moved)) < 0.3 * rise(moved)
+
+
+def test_radial_fibres_are_diameters_spread_over_length_and_directions(column_muscles: MuscleSet) -> None:
+    """Level, through the axis, from 0.7 of the way to one side to as far on the other; as many each way on each
+    level.
+    """
+    ends = column_muscles.end_points(COLUMN.nodes)[
+        column_muscles.segments[column_muscles.segments_of_kind(FibreKind.RADIAL)]
+    ]
+    across, middles = ends[:, 1] - ends[:, 0], ends.mean(axis=1)
+    edge = 0.1
+    assert np.abs(across[:, 2]).max() < 0.2 * edge and np.abs(middles[:, :2]).max() < 0.1 * edge
+    directions = across[:, :2] / np.linalg.norm(across[:, :2], axis=1, keepdims=True)
+    reach = 0.2 / np.abs(directions).max(axis=1)
+    np.testing.assert_allclose(0.5 * np.linalg.norm(across, axis=1), 0.7 * reach, rtol=0.1)
+    levels = np.unique(np.round(middles[:, 2], 1))
+    assert len(levels) >= 3 and np.ptp(levels) > 0.5
+    # The squares of the directions' sines and cosines are alike: no way across is pulled more than another.
+    second = np.einsum("ni,nj->ij", directions, directions) / len(directions)
+    np.testing.assert_allclose(second, 0.5 * np.eye(2), atol=0.02)
 
 
 def test_oblique_fibres_twist_by_their_hand_and_hoops_do_not(column_body: SoftBody, column_muscles: MuscleSet) -> None:

@@ -12,48 +12,7 @@ from egs_warp.muscles.ascent import ascent_field, base_nodes
 from egs_warp.muscles.fibres import FibreKind
 from egs_warp.muscles.muscle_set import automatic_muscles
 from egs_warp.muscles.skeleton import skeleton
-
-UP = np.array([0.0, 0.0, 1.0])
-
-
-def carved(size: tuple[float, float, float], cell: float, keep: Callable[[np.ndarray], np.ndarray]) -> TetMesh:
-    """Cells of a lattice over a box standing on z = 0 whose centres ``keep`` accepts, six tetrahedra each."""
-    counts = np.round(np.array(size) / cell).astype(int)
-    grid = np.stack(np.meshgrid(*[np.arange(n + 1) for n in counts], indexing="ij"), axis=-1)
-    nodes = (grid * cell - [size[0] / 2, size[1] / 2, 0.0]).reshape(-1, 3)
-    index = np.arange(len(nodes)).reshape(grid.shape[:3])
-    cells = np.stack(
-        [index[a : a + counts[0], b : b + counts[1], c : c + counts[2]].ravel() for a, b, c in np.ndindex(2, 2, 2)],
-        axis=1,
-    )
-    cells = cells[keep(nodes[cells].mean(axis=1))]
-    paths = [(0, 1, 3, 7), (0, 1, 5, 7), (0, 2, 3, 7), (0, 2, 6, 7), (0, 4, 5, 7), (0, 4, 6, 7)]
-    used, tets = np.unique(np.concatenate([cells[:, path] for path in paths]), return_inverse=True)
-    return TetMesh.oriented(nodes[used], tets.reshape(-1, 4))
-
-
-def column() -> TetMesh:
-    return carved((0.3, 0.3, 1.2), 0.1, lambda c: np.ones(len(c), dtype=bool))
-
-
-def stool() -> TetMesh:
-    """Four legs under a seat."""
-    return carved(
-        (0.7, 0.7, 0.8), 0.1, lambda c: (c[:, 2] > 0.6) | ((np.abs(c[:, 0]) > 0.15) & (np.abs(c[:, 1]) > 0.15))
-    )
-
-
-def figure() -> TetMesh:
-    """Two legs, a trunk that ends in a head, two arms held out."""
-
-    def keep(c: np.ndarray) -> np.ndarray:
-        x, z = np.abs(c[:, 0]), c[:, 2]
-        legs = (z < 0.5) & (x > 0.1) & (x < 0.3)
-        trunk = (z > 0.5) & (x < 0.3)
-        arms = (z > 0.8) & (z < 1.0)
-        return legs | trunk | arms
-
-    return carved((1.6, 0.2, 1.4), 0.1, keep)
+from tests.support.meshes import UP, carved, column, figure, stool
 
 
 def test_ascent_is_height_on_a_column() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import scipy.sparse as sparse
@@ -13,7 +15,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.muscle_set import MuscleSet, attach_fibres, muscle_columns
 from egs_warp.muscles.tension import MuscleTension
-from tests.muscles.test_muscle_set import box_mesh
+from tests.support.meshes import box_mesh
 
 ROD = box_mesh((2, 2, 14), (0.08, 0.08, 1.0))
 
@@ -36,7 +38,7 @@ def scattered(rng: np.random.Generator) -> MuscleTension:
     return MuscleTension.of(muscles, rng.uniform(-1.0, 1.0, muscles.segment_count) * muscles.bounds)
 
 
-def dense(product, count: int) -> np.ndarray:
+def dense(product: Callable[[np.ndarray], np.ndarray], count: int) -> np.ndarray:
     """(3N, 3N) matrix of a linear map on (N, 3)."""
     return np.stack([product(column.reshape(-1, 3)).ravel() for column in np.eye(3 * count)], axis=1)
 

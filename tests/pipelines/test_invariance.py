@@ -4,6 +4,9 @@ within bands.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -25,7 +28,10 @@ from tests.support.frames import TURN, Lying
 
 def jump(lying: Lying, *, frames: int | None = None, by_up: bool = False) -> tuple[Creature, Simulation]:
     """The first ``frames`` of a jump, or all of it; the plane is given, or found from up alone."""
-    creature = make_creature(lying.cloud, **({"up": lying.up} if by_up else {"plane": lying.plane}))
+    if by_up:
+        creature = make_creature(lying.cloud, up=lying.up)
+    else:
+        creature = make_creature(lying.cloud, plane=lying.plane)
     return creature, simulate(creature, motion("jump"), frames=frames).simulation
 
 
@@ -56,7 +62,9 @@ def first_steps(thing: Lying) -> tuple[Creature, Simulation]:
     ],
     ids=["shuffled", "x4", "moved"],
 )
-def test_same_bits_however_the_file_lies(thing: Lying, first_steps: tuple[Creature, Simulation], other) -> None:
+def test_same_bits_however_the_file_lies(
+    thing: Lying, first_steps: tuple[Creature, Simulation], other: Callable[[Lying], Lying]
+) -> None:
     creature, simulation = first_steps
     again, simulated = jump(other(thing), frames=2, by_up=True)
     for mine, its in (
@@ -76,7 +84,9 @@ def test_same_bits_however_the_file_lies(thing: Lying, first_steps: tuple[Creatu
 @pytest.mark.parametrize(
     "other", [lambda thing: thing.scaled(0.37), lambda thing: thing.turned()], ids=["x0.37", "turned"]
 )
-def test_same_pictures_in_any_unit_and_turned(thing: Lying, first_steps: tuple[Creature, Simulation], other) -> None:
+def test_same_pictures_in_any_unit_and_turned(
+    thing: Lying, first_steps: tuple[Creature, Simulation], other: Callable[[Lying], Lying]
+) -> None:
     creature, simulation = first_steps
     again, simulated = jump(other(thing), frames=2, by_up=True)
     truth = pictures(creature, simulation.trajectory.positions[-1])
@@ -115,7 +125,7 @@ def test_jump_goes_as_far_in_any_unit_and_turned(thing: Lying, name: str) -> Non
 @pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "up"), [("monkey.ply", (0, 1, 0)), ("plush_dog.ply", (0, -1, 0))])
-def test_jump_of_real_captures_goes_as_far(data_dir, name: str, up: tuple[int, int, int]) -> None:
+def test_jump_of_real_captures_goes_as_far(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:
     """Turned and in another unit, with nothing but up: distance and height within 1 %."""
     cloud = read_capture(data_dir / "objects" / name).cloud
     lying = Lying(cloud, find_base_plane(cloud, np.array(up, float)))

@@ -11,12 +11,13 @@ import pytest
 
 from egs_warp.cli import main
 from egs_warp.errors import UserError
+from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.inpainting.inpainters import OpenCvInpainter, OpenCvMethod
 from egs_warp.io import read_capture, write_ply
-from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene
+from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene, viewing_direction
 from egs_warp.segmentation.clearance import Clearing
 from egs_warp.segmentation.object_mask import ObjectSpec
-from tests.segmentation.test_object_mask import ball_on_floor
+from tests.support.scenes import FLOOR, ball_on_floor
 
 
 @pytest.fixture(scope="module")
@@ -156,3 +157,22 @@ def test_an_animation_that_fails_loses_none_of_the_parts(
     for name in ("plane.json", "plane.png", "segment.png"):
         assert (out / name).is_file()
     assert not (out / "filled.png").exists(), "no floor was filled"
+
+
+def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:
+    cloud, _ = ball_on_floor()
+    stages: list[str] = []
+    prepared = prepare_scene(
+        cloud,
+        ObjectSpec(point=np.array([0.0, -0.5, 0.5])),
+        options=SceneOptions(clearing=Clearing.SPLIT, inpaint=False),
+        progress=stages.append,
+    )
+    assert stages == ["plane", "segment"]
+    assert prepared.background is prepared.bare
+    assert any("straddled the plane: static split" in note for note in prepared.notes)
+    cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.9, count=3, elevations=(20.0, 40.0, 60.0))
+    direction = viewing_direction(prepared, cameras)
+    np.testing.assert_allclose(direction, cameras[1].centre - prepared.located.centre)
+    up = viewing_direction(prepared, [])
+    assert 0.3 < up @ prepared.plane.normal / np.linalg.norm(up) < 0.6

@@ -17,7 +17,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io import read_capture
 from egs_warp.io.photos import turned
 from egs_warp.render import render_gaussians
-from tests.training.test_finetune import ball, ring
+from tests.support.training_views import ball, ring
 
 pytest.importorskip("torch")
 from egs_warp.pipelines.train_capture import train
@@ -138,6 +138,7 @@ def test_portrait_and_landscape_through_a_lens(tmp_path: Path) -> None:
     tree = json.loads((posed / "transforms.json").read_text())
     for number, frame in enumerate(tree["frames"]):
         pixels = cv2.imread(str(posed / frame["file_path"]))
+        assert pixels is not None
         frame.update(k1=-0.02)
         if number % 2:
             # The left and right margin off: a portrait, lying on its side.

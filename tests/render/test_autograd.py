@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,12 +43,12 @@ def weights(camera: Camera) -> dict[str, np.ndarray]:
     }
 
 
-def loss_of_twin(values: dict[str, np.ndarray], camera: Camera, **options: object) -> float:
+def loss_of_twin(values: dict[str, np.ndarray], camera: Camera, **options: Any) -> float:
     picture = render_twin(values, camera, **options)
     return sum(float((w * picture[name]).sum()) for name, w in weights(camera).items())
 
 
-def gradients(values: dict[str, np.ndarray], camera: Camera, device: str, **options: object) -> dict[str, np.ndarray]:
+def gradients(values: dict[str, np.ndarray], camera: Camera, device: str, **options: Any) -> dict[str, np.ndarray]:
     tensors = {
         name: torch.tensor(values[name], dtype=torch.float32, device=device, requires_grad=True) for name in NAMES
     }
@@ -55,11 +56,13 @@ def gradients(values: dict[str, np.ndarray], camera: Camera, device: str, **opti
         "rotation": torch.tensor(camera.rotation, device=device, requires_grad=True),
         "translation": torch.tensor(camera.translation, device=device, requires_grad=True),
     }
-    image = render_torch(*tensors.values(), camera, **pose, **options)
-    loss = sum(
-        (torch.tensor(w, dtype=torch.float32, device=device) * getattr(image, name)).sum()
-        for name, w in weights(camera).items()
-    )
+    image = render_torch(*tensors.values(), camera=camera, **pose, **options)
+    loss = torch.stack(
+        [
+            (torch.tensor(w, dtype=torch.float32, device=device) * getattr(image, name)).sum()
+            for name, w in weights(camera).items()
+        ]
+    ).sum()
     loss.backward()
     return {name: tensor.grad.double().cpu().numpy() for name, tensor in {**tensors, **pose}.items()}
 
@@ -123,7 +126,7 @@ def test_directional_derivative_of_a_crowded_scene(device: str) -> None:
         sides = [loss_of_twin(values | {name: values[name] + sign * step * direction}, camera) for sign in (1, -1)]
         slope = (sides[0] - sides[1]) / (2 * step)
         expected = (got[name] * direction).sum()
-        assert slope == pytest.approx(expected, rel=0.02, abs=0.02 * np.linalg.norm(got[name])), name
+        assert slope == pytest.approx(expected, rel=0.02, abs=0.02 * float(np.linalg.norm(got[name]))), name
 
 
 def test_gradients_do_not_depend_on_threads_or_repeats() -> None:
@@ -152,7 +155,7 @@ def test_work_is_queued_on_torchs_stream() -> None:
     """The inputs are still being written on a side stream when the picture is asked for."""
     values, camera = many_splats()
     tensors = [torch.tensor(values[name], dtype=torch.float32, device="cuda") for name in NAMES]
-    expected = render_torch(*tensors, camera).colour
+    expected = render_torch(*tensors, camera=camera).colour
     torch.cuda.synchronize()
     side = torch.cuda.Stream()
     with torch.cuda.stream(side):
@@ -160,7 +163,7 @@ def test_work_is_queued_on_torchs_stream() -> None:
         torch.cuda._sleep(50_000_000)
         for to, tensor in zip(moved, tensors, strict=True):
             to.copy_(tensor)
-        got = render_torch(*moved, camera).colour.clone()
+        got = render_torch(*moved, camera=camera).colour.clone()
     side.synchronize()
     assert torch.equal(got, expected)
 
@@ -168,16 +171,16 @@ def test_work_is_queued_on_torchs_stream() -> None:
 def test_pixels_share_memory_and_bad_tensors_are_named() -> None:
     values, camera = clear_scene()
     tensors = [torch.tensor(values[name], dtype=torch.float32) for name in NAMES]
-    image = render_torch(*tensors, camera)
+    image = render_torch(*tensors, camera=camera)
     twin = render_twin(values, camera)
     np.testing.assert_allclose(image.colour.numpy(), twin["colour"], atol=1e-5)
     assert image.visible().all()
     with pytest.raises(
         UserError, match=r"rotations is \(7, 3\) torch.float32 on cpu, expected \(7, 4\) float32 on cpu"
     ):
-        render_torch(tensors[0], tensors[1][:, :3], *tensors[2:], camera)
+        render_torch(tensors[0], tensors[1][:, :3], *tensors[2:], camera=camera)
     with pytest.raises(UserError, match="rotation and translation together"):
-        render_torch(*tensors, camera, rotation=torch.eye(3))
+        render_torch(*tensors, camera=camera, rotation=torch.eye(3))
 
 
 def test_screen_positions_get_their_gradient_where_asked_for(device: str) -> None:
@@ -185,7 +188,7 @@ def test_screen_positions_get_their_gradient_where_asked_for(device: str) -> Non
     values, camera = clear_scene()
     tensors = [torch.tensor(values[name], dtype=torch.float32, device=device, requires_grad=True) for name in NAMES]
     screen = torch.zeros((len(values["means"]), 2), device=device, requires_grad=True)
-    image = render_torch(*tensors, camera, screen=screen, background=(0.2, 0.5, 0.9))
+    image = render_torch(*tensors, camera=camera, screen=screen, background=(0.2, 0.5, 0.9))
     weight = torch.tensor(weights(camera)["colour"], dtype=torch.float32, device=device)
     (weight * image.colour).sum().backward()
     assert screen.grad is not None

@@ -7,7 +7,7 @@ import numpy as np
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.render.backdrop import CapturedScene, ContactShadow
-from tests.segmentation.test_object_mask import FLOOR, ball_on_floor
+from tests.support.scenes import FLOOR, ball_on_floor
 
 
 def test_the_shadow_falls_where_the_floor_is_seen() -> None:

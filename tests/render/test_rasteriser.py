@@ -46,7 +46,7 @@ def one_splat(**changes: object) -> dict[str, np.ndarray]:
     return {name: np.array(value, dtype=np.float64) for name, value in values.items()}
 
 
-def camera_of(width: int = 67, height: int = 45, **changes: object) -> Camera:
+def camera_of(width: int = 67, height: int = 45, **changes: float) -> Camera:
     return Camera.look_at(EYE, np.zeros(3), np.array([0, -1.0, 0]), width=width, height=height, **changes)
 
 
@@ -144,6 +144,7 @@ def test_median_depth_and_normal(device: str) -> None:
     camera = camera_of()
     image = render_gaussians(cloud_of(values, device), camera, geometry=True)
     twin = render_twin(values, camera)
+    assert image.normal is not None and image.median_depth is not None
     assert np.abs(image.normal.numpy() - twin["normal"]).mean() < 1e-5
     # A rounding in the transmittance can move the median to the next splat in a few pixels.
     assert (np.abs(image.median_depth.numpy() - twin["median_depth"]) > 1e-4).mean() < 2e-3
@@ -309,6 +310,7 @@ def test_sorted_lists_equal_counted_ones(spread: float) -> None:
         assert np.array_equal(lists[0].tile_start.numpy(), other.tile_start.numpy())
         for name in ("gaussian_from_intersection", "slot_from_intersection"):
             assert np.array_equal(getattr(lists[0], name).numpy()[:pairs], getattr(other, name).numpy()[:pairs])
-    depth = projected.colour_depth.numpy()[lists[0].gaussian_from_intersection.numpy()[:pairs], 3]
+    order = np.asarray(lists[0].gaussian_from_intersection.numpy()[:pairs], np.int32)
+    depth = projected.colour_depth.numpy()[order, 3]
     inner = np.setdiff1d(np.arange(1, pairs), lists[0].tile_start.numpy())
     assert (depth[inner] >= depth[inner - 1]).all()

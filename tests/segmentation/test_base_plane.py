@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -47,7 +49,7 @@ def test_plane_is_scale_free(scale: float) -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "up"), _OBJECTS)
-def test_planes_of_real_captures(data_dir, name: str, up: tuple[int, int, int]) -> None:
+def test_planes_of_real_captures(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:
     """Little mass below, yet visible support within 1.5 % of the height."""
     cloud = read_capture(data_dir / "objects" / name).cloud
     plane = find_base_plane(cloud, np.array(up, float))
@@ -61,7 +63,7 @@ def test_planes_of_real_captures(data_dir, name: str, up: tuple[int, int, int]) 
 
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "up"), _OBJECTS)
-def test_up_of_real_captures(data_dir, name: str, up: tuple[int, int, int]) -> None:
+def test_up_of_real_captures(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:
     """The guess is right for every real object and says why."""
     guessed, reason = guess_up(read_capture(data_dir / "objects" / name).cloud, None)
     assert np.array_equal(guessed, up)

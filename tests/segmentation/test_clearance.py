@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -23,10 +25,10 @@ from egs_warp.segmentation.clearance import (
 PLANE = Plane.from_coefficients(0.3, -0.5, 0.8, 0.1)
 
 
-def cloud_near(plane: Plane, device: str, count: int = 60, seed: int = 0) -> GaussianCloud:
+def cloud_near(plane: Plane, device: str, count: int = 60, seed: int = 0, lowest: float = 0.0) -> GaussianCloud:
     random = np.random.default_rng(seed)
     means = random.uniform(-1.0, 1.0, (count, 3))
-    means += (random.uniform(0.0, 0.3, count) - plane.heights(means))[:, None] * plane.normal
+    means += (random.uniform(lowest, 0.3, count) - plane.heights(means))[:, None] * plane.normal
     return GaussianCloud.from_numpy(
         means,
         random.normal(size=(count, 4)),
@@ -110,12 +112,14 @@ def test_removing_leaves_nothing_across_the_plane() -> None:
 
 
 def test_loss_is_the_sum_over_straddling_gaussians() -> None:
-    """Eq. (21): the sum of eta_seg - |d0| where it is positive, with gradients that finite differences confirm."""
+    """Eq. (21): the sum of eta_seg - |d0| where it is positive, on both sides, with gradients that finite differences
+    confirm.
+    """
     torch = pytest.importorskip("torch")
     from egs_warp.segmentation.clearance import straddling_loss
     from egs_warp.training.finetune import GaussianTensors
 
-    cloud = cloud_near(PLANE, "cpu", count=20)
+    cloud = cloud_near(PLANE, "cpu", count=20, lowest=-0.2)
     names = {"means": "means", "rotations": "rotations", "log_scales": "log_scales", "opacity_logits": "opacity_logits"}
     leaves = {
         name: torch.tensor(getattr(cloud, field).numpy().astype(np.float64), requires_grad=True)
@@ -128,10 +132,11 @@ def test_loss_is_the_sum_over_straddling_gaussians() -> None:
         expected = np.maximum(eta - np.abs(heights), 0.0).sum()
         loss = straddling_loss(GaussianTensors(**leaves, **rest), near, normal, PLANE.offset, reach)
         assert float(loss.detach()) == pytest.approx(expected, rel=1e-4)
-        assert expected > 0.0
+        straddling = eta > np.abs(heights)
+        assert (straddling & (heights > 0.0)).any() and (straddling & (heights < 0.0)).any()
         inputs = [leaves[name] for name in ("means", "rotations", "log_scales")]
 
-        def value(means, rotations, log_scales, reach=reach):
+        def value(means: Any, rotations: Any, log_scales: Any, reach: Reach = reach) -> Any:
             tensors = GaussianTensors(means, rotations, log_scales, leaves["opacity_logits"], **rest)
             return straddling_loss(tensors, near, normal, PLANE.offset, reach)
 
@@ -169,5 +174,6 @@ def test_finetuning_clears_the_plane_and_keeps_the_looks() -> None:
     camera = Camera.look_at(np.array([0.3, -3.0, 1.0]), np.array([0.0, 0.0, 0.5]), floor.normal, width=96, height=96)
     view = views_above(ball, floor, [camera])[0]
     pictures = [render_gaussians(one, camera, background=(0.0, 0.0, 0.0)).colour.numpy() for one in (ball, tuned)]
+    assert view.weight is not None
     counted = view.weight[..., None] > 0
     assert psnr(np.where(counted, pictures[0], 0.0), np.where(counted, pictures[1], 0.0)) > 30.0

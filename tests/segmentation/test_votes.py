@@ -41,7 +41,7 @@ def test_votes_are_the_weights_that_paint_each_gaussian(device: str) -> None:
         sh[chosen] = 0.5 / SH_0
         painted = GaussianCloud.from_numpy(
             *(getattr(cloud, name).numpy() for name in ("means", "rotations", "log_scales", "opacity_logits")),
-            sh,
+            sh=sh,
             device=device,
         )
         weight = render_gaussians(painted, view, background=(0.0, 0.0, 0.0)).colour.numpy()[..., 0].astype(np.float64)

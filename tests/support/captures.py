@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import tempfile
 from collections.abc import Callable
 from functools import cache
@@ -33,6 +34,11 @@ def make_cloud(count: int, degree: int = 0, *, seed: int = 1, device: str = "cpu
 def assert_same_bits(actual: GaussianCloud, expected: GaussianCloud) -> None:
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(actual, name).numpy(), getattr(expected, name).numpy(), err_msg=name)
+
+
+def digest(cloud: GaussianCloud) -> str:
+    """Of every bit of the cloud."""
+    return hashlib.sha256(b"".join(getattr(cloud, name).numpy().tobytes() for name in ARRAYS)).hexdigest()
 
 
 def small_cloud() -> GaussianCloud:

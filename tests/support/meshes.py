@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 
 from egs_warp.geometry.tetmesh import TetMesh
+
+UP = np.array([0.0, 0.0, 1.0])
 
 
 def block_mesh(nx: int = 3, ny: int = 3, nz: int = 5, size: tuple[float, float, float] = (0.4, 0.4, 1.0)) -> TetMesh:
@@ -29,3 +32,59 @@ def block_mesh(nx: int = 3, ny: int = 3, nz: int = 5, size: tuple[float, float, 
     inside &= points[:, 2] < size[2] - 1e-9
     points[inside] += np.random.default_rng(0).uniform(-0.02, 0.02, (inside.sum(), 3))
     return TetMesh.oriented(points, np.concatenate(tets))
+
+
+def box_mesh(counts: tuple[int, int, int], size: tuple[float, float, float]) -> TetMesh:
+    """A box with its base centred at the origin, each of its cells cut into six tetrahedra."""
+    grid = np.stack(np.meshgrid(*[np.arange(n + 1) for n in counts], indexing="ij"), axis=-1)
+    nodes = (grid / np.array(counts) * np.array(size) - [size[0] / 2, size[1] / 2, 0.0]).reshape(-1, 3)
+    index = np.arange(len(nodes)).reshape(grid.shape[:3])
+    cells = np.stack(
+        [index[a : a + counts[0], b : b + counts[1], c : c + counts[2]].ravel() for a, b, c in np.ndindex(2, 2, 2)],
+        axis=1,
+    )
+    # Cells mirror their neighbours, so that the mesh prefers no diagonal and mirrors in x = 0 and y = 0.
+    odd = np.stack(np.meshgrid(*[np.arange(n) % 2 for n in counts], indexing="ij"), axis=-1).reshape(-1, 3) @ [4, 2, 1]
+    cells = np.take_along_axis(cells, np.arange(8)[None] ^ odd[:, None], axis=1)
+    paths = [(0, 1, 3, 7), (0, 1, 5, 7), (0, 2, 3, 7), (0, 2, 6, 7), (0, 4, 5, 7), (0, 4, 6, 7)]
+    return TetMesh.oriented(nodes, np.concatenate([cells[:, path] for path in paths]))
+
+
+def carved(size: tuple[float, float, float], cell: float, keep: Callable[[np.ndarray], np.ndarray]) -> TetMesh:
+    """Cells of a lattice over a box standing on z = 0 whose centres ``keep`` accepts, six tetrahedra each."""
+    counts = np.round(np.array(size) / cell).astype(int)
+    grid = np.stack(np.meshgrid(*[np.arange(n + 1) for n in counts], indexing="ij"), axis=-1)
+    nodes = (grid * cell - [size[0] / 2, size[1] / 2, 0.0]).reshape(-1, 3)
+    index = np.arange(len(nodes)).reshape(grid.shape[:3])
+    cells = np.stack(
+        [index[a : a + counts[0], b : b + counts[1], c : c + counts[2]].ravel() for a, b, c in np.ndindex(2, 2, 2)],
+        axis=1,
+    )
+    cells = cells[keep(nodes[cells].mean(axis=1))]
+    paths = [(0, 1, 3, 7), (0, 1, 5, 7), (0, 2, 3, 7), (0, 2, 6, 7), (0, 4, 5, 7), (0, 4, 6, 7)]
+    used, tets = np.unique(np.concatenate([cells[:, path] for path in paths]), return_inverse=True)
+    return TetMesh.oriented(nodes[used], tets.reshape(-1, 4))
+
+
+def column() -> TetMesh:
+    return carved((0.3, 0.3, 1.2), 0.1, lambda c: np.ones(len(c), dtype=bool))
+
+
+def stool() -> TetMesh:
+    """Four legs under a seat."""
+    return carved(
+        (0.7, 0.7, 0.8), 0.1, lambda c: (c[:, 2] > 0.6) | ((np.abs(c[:, 0]) > 0.15) & (np.abs(c[:, 1]) > 0.15))
+    )
+
+
+def figure() -> TetMesh:
+    """Two legs, a trunk that ends in a head, two arms held out."""
+
+    def keep(c: np.ndarray) -> np.ndarray:
+        x, z = np.abs(c[:, 0]), c[:, 2]
+        legs = (z < 0.5) & (x > 0.1) & (x < 0.3)
+        trunk = (z > 0.5) & (x < 0.3)
+        arms = (z > 0.8) & (z < 1.0)
+        return legs | trunk | arms
+
+    return carved((1.6, 0.2, 1.4), 0.1, keep)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
+from tests.support.render_twin import rotation_matrices
+from tests.support.training_views import ball, ring
 
 torch = pytest.importorskip("torch")
 from egs_warp.render import render_gaussians  # noqa: E402
@@ -22,31 +23,9 @@ from egs_warp.training.finetune import (  # noqa: E402
     finetune,
     views_of_capture,
 )
+from egs_warp.training.growth import Growth  # noqa: E402
 from egs_warp.training.likeness import psnr, ssim  # noqa: E402
 from egs_warp.training.relocation import Population  # noqa: E402
-
-
-def ring(count: int = 6, size: int = 40) -> list[Camera]:
-    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    return [
-        Camera.look_at(
-            np.array([3 * np.cos(a), -1.0, 3 * np.sin(a)]), np.zeros(3), np.array([0, -1.0, 0]), width=size, height=size
-        )
-        for a in angles
-    ]
-
-
-def ball(count: int = 150, seed: int = 0) -> dict[str, np.ndarray]:
-    random = np.random.default_rng(seed)
-    directions = random.normal(size=(count, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return {
-        "means": 0.7 * directions,
-        "rotations": random.normal(size=(count, 4)),
-        "log_scales": np.full((count, 3), -1.9) + random.normal(0, 0.2, (count, 3)),
-        "opacity_logits": np.full(count, 2.0),
-        "sh": np.concatenate([directions[:, None], random.normal(0, 0.05, (count, 3, 3))], axis=1),
-    }
 
 
 def mean_psnr(cloud: GaussianCloud, views: list[TrainingView]) -> float:
@@ -138,18 +117,54 @@ def test_relocated_copies_together_look_as_the_one_did(copies: int) -> None:
 
 
 def test_ssim_equals_scikit_images() -> None:
+    """Pixel by pixel the published index: a window of sigma 1.5 and zeros beyond the rim, which scikit-image is given
+    as pixels.
+    """
     from skimage.metrics import structural_similarity
 
     random = np.random.default_rng(0)
     a = random.uniform(size=(48, 56, 3)).astype(np.float32)
-    b = np.clip(a + random.normal(0, 0.1, a.shape), 0, 1).astype(np.float32)
-    expected = structural_similarity(
-        a, b, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0
-    )
-    # Zeros against mirrored pixels beyond the rim: a few percent of the pixels differ a little.
+    b = np.clip(a + random.normal(0, 0.2, a.shape), 0, 1).astype(np.float32)
+    rim = 6
+    framed = [np.pad(image.astype(np.float64), ((rim, rim), (rim, rim), (0, 0))) for image in (a, b)]
+    index = structural_similarity(
+        *framed,
+        channel_axis=2,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        full=True,
+    )[1]
+    expected = index[rim:-rim, rim:-rim].mean()
+    assert 0.5 < expected < 0.95
+    assert float(ssim(torch.tensor(a), torch.tensor(b))) == pytest.approx(expected, abs=2e-6)
     assert float(ssim(torch.tensor(a), torch.tensor(a))) == pytest.approx(1.0, abs=1e-6)
-    got = float(ssim(torch.tensor(a), torch.tensor(b)))
-    assert got == pytest.approx(float(expected), abs=0.01)
+
+
+def test_the_noise_of_mcmc_has_the_covariance_of_the_shape_squared() -> None:
+    """Kheradmand et al. 2024: the means move by 5e5 rate sigmoid(-100 (o - 0.005)) Sigma times a normal deviate."""
+    count, rate, scales, turn = 40_000, 1e-7, np.array([0.8, 0.3, 0.1]), np.array([0.7, 0.2, -0.5, 0.4])
+    opacities = np.array([0.001, 0.005, 0.02])
+    tensors = {
+        "means": torch.zeros(3 * count, 3),
+        "rotations": torch.tensor(turn, dtype=torch.float32).repeat(3 * count, 1),
+        "log_scales": torch.tensor(np.log(scales), dtype=torch.float32).repeat(3 * count, 1),
+        "opacity_logits": torch.tensor(np.log(opacities / (1 - opacities)), dtype=torch.float32).repeat_interleave(
+            count
+        ),
+    }
+    population = Population(
+        tensors, dict.fromkeys(tensors, rate), extent=1.0, generator=torch.Generator().manual_seed(1)
+    )
+    population.evolve(0, 1000, Growth(1, 3 * count, "cpu"))
+    axes = rotation_matrices(turn[None])[0]
+    shape = axes @ np.diag(scales**2) @ axes.T
+    for moved, opacity in zip(tensors["means"].numpy().astype(float).reshape(3, count, 3), opacities, strict=True):
+        size = 5e5 * rate / (1 + np.exp(100 * (opacity - 0.005)))
+        # In the shape's own units each deviate has variance 1: sampled, to 1 / sqrt(count / 2), and four times that.
+        unit = moved @ np.linalg.inv(size * shape)
+        np.testing.assert_allclose(unit.T @ unit / count, np.eye(3), atol=4 * np.sqrt(2 / count))
 
 
 def test_bad_views_are_named() -> None:

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
 import pytest
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 torch = pytest.importorskip("torch")
 from egs_warp.training.likeness import ssim  # noqa: E402
 from egs_warp.training.photo_loss import PhotoLoss, Target  # noqa: E402
 
 
-def twin(colour, alpha, tone, target, backdrop, weight):
+def twin(
+    colour: Tensor, alpha: Tensor, tone: Tensor, target: Target, backdrop: tuple[float, float, float], weight: float
+) -> Tensor:
     """The same in plain torch, differentiated by torch."""
     behind = torch.tensor(backdrop)
     image = target.image
@@ -31,7 +39,7 @@ def twin(colour, alpha, tone, target, backdrop, weight):
 def test_loss_and_gradients_equal_the_twins(cut_out: bool, weighted: bool, device: str) -> None:
     generator = torch.Generator().manual_seed(0)
 
-    def random(*shape: int) -> torch.Tensor:
+    def random(*shape: int) -> Tensor:
         return torch.rand(shape, generator=generator)
 
     weight = random(19, 23) if weighted else None
@@ -42,9 +50,10 @@ def test_loss_and_gradients_equal_the_twins(cut_out: bool, weighted: bool, devic
     plain = [value.clone().requires_grad_() for value in given]
     fast = [value.clone().to("cuda" if device != "cpu" else "cpu").requires_grad_() for value in given]
     backdrop = (0.2, 0.9, 0.4)
-    wanted = twin(*plain, target, backdrop, 0.2)
-    there = Target(*(None if v is None else v.to(fast[0].device) for v in vars(target).values()))
-    got = PhotoLoss(0.2, str(fast[0].device), None)(*fast, there, backdrop)
+    wanted = twin(plain[0], plain[1], plain[2], target, backdrop, 0.2)
+    moved = {name: None if v is None else v.to(fast[0].device) for name, v in vars(target).items()}
+    there = replace(target, **moved)
+    got = PhotoLoss(0.2, str(fast[0].device), None)(fast[0], fast[1], fast[2], there, backdrop)
     assert float(got) == pytest.approx(float(wanted), rel=1e-5)
     (3 * wanted).backward()
     (3 * got).backward()

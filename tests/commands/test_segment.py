@@ -9,26 +9,20 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from egs_warp.assets import scene
 from egs_warp.cli import main
-from egs_warp.commands.scene_flags import SceneInput
-from egs_warp.commands.scene_planes import planes_of_scene
-from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_cameras
-from egs_warp.geometry.gaussians import GaussianCloud, joined
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.inpaint import InpaintOptions, inpaint
 from egs_warp.inpainting.inpainters import inpainter_by_name
 from egs_warp.io import read_capture, write_ply
 from egs_warp.io.cameras import write_cameras
 from egs_warp.io.planes import KnownPlane, read_planes, write_planes
-from egs_warp.pipelines.pictures import picture_cameras, plane_picture
-from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene, viewing_direction
-from egs_warp.render import render_gaussians
-from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane, reach_across
+from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene
+from egs_warp.segmentation.clearance import Clearing
 from egs_warp.segmentation.object_mask import ObjectSpec, masks_from_selection
-from tests.segmentation.test_object_mask import FLOOR, ball_on_floor
+from tests.support.scenes import FLOOR, ball_on_floor
 
 
 @pytest.fixture(scope="module")
@@ -127,50 +121,6 @@ def test_mistakes_are_one_line(
     assert message in lines[-1]
 
 
-def test_photographs_beside_the_cameras_clear_the_plane(folder: Path) -> None:
-    """Eq. (21) against photographs of the whole scene; a photo of another size than its camera is no photo of it."""
-    pytest.importorskip("torch")
-    from egs_warp.commands.scene_flags import SceneInput
-    from egs_warp.io import read_cameras
-    from egs_warp.training.photo_colours import in_colours_of, photographs_in_colours_of
-
-    cloud, truth = ball_on_floor()
-    posed = read_cameras(folder / "cameras.json")
-    images = folder / "images"
-    images.mkdir(exist_ok=True)
-    for one in posed[:5]:
-        picture = render_gaussians(cloud, one.camera, background=(0.0, 0.0, 0.0)).colour_srgb8()
-        Image.fromarray(picture[:50] if one is posed[4] else picture).save(images / one.name)
-    given = SceneInput(cloud, read_cameras(folder / "cameras.json"), None, None, None, ())
-    photographs = photographs_in_colours_of(given.cloud, given.posed)
-    assert len(photographs) == 4
-    assert photographs[0].image.shape == (96, 96, 3)
-    expected = render_gaussians(cloud, posed[0].camera, background=(0.0, 0.0, 0.0)).colour.numpy()
-    np.testing.assert_allclose(photographs[0].image, np.clip(expected, 0.0, 1.0), atol=1.0 / 255)
-    # Taken at a third of the exposure, in a warmer light, and with a stranger in front.
-    expected = np.clip(expected, 0.0, 1.0)
-    toned = expected * [0.4, 0.33, 0.25] + 0.02
-    toned[70:80, 40:60] = 1.0
-    matched = in_colours_of(expected, toned, expected.max(axis=2) > 0.1)
-    np.testing.assert_allclose(matched[:70], expected[:70], atol=1.0 / 255)
-    thing = cloud.subset(truth & (cloud.means.numpy()[:, 2] > 0.0))
-    tuned = clear_plane(
-        thing,
-        FLOOR,
-        Clearing.FINETUNE,
-        views=photographs,
-        surroundings=cloud.subset(~truth),
-        options=ClearingOptions(iterations=60, subdivisions=0, weight=3.0),
-    )
-
-    def crossing(one: GaussianCloud) -> float:
-        heights, reach = reach_across(one, FLOOR)
-        return float(np.maximum(reach - np.abs(heights), 0.0).sum())
-
-    assert thing.count - 10 <= tuned.count <= thing.count
-    assert crossing(tuned) < 0.6 * crossing(thing)
-
-
 def test_inpaint_fills_the_hole_that_animate_fills(folder: Path, tmp_path: Path) -> None:
     """Outline and margin go from segment to inpaint by plane.json; an object elsewhere has its own foot."""
     cloud, spec = read_capture(folder / "scene.ply").cloud, ObjectSpec(point=np.array([0.0, -0.5, 0.5]))
@@ -198,75 +148,3 @@ def test_inpaint_fills_the_hole_that_animate_fills(folder: Path, tmp_path: Path)
         broken = {"planes": [entry | {"hole": entry["hole"] | damage}]}
         (tmp_path / "plane.json").write_text(json.dumps(broken))
         assert main(["inpaint", *files, "--out", str(filled)]) == 2
-
-
-def test_further_planes_are_level_patches_in_colours_of_their_own() -> None:
-    """Beside a bedroom's floor only the stool's board and cushion are level; slices of walls and legs are no planes."""
-    made = scene("stool")
-    cloud = joined(made.background, made.object)
-    given = SceneInput(cloud, [], ObjectSpec(point=np.array([0.0, 0.0, 0.68])), None, made.plane, ())
-    found = planes_of_scene(given, plane_mask=None, view=None, count=5)
-    assert [-one.offset for one in found.planes] == pytest.approx([0.0, 0.52, 0.68], abs=0.01)
-    assert all(one.normal[2] > np.cos(np.radians(1.0)) for one in found.planes)
-    assert found.notes[-1] == "3 of 5 planes found"
-    cameras = picture_cameras(made.plane, found.centre, found.size)[1:2]
-    picture = plane_picture(cloud, found.planes[:2], cameras, centre=found.centre, size=found.size).astype(float)
-    red, green, _ = np.moveaxis(picture, -1, 0)
-    assert (red - green > 90).mean() > 0.01
-    assert (green - red > 60).mean() > 0.002
-
-
-def test_a_capture_with_nothing_flat_has_one_plane() -> None:
-    """Round Gaussians on a grid: the plane that is given, and none beside it."""
-    x, y = (values.ravel() for values in np.meshgrid(np.linspace(-1.0, 1.0, 40), np.linspace(-1.0, 1.0, 40)))
-    means = np.stack([x, y, np.zeros_like(x)], axis=1)
-    box = (np.abs(x) < 0.2) & (np.abs(y) < 0.2)
-    means = np.concatenate([means, *(means[box] + [0.0, 0.0, height] for height in np.linspace(0.03, 0.6, 12))])
-    count = len(means)
-    cloud = GaussianCloud.from_numpy(
-        means,
-        np.tile([1.0, 0, 0, 0], (count, 1)),
-        np.full((count, 3), -3.5),
-        np.full(count, 4.0),
-        np.zeros((count, 1, 3)),
-    )
-    given = SceneInput(cloud, [], ObjectSpec(point=np.array([0.0, 0.0, 0.3])), None, FLOOR, ())
-    found = planes_of_scene(given, plane_mask=None, view=None, count=2)
-    assert len(found.planes) == 1 and found.notes[-1] == "1 of 2 planes found"
-
-
-def test_plane_files_are_checked(tmp_path: Path) -> None:
-    path = tmp_path / "plane.json"
-    planes = [FLOOR, Plane.from_coefficients(0.0, 1.0, 0.0, 2.0)]
-    write_planes(path, [KnownPlane(planes[0], noise=0.01), KnownPlane(planes[1])])
-    for one, other in zip((known.plane for known in read_planes(path)), planes, strict=True):
-        np.testing.assert_allclose([*one.normal, one.offset], [*other.normal, other.offset])
-    for text, message in (
-        ("{", "not readable JSON"),
-        ("[]", "it has no planes"),
-        ('{"planes": [{"normal": [1, 2]}]}', "plane 0 needs normal"),
-        ('{"planes": [{"normal": [0, 0, 0], "offset": 1}]}', "a normal that is not zero"),
-        (f'{{"planes": [{{"normal": [0, 0, {401 * "1"}], "offset": 1}}]}}', "give four finite numbers"),
-    ):
-        path.write_text(text)
-        with pytest.raises(UserError, match=message):
-            read_planes(path)
-
-
-def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:
-    cloud, _ = ball_on_floor()
-    stages: list[str] = []
-    prepared = prepare_scene(
-        cloud,
-        ObjectSpec(point=np.array([0.0, -0.5, 0.5])),
-        options=SceneOptions(clearing=Clearing.SPLIT, inpaint=False),
-        progress=stages.append,
-    )
-    assert stages == ["plane", "segment"]
-    assert prepared.background is prepared.bare
-    assert any("straddled the plane: static split" in note for note in prepared.notes)
-    cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.9, count=3, elevations=(20.0, 40.0, 60.0))
-    direction = viewing_direction(prepared, cameras)
-    np.testing.assert_allclose(direction, cameras[1].centre - prepared.located.centre)
-    up = viewing_direction(prepared, [])
-    assert 0.3 < up @ prepared.plane.normal / np.linalg.norm(up) < 0.6

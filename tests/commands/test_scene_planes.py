@@ -1,0 +1,49 @@
+"""The plane under the object and further ones: level patches in colours of their own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.assets import scene
+from egs_warp.commands.scene_flags import SceneInput
+from egs_warp.commands.scene_planes import planes_of_scene
+from egs_warp.geometry.gaussians import GaussianCloud, joined
+from egs_warp.pipelines.pictures import picture_cameras, plane_picture
+from egs_warp.segmentation.object_mask import ObjectSpec
+from tests.support.scenes import FLOOR
+
+
+def test_further_planes_are_level_patches_in_colours_of_their_own() -> None:
+    """Beside a bedroom's floor only the stool's board and cushion are level; slices of walls and legs are no planes."""
+    made = scene("stool")
+    cloud = joined(made.background, made.object)
+    given = SceneInput(cloud, [], ObjectSpec(point=np.array([0.0, 0.0, 0.68])), None, made.plane, ())
+    found = planes_of_scene(given, plane_mask=None, view=None, count=5)
+    assert [-one.offset for one in found.planes] == pytest.approx([0.0, 0.52, 0.68], abs=0.01)
+    assert all(one.normal[2] > np.cos(np.radians(1.0)) for one in found.planes)
+    assert found.notes[-1] == "3 of 5 planes found"
+    cameras = picture_cameras(made.plane, found.centre, found.size)[1:2]
+    picture = plane_picture(cloud, found.planes[:2], cameras, centre=found.centre, size=found.size).astype(float)
+    red, green, _ = np.moveaxis(picture, -1, 0)
+    assert (red - green > 90).mean() > 0.01
+    assert (green - red > 60).mean() > 0.002
+
+
+def test_a_capture_with_nothing_flat_has_one_plane() -> None:
+    """Round Gaussians on a grid: the plane that is given, and none beside it."""
+    x, y = (values.ravel() for values in np.meshgrid(np.linspace(-1.0, 1.0, 40), np.linspace(-1.0, 1.0, 40)))
+    means = np.stack([x, y, np.zeros_like(x)], axis=1)
+    box = (np.abs(x) < 0.2) & (np.abs(y) < 0.2)
+    means = np.concatenate([means, *(means[box] + [0.0, 0.0, height] for height in np.linspace(0.03, 0.6, 12))])
+    count = len(means)
+    cloud = GaussianCloud.from_numpy(
+        means,
+        np.tile([1.0, 0, 0, 0], (count, 1)),
+        np.full((count, 3), -3.5),
+        np.full(count, 4.0),
+        np.zeros((count, 1, 3)),
+    )
+    given = SceneInput(cloud, [], ObjectSpec(point=np.array([0.0, 0.0, 0.3])), None, FLOOR, ())
+    found = planes_of_scene(given, plane_mask=None, view=None, count=2)
+    assert len(found.planes) == 1 and found.notes[-1] == "1 of 2 planes found"

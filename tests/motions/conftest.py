@@ -1,0 +1,21 @@
+"""The block that the motions are tried on, posed by hand, or simulated once for all tests."""
+
+from __future__ import annotations
+
+import pytest
+
+from egs_warp.motions.sequence import Place
+from tests.support.places import block_place
+from tests.support.runs import Run, coarse_block_run
+
+
+@pytest.fixture
+def place() -> Place:
+    """A block of 0.4 x 0.4 x 1 metres that stands on z = 0 and faces +x."""
+    return block_place()
+
+
+@pytest.fixture(scope="session")
+def coarse_run() -> Run:
+    """A block that hops onto a square half a metre ahead and then twists by 45 degrees."""
+    return coarse_block_run("hop 0.5 0.25, twist 45")

@@ -1,0 +1,35 @@
+"""Jumps on a block that is posed by hand: the lean, and the frame of the landing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.fem.body import BodyState
+from egs_warp.motions.jump import Jump, JumpPhase
+from egs_warp.motions.jump_plan import JumpTarget
+from egs_warp.motions.sequence import Place
+from egs_warp.motions.twist import Turning
+from tests.support.places import DT, moved
+
+
+def test_a_landing_frame_holds_the_landed_body(place: Place) -> None:
+    """From take-off on, a body that stands turned at the target has the coordinates of the start."""
+    target = JumpTarget(0.5, 0.3, 0.1)
+    jump = Jump(place, target, facing=Turning(place, 0.8))
+    start = place.ground.local(place.standing)
+    jump.phase = JumpPhase.THRUST
+    flying = place.standing + [0.2, 0.0, 0.3]
+    jump.objectives(BodyState(flying, np.tile([1.0, 0.0, 2.5], (len(flying), 1)), 0.01), None, DT)
+    assert jump.phase is JumpPhase.FLIGHT and jump.left_ground
+    landed = moved(place, 0.8, np.array([0.5, 0.0, 0.1]))
+    assert np.allclose(jump.ground.local(landed), start)
+    assert jump.pose.measure(BodyState(landed, 0 * landed), None).heading == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(("distance", "lean"), [(0.0, 0.0), (0.3, 0.06), (2.0, 0.07)])
+def test_the_weight_goes_ahead_with_the_distance_and_stays_well_behind_the_toes(
+    place: Place, distance: float, lean: float
+) -> None:
+    """A fifth of the distance, at most 0.35 of the 0.2 metres to the front of the feet."""
+    assert Jump(place, JumpTarget(distance, 0.3)).plan.lean == pytest.approx(lean)

@@ -1,0 +1,90 @@
+"""Twists on a block that is posed by hand: what spin is asked of the ground, and what shape in the air."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.fem.body import BodyState
+from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.motions.jump import Jump, JumpPhase
+from egs_warp.motions.jump_plan import JumpTarget
+from egs_warp.motions.sequence import Place
+from egs_warp.motions.twist import SLIDE, twist
+from tests.support.places import DT, moved
+
+
+def yaw_asked(jump: Jump, state: BodyState) -> float:
+    """Angular momentum about up, kg m^2/s, that the step from ``state`` asks for."""
+    spin = jump.objectives(state, None, DT)[1]
+    assert isinstance(spin, SpinObjective)
+    return float(spin.target[2])
+
+
+def inertia_about_up(place: Place, positions: np.ndarray) -> float:
+    flat = positions[:, :2] - place.body.centre_of_mass(positions)[:2]
+    return float(place.body.node_mass @ (flat**2).sum(axis=1))
+
+
+@pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.0 * np.pi])
+def test_a_twist_asks_friction_for_the_spin_that_is_left(place: Place, turn: float) -> None:
+    """In the thrust: the spin that turns the standing body by what is left while it flies, whatever its shape now, and
+    a reserve.
+
+    What is asked falls in proportion to the angle turned and is nothing a few degrees, which the feet slide on by,
+    before the end. Its own turning is counted beyond half turns.
+    """
+    jump = twist(place, JumpTarget(0.0, 0.2), turn)
+    jump.phase = JumpPhase.THRUST
+    still, sign = np.zeros_like(place.standing), np.sign(turn)
+    angles = np.array([0.0, 0.3, 0.6])
+    asked = [yaw_asked(jump, BodyState(moved(place, sign * angle, np.zeros(3)), still, 0.0)) for angle in angles]
+    slope, start = np.polyfit(angles, sign * np.array(asked), 1)
+    assert np.allclose(sign * np.array(asked), start + slope * angles, rtol=1e-3)
+    assert 0.0 < np.degrees(abs(turn) + start / slope) < 10.0
+    reserve = -slope * jump.plan.flight_time / inertia_about_up(place, place.standing)
+    assert 1.2 < reserve < 1.7
+    crouched = moved(place, float(sign * 0.6), np.zeros(3))
+    middle = place.body.centre_of_mass(crouched)
+    crouched = middle + (crouched - middle) * [1.1, 1.1, 0.8]
+    assert yaw_asked(jump, BodyState(crouched, still, 0.0)) == pytest.approx(asked[-1], rel=1e-3)
+    for angle in np.linspace(0.6, abs(turn), 12) * sign:
+        jump.objectives(BodyState(moved(place, angle, np.zeros(3)), still, 0.0), None, DT)
+    assert jump.facing.turned == pytest.approx(turn)
+
+
+def test_in_the_air_the_body_takes_the_width_with_which_its_spin_makes_the_turn(place: Place) -> None:
+    """Angular momentum L is kept: the inertia I (arms in or out) that turns by the angle left in the time left is L t /
+    angle.
+
+    Nodes are asked to approach that shape at one rate; at the spin that fits the body as it stands they are asked for
+    nothing.
+    """
+    turn, speed = 1.5, 2.5
+    left = turn - SLIDE
+    time = 2.0 * speed / 9.81
+    corners = [int(np.argmin(np.linalg.norm(place.standing - [x, x, 0.0], axis=1))) for x in (-0.2, 0.2)]
+    arms = place.standing - place.body.centre_of_mass(place.standing)
+    fitting = left / time
+    rates = []
+    for width in (1.0, 1.05, 0.95):
+        jump = twist(place, JumpTarget(0.0, 0.2), turn)
+        jump.phase = JumpPhase.THRUST
+        spin = fitting * width**2
+        velocities = np.cross([0.0, 0.0, spin], arms) + [0.0, 0.0, speed]
+        flying = BodyState(place.standing, velocities, 0.01)
+        for _ in range(2):  # the second time the pose asked for is at rest
+            objectives = jump.objectives(flying, None, DT)
+        assert jump.phase is JumpPhase.FLIGHT
+        shape = objectives[2]
+        assert isinstance(shape, Objective)
+        mass = np.sqrt(place.body.node_mass / place.body.mass)[:, None]
+        wanted = shape.target.reshape(-1, 3) / mass
+        apart = wanted[corners[1], :2] - wanted[corners[0], :2]
+        if width == 1.0:
+            assert np.abs(apart).max() < 1e-9
+        else:
+            # d(arm)/dt = rate (width - 1) arm
+            rates.append(apart / (0.4 * (width - 1.0)))
+    assert np.min(rates) > 1.0
+    assert np.allclose(rates, rates[0][0], rtol=1e-6)

@@ -1,0 +1,51 @@
+"""Coarse bodies with muscles that stand where a motion begins."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from egs_warp.contact.detection import ContactGeometry
+from egs_warp.deformation.embedding import embed_points
+from egs_warp.fem.body import BodyState, make_body
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.locomotion.rollout import settle
+from egs_warp.locomotion.stepper import LocomotionStepper
+from egs_warp.motions.sequence import Place
+from egs_warp.motions.stance import Ground
+from egs_warp.muscles.muscle_set import automatic_muscles
+from tests.support.meshes import UP
+from tests.support.places import DT, FLOOR
+
+
+@dataclass(frozen=True)
+class CoarseCreature:
+    """A stepper, the place where its body stands, and its state there."""
+
+    stepper: LocomotionStepper
+    place: Place
+    start: BodyState
+
+
+def coarse_creature(
+    mesh: TetMesh,
+    *,
+    forward: np.ndarray,
+    up: np.ndarray = UP,
+    sag: float = 0.05,
+    strength: float = 4.0,
+    settled: bool = True,
+) -> CoarseCreature:
+    """A body of ``mesh`` on its lowest nodes, facing ``forward`` (3,); ``up`` (3,) is against gravity."""
+    body = make_body(mesh, FLOOR, up=up, sag=sag, device="cpu")
+    muscles = automatic_muscles(
+        mesh, UP, body_weight=body.weight, height=body.height, young_modulus=body.young_modulus, strength=strength
+    )
+    soles = embed_points(mesh, mesh.nodes[mesh.nodes[:, 2] == 0.0], device="cpu")
+    geometry = ContactGeometry(mesh, (FLOOR,), 0.8, soles.tets.numpy(), soles.weights.numpy(), 0, 0.0)
+    stepper = LocomotionStepper(body, muscles, geometry, device="cpu")
+    start = settle(stepper) if settled else BodyState(mesh.nodes, np.zeros_like(mesh.nodes))
+    ground = Ground.on(FLOOR, forward, body.centre_of_mass(start.positions), up=up)
+    touching = stepper.detector.points_within(start.positions, 0.01)
+    return CoarseCreature(stepper, Place(body, ground, start.positions, touching, DT), start)

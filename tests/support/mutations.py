@@ -1,0 +1,262 @@
+"""Deliberately wrong formulas, each with the test that must notice: what ``tests/test_teeth.py`` tries one by one.
+
+A formula of the package that is rewritten has its line rewritten here too: the mutation must still be the formula,
+wrong.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Mutation:
+    """One wrong formula."""
+
+    what: str
+    """The formula, with its equation in the paper as "Eq. (n)" if it has one."""
+    file: str
+    """Of the package."""
+    right: str
+    """Stands once in the file."""
+    wrong: str
+    test: str
+    """file::function that fails under it."""
+
+
+def _equation(number: int, what: str, file: str, right: str, wrong: str, test: str) -> Mutation:
+    return Mutation(f"Eq. ({number}): {what}", file, right, wrong, test)
+
+
+EQUATIONS: dict[int, Mutation] = {
+    number: _equation(number, what, f"egs_warp/{file}", right, wrong, f"tests/{test}")
+    for number, what, file, right, wrong, test in [
+        (
+            *(1, "the plane's sign", "geometry/plane.py"),
+            *("self.normal + self.offset", "self.normal - self.offset"),
+            "segmentation/test_plane_fit.py::test_plane_measures_height_towards_the_objects_side",
+        ),
+        (
+            *(2, "which weight is whose", "kernels/deformation/embedding.py"),
+            *("w[2], w[0], w[1], w[2])", "w[2], w[1], w[0], w[2])"),
+            "deformation/test_embedding.py::test_weights_reproduce_points_and_shared_faces_take_the_lowest_tet",
+        ),
+        (
+            *(3, "the shortening of what reaches below the plane", "contact/detection.py"),
+            *("means[above] + reach[:, None] * arm", "means[above] + arm"),
+            "contact/test_detection.py::test_endpoints_are_shortened_to_the_plane_at_rest",
+        ),
+        (
+            *(4, "the force's factor dt", "fem/implicit_step.py"),
+            *("self.dt * (internal - force)", "self.dt * (internal - 1.01 * force)"),
+            "fem/test_implicit_step.py::test_free_fall_follows_the_discrete_parabola",
+        ),
+        (
+            *(5, "the half of lambda log^2 J", "kernels/fem/elasticity.py"),
+            *("mu * log_j + real(0.5) * lam * log_j", "mu * log_j + real(0.6) * lam * log_j"),
+            "fem/test_elasticity.py::test_gradient_is_derivative_of_energy",
+        ),
+        (
+            *(6, "the drag on the end velocity", "fem/implicit_step.py"),
+            *("self.dt * self.drag * velocities)", "self.dt * self.drag * self.state.velocities)"),
+            "fem/test_implicit_step.py::test_drag_slows_free_flight_exponentially",
+        ),
+        (
+            *(7, "the direction of a segment's pull", "kernels/muscles/columns.py"),
+            *("columns_out[3 * node + axis, segment] = row", "columns_out[3 * node + axis, segment] = -row"),
+            "muscles/test_muscle_set.py::test_columns_are_equation_7",
+        ),
+        (
+            *(8, "the plane's offset", "kernels/contact/gaps.py"),
+            *("plane[2] * x[2] + plane[3]", "plane[2] * x[2] - plane[3]"),
+            "contact/test_detection.py::test_gaps_kernel_equals_its_twin",
+        ),
+        (
+            *(9, "the radius of Coulomb's cone", "contact/coulomb.py"),
+            *(
+                "    radius = friction * np.maximum(normal, 0.0)",
+                "    radius = 1.02 * friction * np.maximum(normal, 0.0)",
+            ),
+            "contact/test_detection.py::test_coulomb_forces_on_random_problems",
+        ),
+        (
+            *(10, "the penalty's energy", "contact/penalty.py"),
+            *("(0.5 * self.normal_stiffness * depth**2 + huber)", "(self.normal_stiffness * depth**2 + huber)"),
+            "contact/test_penalty.py::test_penalty_derivatives",
+        ),
+        (
+            *(11, "Coulomb's limit", "contact/penalty.py"),
+            *("np.minimum(self.normal_stiffness * speed, self.friction_cap)", "self.normal_stiffness * speed"),
+            "contact/test_penalty.py::test_friction_never_exceeds_coulomb",
+        ),
+        (
+            *(12, "the direction of the slip", "locomotion/complementarity.py"),
+            *("slide = np.argmin(velocities @ table.T", "slide = np.argmax(velocities @ table.T"),
+            "locomotion/test_complementarity.py::test_states_from_prediction",
+        ),
+        (
+            *(13, "the pair of the slip and the cone", "locomotion/complementarity.py"),
+            *("[states != STATIC] = 0.0", "[states == STATIC] = 0.0"),
+            "locomotion/test_complementarity.py::test_every_state_satisfies_the_complementarity_conditions",
+        ),
+        (
+            *(14, "the mean of F+ and F-", "kernels/deformation/deformer.py"),
+            *("average = 0.5 * (both.plus + both.minus)", "average = both.plus"),
+            "deformation/test_deformer.py::test_arms_go_where_their_ends_go",
+        ),
+        (
+            *(15, "the turn of the colour", "kernels/deformation/deformer.py"),
+            *(
+                "result.turn = quaternion_of(turned * wp.transpose(axes))",
+                "result.turn = quaternion_of(axes * wp.transpose(turned))",
+            ),
+            "deformation/test_deformer.py::test_a_turned_cage_turns_shape_and_colour_exactly",
+        ),
+        (
+            *(16, "the bend's angle", "kernels/deformation/deformer.py"),
+            *("wp.trace(between) - 1.0", "wp.trace(between) + 1.0"),
+            "deformation/test_deformer.py::test_bend_angle_is_the_angle_between_the_arms",
+        ),
+        (
+            *(17, "the children's distance", "deformation/splitting.py"),
+            *("np.array([-1.0, 1.0]) * np.sqrt(2.0 / np.pi)", "np.array([-1.0, 1.0]) * np.sqrt(0.5 * np.pi)"),
+            "deformation/test_splitting.py::test_children_keep_mean_and_covariance",
+        ),
+        (
+            *(18, "depth along the ray, not distance", "segmentation/plane_fit.py"),
+            *(
+                "-height / np.where(slope == 0.0, np.inf, slope)",
+                "-height / np.where(slope == 0.0, np.inf, 1.001 * slope)",
+            ),
+            "segmentation/test_plane_fit.py::test_depth_puts_every_pixel_on_the_plane",
+        ),
+        (
+            *(19, "the residual", "segmentation/plane_fit.py"),
+            *("(self.rays @ plane.normal) + camera) / camera", "(self.rays @ plane.normal) + 1.01 * camera) / camera"),
+            "segmentation/test_plane_fit.py::test_exact_depth_gives_the_exact_plane",
+        ),
+        (
+            *(20, "the longest tip", "kernels/segmentation/clearance.py"),
+            *("axis_reach_out[row] = wp.max(w)", "axis_reach_out[row] = wp.min(w)"),
+            "segmentation/test_clearance.py::test_reach_is_that_of_the_six_tips_or_of_the_whole_ellipsoid",
+        ),
+        (
+            *(21, "the loss of one that straddles", "segmentation/clearance.py"),
+            *("torch.relu(eta - height.abs())", "torch.relu(eta - height)"),
+            "segmentation/test_clearance.py::test_loss_is_the_sum_over_straddling_gaussians",
+        ),
+    ]
+}
+"""One of each equation of the paper; ``docs/equations.md`` says where else it is and what else tests it."""
+
+BESIDE_THE_PAPER: list[Mutation] = [
+    Mutation(what, f"egs_warp/{file}", right, wrong, f"tests/{test}")
+    for what, file, right, wrong, test in [
+        (
+            *("SSIM's window", "training/finetune.py", "(2 * 1.5**2)", "(2 * 1.6**2)"),
+            "training/test_finetune.py::test_ssim_equals_scikit_images",
+        ),
+        (
+            *("SSIM's constants", "training/finetune.py", "0.01**2, 0.03**2", "0.01**2, 0.01**2"),
+            "training/test_finetune.py::test_ssim_equals_scikit_images",
+        ),
+        (
+            *("MCMC's noise: Sigma, not its root", "training/relocation.py", "noise) * scales**2", "noise) * scales"),
+            "training/test_finetune.py::test_the_noise_of_mcmc_has_the_covariance_of_the_shape_squared",
+        ),
+        (
+            *("MCMC's noise: the axes", "training/relocation.py", '"nij,nj->ni", axes', '"nji,nj->ni", axes'),
+            "training/test_finetune.py::test_the_noise_of_mcmc_has_the_covariance_of_the_shape_squared",
+        ),
+        (
+            *("MCMC's noise: the gate", "training/relocation.py", "sigmoid(-100.0 *", "sigmoid(-80.0 *"),
+            "training/test_finetune.py::test_the_noise_of_mcmc_has_the_covariance_of_the_shape_squared",
+        ),
+        (
+            *("fTetWild: always the lattice instead", "meshing/tetwild.py"),
+            *("return TetMesh.oriented(nodes, tets)", "return None"),
+            "meshing/test_cage.py::test_tetwild",
+        ),
+        (
+            *("a jump's plan: half a step of gravity", "motions/jump_plan.py"),
+            *("(2.0 * gravity * rise) + 0.5 * gravity * step", "(2.0 * gravity * rise)"),
+            "motions/test_jump_plan.py::test_a_body_that_does_as_planned_reaches_height_and_distance",
+        ),
+        (
+            *("a jump's plan: half a step of the thrust", "motions/jump_plan.py"),
+            *("stroke += 0.5 * speed_up * step", "stroke += speed_up * step"),
+            "motions/test_jump_plan.py::test_a_body_that_does_as_planned_reaches_height_and_distance",
+        ),
+        (
+            *("a jump's plan: the time down to a landing that is higher", "motions/jump_plan.py"),
+            *("max(rise - target.rise, 0.0)", "max(rise + target.rise, 0.0)"),
+            "motions/test_jump_plan.py::test_a_body_that_does_as_planned_reaches_height_and_distance",
+        ),
+        (
+            *("a jump's plan: the capture point", "motions/jump_plan.py"),
+            *("np.sqrt(com_height / (1.3 * gravity))", "np.sqrt(com_height / gravity)"),
+            "motions/test_jump_plan.py::test_a_body_that_does_as_planned_reaches_height_and_distance",
+        ),
+        (
+            *("balance: the centre of pressure under load", "motions/stance.py"),
+            *("max(gravity + up, 0.2 * gravity)", "gravity"),
+            "motions/test_stance.py::test_the_nearest_acceleration_that_does_not_tip",
+        ),
+        (
+            *("balance: the margin of the footprint", "motions/stance.py"),
+            *("place + margin * self.support_high", "place + self.support_high"),
+            "motions/test_stance.py::test_the_nearest_acceleration_that_does_not_tip",
+        ),
+        (
+            *("the largest turn: the lever of a disc", "motions/turn.py"),
+            *("2.0 / 3.0 * float(", "3.0 / 4.0 * float("),
+            "motions/test_turn.py::test_the_largest_turn_is_that_of_a_disc_that_twists_on_rough_ground",
+        ),
+        (
+            *("the largest turn: the impulse of the weight", "motions/turn.py"),
+            *("(plan.speed_up + jump.gravity * plan.thrust_time)", "plan.speed_up"),
+            "motions/test_turn.py::test_the_largest_turn_is_that_of_a_disc_that_twists_on_rough_ground",
+        ),
+        (
+            *("the largest turn: the pyramid of friction", "motions/turn.py"),
+            *("rate = PYRAMID * place.friction", "rate = place.friction"),
+            "motions/test_turn.py::test_the_largest_turn_is_that_of_a_disc_that_twists_on_rough_ground",
+        ),
+        (
+            *("twist: the spin of the standing body, not of the crouched one", "motions/twist.py"),
+            *(
+                "yaw = yaw * self._standing_inertia / float(up @ self.body.inertia(state.positions) @ up)",
+                "yaw = 1.0 * yaw",
+            ),
+            "motions/test_twist.py::test_a_twist_asks_friction_for_the_spin_that_is_left",
+        ),
+        (
+            *("twist: the time of flight", "motions/twist.py"),
+            *("(AIRBORNE_SHARE * flight_time)", "(2.0 * AIRBORNE_SHARE * flight_time)"),
+            "motions/test_twist.py::test_a_twist_asks_friction_for_the_spin_that_is_left",
+        ),
+        (
+            *("twist: arms as the square root of the inertia", "motions/twist.py"),
+            *("width = float(np.sqrt(np.clip(", "width = float((np.clip("),
+            "motions/test_twist.py::test_in_the_air_the_body_takes_the_width_with_which_its_spin_makes_the_turn",
+        ),
+        (
+            *("radial fibres: their pull", "kernels/muscles/columns.py"),
+            *("segment] = row_weights[entry] * force[axis]", "segment] = real(1.1) * row_weights[entry] * force[axis]"),
+            "muscles/test_muscle_set.py::test_radial_fibres_lengthen_by_poissons_ratio",
+        ),
+        (
+            *("radial fibres: how far out they end", "muscles/tube.py"),
+            *("_RADIUS_FRACTION * reach * outwards", "0.5 * reach * outwards"),
+            "muscles/test_muscle_set.py::test_radial_fibres_are_diameters_spread_over_length_and_directions",
+        ),
+        (
+            *("radial fibres: spread over the directions", "muscles/tube.py"),
+            *("diameter * count // (2 * self.detail.diameters)", "0"),
+            "muscles/test_muscle_set.py::test_radial_fibres_are_diameters_spread_over_length_and_directions",
+        ),
+    ]
+]
+"""Formulas that the paper leaves open."""
+
+ALL = [*EQUATIONS.values(), *BESIDE_THE_PAPER]

@@ -1,0 +1,62 @@
+"""Photographs of a scene in the colours of its capture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from egs_warp.commands.scene_flags import SceneInput
+from egs_warp.geometry.camera_ring import ring_cameras
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.io.cameras import write_cameras
+from egs_warp.render import render_gaussians
+from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane, reach_across
+from tests.support.scenes import FLOOR, ball_on_floor
+
+
+def test_photographs_beside_the_cameras_clear_the_plane(tmp_path: Path) -> None:
+    """Eq. (21) against photographs of the whole scene; a photo of another size than its camera is no photo of it."""
+    pytest.importorskip("torch")
+    from egs_warp.io import read_cameras
+    from egs_warp.training.photo_colours import in_colours_of, photographs_in_colours_of
+
+    cloud, truth = ball_on_floor()
+    cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.9, count=6, size=96)
+    write_cameras(tmp_path / "cameras.json", cameras, [f"photo{k}.png" for k in range(6)])
+    posed = read_cameras(tmp_path / "cameras.json")
+    images = tmp_path / "images"
+    images.mkdir()
+    for one in posed[:5]:
+        picture = render_gaussians(cloud, one.camera, background=(0.0, 0.0, 0.0)).colour_srgb8()
+        Image.fromarray(picture[:50] if one is posed[4] else picture).save(images / one.name)
+    given = SceneInput(cloud, read_cameras(tmp_path / "cameras.json"), None, None, None, ())
+    photographs = photographs_in_colours_of(given.cloud, given.posed)
+    assert len(photographs) == 4
+    assert photographs[0].image.shape == (96, 96, 3)
+    expected = render_gaussians(cloud, posed[0].camera, background=(0.0, 0.0, 0.0)).colour.numpy()
+    np.testing.assert_allclose(photographs[0].image, np.clip(expected, 0.0, 1.0), atol=1.0 / 255)
+    # Taken at a third of the exposure, in a warmer light, and with a stranger in front.
+    expected = np.clip(expected, 0.0, 1.0)
+    toned = expected * [0.4, 0.33, 0.25] + 0.02
+    toned[70:80, 40:60] = 1.0
+    matched = in_colours_of(expected, toned, expected.max(axis=2) > 0.1)
+    np.testing.assert_allclose(matched[:70], expected[:70], atol=1.0 / 255)
+    thing = cloud.subset(truth & (cloud.means.numpy()[:, 2] > 0.0))
+    tuned = clear_plane(
+        thing,
+        FLOOR,
+        Clearing.FINETUNE,
+        views=photographs,
+        surroundings=cloud.subset(~truth),
+        options=ClearingOptions(iterations=60, subdivisions=0, weight=3.0),
+    )
+
+    def crossing(one: GaussianCloud) -> float:
+        heights, reach = reach_across(one, FLOOR)
+        return float(np.maximum(reach - np.abs(heights), 0.0).sum())
+
+    assert thing.count - 10 <= tuned.count <= thing.count
+    assert crossing(tuned) < 0.6 * crossing(thing)
