@@ -42,6 +42,7 @@ class Population:
         extent: float,
         generator: torch.Generator,
     ) -> None:
+        wp.init()  # torch's tensors are handed over before any kernel is launched
         self.tensors = tensors
         self._rates = {name: rates[name] * (extent if name == "means" else 1.0) for name in tensors}
         self._extent = extent

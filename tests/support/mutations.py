@@ -153,23 +153,34 @@ BESIDE_THE_PAPER: list[Mutation] = [
     Mutation(what, f"egs_warp/{file}", right, wrong, f"tests/{test}")
     for what, file, right, wrong, test in [
         (
-            *("SSIM's window", "training/finetune.py", "(2 * 1.5**2)", "(2 * 1.6**2)"),
+            *("SSIM's window", "training/likeness.py", "(2 * 1.5**2)", "(2 * 1.6**2)"),
             "training/test_finetune.py::test_ssim_equals_scikit_images",
         ),
         (
-            *("SSIM's constants", "training/finetune.py", "0.01**2, 0.03**2", "0.01**2, 0.01**2"),
+            *("SSIM's constants", "training/likeness.py", "0.01**2, 0.03**2", "0.01**2, 0.01**2"),
             "training/test_finetune.py::test_ssim_equals_scikit_images",
         ),
         (
-            *("MCMC's noise: Sigma, not its root", "training/relocation.py", "noise) * scales**2", "noise) * scales"),
+            *("MCMC's noise: Sigma, not its root", "kernels/training/population.py"),
+            *("wp.exp(2.0 * s[0]) * local[0]", "wp.exp(s[0]) * local[0]"),
             "training/test_finetune.py::test_the_noise_of_mcmc_has_the_covariance_of_the_shape_squared",
         ),
         (
-            *("MCMC's noise: the axes", "training/relocation.py", '"nij,nj->ni", axes', '"nji,nj->ni", axes'),
+            *(
+                "MCMC's noise: the axes",
+                "kernels/training/population.py",
+                "(turn * local)",
+                "(wp.transpose(turn) * local)",
+            ),
             "training/test_finetune.py::test_the_noise_of_mcmc_has_the_covariance_of_the_shape_squared",
         ),
         (
-            *("MCMC's noise: the gate", "training/relocation.py", "sigmoid(-100.0 *", "sigmoid(-80.0 *"),
+            *(
+                "MCMC's noise: the gate",
+                "kernels/training/population.py",
+                "STEEPNESS = wp.constant(wp.float32(100.0))",
+                "STEEPNESS = wp.constant(wp.float32(80.0))",
+            ),
             "training/test_finetune.py::test_the_noise_of_mcmc_has_the_covariance_of_the_shape_squared",
         ),
         (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from egs_warp.geometry.gaussians import GaussianCloud
-from tests.training.test_finetune import ball, ring
+from tests.support.training_views import ball, ring
 
 torch = pytest.importorskip("torch")
 from egs_warp.training.finetune import FinetuneOptions, finetune, views_of_capture  # noqa: E402
