@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.linalg as dense
+import warp as wp
+
+from egs_warp.kernels.contact.coulomb import gauss_seidel_kernel
 
 
 def coulomb_forces(
@@ -40,8 +43,7 @@ def coulomb_forces(
 
     best, best_size = force, np.inf
     for attempt in range(4):
-        for _ in range(3 + 60 * attempt):
-            force = _gauss_seidel_sweep(delassus, blocks, rate, free_velocity, shift, friction, force)
+        force = _swept(delassus, free_velocity, shift, friction, force, sweeps=3 + 60 * attempt)
         value, velocity = residual(force)
         for _ in range(iteration_limit):
             current = size(value)
@@ -91,47 +93,44 @@ def _project(force: np.ndarray, normal: np.ndarray, friction: float) -> np.ndarr
     return projected
 
 
-def _gauss_seidel_sweep(
+def _swept(
     delassus: np.ndarray,
-    blocks: np.ndarray,
-    rate: np.ndarray,
     free_velocity: np.ndarray,
     shift: np.ndarray,
     friction: float,
     force: np.ndarray,
+    *,
+    sweeps: int,
 ) -> np.ndarray:
-    force = force.copy()
-    for i in range(len(shift)):
-        velocity = free_velocity[3 * i : 3 * i + 3] + delassus[3 * i : 3 * i + 3] @ force.ravel()
-        normal = max(force[i, 0] - (velocity[0] + shift[i]) / blocks[i, 0, 0], 0.0)
-        velocity = velocity + blocks[i, :, 0] * (normal - force[i, 0])
-        tangent = force[i, 1:] - velocity[1:] / max(blocks[i, 1, 1], blocks[i, 2, 2])
-        length = np.hypot(*tangent)
-        if length > friction * normal:
-            tangent = tangent * (friction * normal / length)
-        force[i] = (normal, *tangent)
-    return force
+    """(n, 3) forces after Gauss-Seidel sweeps that start from ``force``."""
+    swept = np.ascontiguousarray(force, dtype=np.float64).copy()
+    arrays = [
+        wp.array(np.ascontiguousarray(value), device="cpu", copy=False) for value in (delassus, free_velocity, shift)
+    ]
+    out = wp.array(swept.reshape(-1), device="cpu", copy=False)
+    wp.launch(gauss_seidel_kernel, dim=1, inputs=[*arrays, friction, sweeps, out], device="cpu")
+    return out.numpy().reshape(swept.shape).copy()
 
 
 def _projection_jacobian(
     delassus: np.ndarray, rate: np.ndarray, force: np.ndarray, velocity: np.ndarray, friction: float
 ) -> np.ndarray:
+    """Derivative (3n, 3n) of ``force`` - its projection, row by row as each contact separates, sticks or slides."""
     count = len(force)
     trial = force - rate[:, None] * velocity
     moved = np.eye(3 * count) - np.repeat(rate, 3)[:, None] * delassus
-    jacobian = np.eye(3 * count)
+    moved = moved.reshape(count, 3, 3 * count)
     length = np.linalg.norm(trial[:, 1:], axis=1)
     radius = friction * np.maximum(force[:, 0], 0.0)
-    for i in range(count):
-        n, t = 3 * i, slice(3 * i + 1, 3 * i + 3)
-        if trial[i, 0] > 0.0:
-            jacobian[n] -= moved[n]
-        if length[i] <= radius[i]:
-            jacobian[t] -= moved[t]
-        elif length[i] > 0.0:
-            direction = trial[i, 1:] / length[i]
-            slide = radius[i] / length[i] * (np.eye(2) - np.outer(direction, direction))
-            jacobian[t] -= slide @ moved[t]
-            if force[i, 0] > 0.0:
-                jacobian[t, n] -= friction * direction
+    sliding = length > radius
+    safe = np.where(length > 0.0, length, 1.0)
+    direction = trial[:, 1:] / safe[:, None]
+    slide = (radius / safe)[:, None, None] * (np.eye(2) - direction[:, :, None] * direction[:, None, :])
+    taken = np.empty_like(moved)
+    taken[:, 0] = np.where((trial[:, 0] > 0.0)[:, None], moved[:, 0], 0.0)
+    taken[:, 1:] = np.where(sliding[:, None, None], slide @ moved[:, 1:], moved[:, 1:])
+    jacobian = np.eye(3 * count) - taken.reshape(3 * count, 3 * count)
+    pressed = np.flatnonzero(sliding & (force[:, 0] > 0.0))
+    for t in (0, 1):
+        jacobian[3 * pressed + 1 + t, 3 * pressed] -= friction * direction[pressed, t]
     return jacobian

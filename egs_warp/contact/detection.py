@@ -264,11 +264,11 @@ def independent_contacts(compliance: np.ndarray, kept: int, limit: int, toleranc
     return np.array(chosen, dtype=int)
 
 
-def push_out_speeds(gaps: np.ndarray, dt: float, cap: float, factor: float = 0.5) -> np.ndarray:
-    """(n,) constant of the normal measure c = N^T u' + min(phi, 0) b / dt + max(phi, 0) / dt,
-    the push-out capped (docs/concepts/contact.md).
+def push_out_speeds(gaps: np.ndarray, dt: float, cap: float, factor: float = 0.5, slop: float = 0.0) -> np.ndarray:
+    """(n,) constant of the normal measure c = N^T u' + min(phi, 0) b / dt + max(phi, 0) / dt, the push-out capped
+    (docs/concepts/contact.md).
     """
-    return np.maximum(gaps, 0.0) / dt + np.maximum(np.minimum(gaps, 0.0) * factor / dt, -cap)
+    return np.maximum(gaps, 0.0) / dt + np.maximum(np.minimum(gaps + slop, 0.0) * factor / dt, -cap)
 
 
 def tangent_directions(count: int) -> np.ndarray:

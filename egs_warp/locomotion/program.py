@@ -9,9 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sparse
 
 from egs_warp.contact.detection import ContactSet, push_out_speeds, tangent_directions
 from egs_warp.fem.implicit_step import ImplicitStep
+from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.complementarity import ContactLayout
 from egs_warp.locomotion.objectives import Objective, SpinObjective
 from egs_warp.muscles.tension import MuscleTension
@@ -37,10 +39,14 @@ class ContactProgram:
     """(rows, variables)."""
     offset: np.ndarray
     """(rows,)."""
+    reachable: tuple[np.ndarray, np.ndarray] | None = None
+    """Two (M,): bounds of the activations, if not -1 and 1."""
 
     def bounds(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of A y for contact states (n,)."""
         lower, upper = self.layout.bounds(states)
+        if self.reachable is not None:
+            lower[: self.layout.activations], upper[: self.layout.activations] = self.reachable
         return lower - self.offset, upper - self.offset
 
     def pairs(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -128,9 +134,32 @@ def contact_program(
     scales: CostScales,
 ) -> ContactProgram:
     """The problem of one step; ``previous`` (M,) activations in their bounds, ``push_out_cap`` m/s."""
-    P, q, constant = _quadratic_cost(step, linear, contacts, objectives, layout, previous, scales)
+    moments = _moment_rows(step, contacts, layout)
     shift = push_out_speeds(contacts.gaps, step.dt, push_out_cap)
-    A, offset = contact_rows(linear, contacts, shift, layout, friction, scales.speed)
+    return program_of(
+        step, linear, contacts.frame, shift, moments, layout, objectives, previous, friction=friction, scales=scales
+    )
+
+
+def program_of(
+    step: ImplicitStep | StepProblem,
+    linear: LinearResponse,
+    frame: sparse.csr_matrix,
+    shift: np.ndarray,
+    moments: np.ndarray,
+    layout: ContactLayout,
+    objectives: Sequence[Objective | SpinObjective],
+    previous: np.ndarray,
+    *,
+    friction: float,
+    scales: CostScales,
+) -> ContactProgram:
+    """The problem of one step for contacts whose velocities are ``frame`` (3n, 3N) v and whose normal measure has the
+    constant ``shift`` (n,) m/s; ``moments`` (3, variables) is the change of angular momentum that each unknown
+    makes.
+    """
+    P, q, constant = _quadratic_cost(step, linear, moments, objectives, layout, previous, scales)
+    A, offset = contact_rows(linear, frame, shift, layout, friction, scales.speed)
     return ContactProgram(layout, friction, P, q, constant, A, offset)
 
 
@@ -148,16 +177,15 @@ def _moment_rows(step: ImplicitStep, contacts: ContactSet, layout: ContactLayout
 
 
 def _quadratic_cost(
-    step: ImplicitStep,
+    step: ImplicitStep | StepProblem,
     linear: LinearResponse,
-    contacts: ContactSet,
+    moments: np.ndarray,
     objectives: Sequence[Objective | SpinObjective],
     layout: ContactLayout,
     previous: np.ndarray,
     scales: CostScales,
 ) -> tuple[np.ndarray, np.ndarray, float]:
     body, state = step.body, step.state
-    moments = _moment_rows(step, contacts, layout)
     P = 1e-7 * np.eye(layout.variables)
     q = np.zeros(layout.variables)
     constant = float(scales.activation_change @ previous**2)
@@ -181,7 +209,7 @@ def _quadratic_cost(
 
 def contact_rows(
     linear: LinearResponse,
-    contacts: ContactSet,
+    frame: sparse.csr_matrix,
     shift: np.ndarray,
     layout: ContactLayout,
     friction: float,
@@ -192,8 +220,8 @@ def contact_rows(
     ``shift`` (n,) m/s is the constant of the normal measure c.
     """
     n, nd = layout.contacts, layout.directions
-    speed = (contacts.frame @ linear.response).reshape(n, 3, layout.variables) / speed_scale
-    base = (contacts.frame @ linear.base).reshape(n, 3) / speed_scale
+    speed = (frame @ linear.response).reshape(n, 3, layout.variables) / speed_scale
+    base = (frame @ linear.base).reshape(n, 3) / speed_scale
     table = tangent_directions(nd)
     lam = np.zeros((n, layout.variables))
     lam[np.arange(n), layout.slip.start + np.arange(n)] = 1.0

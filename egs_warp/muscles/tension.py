@@ -75,11 +75,11 @@ class TensionStiffness:
         along = np.sum(d * self.directions, axis=1, keepdims=True)
         return self.columns @ (self.rates[:, None] * (d - along * self.directions))
 
-    def factors(self) -> tuple[np.ndarray, np.ndarray]:
-        """U (3N, 2m) and rates (2m,) with K = U diag(rates) U^T:
-        two directions across each of the m segments that matter.
+    def factors(self, *, least: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
+        """U (3N, 2m) and rates (2m,) with K = U diag(rates) U^T: two directions across each of the m segments whose
+        rate is above ``least`` of the largest.
         """
-        kept = np.flatnonzero(np.abs(self.rates) > 1e-3 * np.abs(self.rates).max(initial=1e-300))
+        kept = np.flatnonzero(np.abs(self.rates) > least * np.abs(self.rates).max(initial=1e-300))
         along = self.directions[kept]
         axis = np.eye(3)[np.argmin(np.abs(along), axis=1)]
         first = np.cross(along, axis)

@@ -1,0 +1,178 @@
+"""A step with contact: velocities and contact forces are sought together until both equations hold (Eq. 4, 8, 9)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from egs_warp.contact.coulomb import coulomb_forces
+from egs_warp.contact.detection import ContactDetector, ContactSet, push_out_speeds
+from egs_warp.contact.points import ContactPoints
+from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.step_problem import Tangent
+from egs_warp.muscles.tension import MuscleTension
+
+_ITERATIONS = 60
+_SLOW = 0.5
+"""A tangent is made anew where the residual falls by less than this factor."""
+_SHORTEST = 1e-3
+_MEMORY = 3
+"""Residuals of which the largest must be undercut."""
+_ROUNDS = 6
+_PUSH_OUT = 0.2
+"""Of the depth beyond the tolerance, a step."""
+_ADDED = 0.6
+"""Of the tolerance: points that would end deeper join at once."""
+_SINGULAR = 1e-7
+"""Of the mean of the Delassus operator's diagonal: more points than the cage can resolve leave it singular."""
+
+
+@dataclass(frozen=True)
+class ContactResponse:
+    """What forces at contact points bring about, by the tangent of one step."""
+
+    tangent: Tangent
+    contacts: ContactSet
+    columns: np.ndarray
+    """(3N, 3n) m/s for each newton."""
+    delassus: np.ndarray
+    """(3n, 3n) m/(N s), contact velocities for each newton."""
+
+    @classmethod
+    def of(cls, tangent: Tangent, contacts: ContactSet, columns: np.ndarray | None = None) -> ContactResponse:
+        """Of ``contacts``; ``columns`` if they are known."""
+        if columns is None:
+            columns = tangent.problem.dt * tangent.solve(contacts.frame.T.toarray())
+        delassus = np.asarray(contacts.frame @ columns)
+        return cls(tangent, contacts, columns, delassus)
+
+    def forces(self, free: np.ndarray, shift: np.ndarray, friction: float, start: np.ndarray) -> np.ndarray:
+        """(n, 3) newtons that obey contact and friction if the body moves at ``free`` (3N,) without them."""
+        if self.contacts.count == 0:
+            return start
+        regular = self.delassus.copy()
+        regular[np.diag_indices_from(regular)] += _SINGULAR * regular.diagonal().mean()
+        return coulomb_forces(regular, self.contacts.frame @ free, shift, friction, start)[0]
+
+
+@dataclass(frozen=True)
+class CoupledResult:
+    """End of a step with contact."""
+
+    velocities: np.ndarray
+    """(N, 3) m/s."""
+    contacts: ContactSet
+    forces: np.ndarray
+    """(n, 3) newtons on the body: normal and two tangents of each contact."""
+    converged: bool
+    residual: float
+    """Norm of what the equation of motion misses, over dt x weight."""
+    iterations: int
+    tangents: int
+    """Factorisations made on the way."""
+
+
+@dataclass(frozen=True)
+class CoupledSolver:
+    """Newton's method on velocities and contact forces at once."""
+
+    detector: ContactDetector
+    points: ContactPoints
+    factors: SparseFactors
+    push_out_cap: float
+    """m/s."""
+    penetration_tolerance: float
+    """Metres: points that would end deeper join the set."""
+    tolerance: float = 1e-8
+    """Residual over dt x weight."""
+
+    def shift(self, contacts: ContactSet, dt: float) -> np.ndarray:
+        """(n,) m/s, the constant of the normal measure of a step of ``dt`` seconds: nothing goes deeper, and
+        what is deeper than the tolerance comes out gently."""
+        return push_out_speeds(contacts.gaps, dt, self.push_out_cap, _PUSH_OUT, self.penetration_tolerance)
+
+    def solve(
+        self,
+        response: ContactResponse,
+        tension: MuscleTension | None,
+        *,
+        velocities: np.ndarray,
+        forces: np.ndarray,
+    ) -> CoupledResult:
+        """The step from a start of ``velocities`` (N, 3) and ``forces`` (n, 3); ``response`` is kept while it
+        serves.
+        """
+        problem = response.tangent.problem
+        iterations = tangents = 0
+        start_gaps, _ = self.detector.gaps(problem.state.positions)
+        for number in range(_ROUNDS):
+            result, response = self._round(response, tension, velocities, forces)
+            iterations, tangents = iterations + result.iterations, tangents + result.tangents
+            velocities, forces = result.velocities, result.forces
+            gaps, _ = self.detector.gaps(problem.end_positions(velocities))
+            contacts = response.contacts
+            # What is deep already is held where it is only once it would go deeper.
+            sinking = np.where(gaps < start_gaps - 0.5 * _ADDED * self.penetration_tolerance, gaps, 0.0)
+            added = self.points.deeper(contacts.points, sinking, _ADDED * self.penetration_tolerance)
+            if not result.converged or len(added) == 0 or number == _ROUNDS - 1:
+                break
+            contacts = self.detector.contact_set(np.concatenate([contacts.points, added]), problem.state.positions)
+            new = contacts.frame[3 * len(forces) :].T.toarray()
+            columns = np.hstack([response.columns, problem.dt * response.tangent.solve(new)])
+            response = ContactResponse.of(response.tangent, contacts, columns)
+            forces = np.vstack([forces, np.zeros((len(added), 3))])
+        return CoupledResult(
+            velocities, response.contacts, forces, result.converged, result.residual, iterations, tangents
+        )
+
+    def _round(
+        self, response: ContactResponse, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray
+    ) -> tuple[CoupledResult, ContactResponse]:
+        problem, contacts = response.tangent.problem, response.contacts
+        frame, dt = contacts.frame, problem.dt
+        shift = self.shift(contacts, dt)
+        friction = self.detector.geometry.friction
+        tangents, fresh = 0, False
+
+        def missing(v: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, float]:
+            free = problem.residual(v, tension)
+            rest = free.ravel() - dt * (frame.T @ f.ravel())
+            return free, float(np.linalg.norm(rest)) / problem.unit
+
+        free, size = missing(velocities, forces)
+        recent: list[float] = []
+        for iteration in range(1, _ITERATIONS + 1):
+            loose = velocities.ravel() - response.tangent.solve(free.ravel())
+            wanted = response.forces(loose, shift, friction, forces)
+            change = (loose + response.columns @ wanted.ravel()).reshape(velocities.shape) - velocities
+            length, better = 1.0, False
+            while length > _SHORTEST:
+                trial, trial_forces = velocities + length * change, forces + length * (wanted - forces)
+                if problem.feasible(trial):
+                    trial_free, trial_size = missing(trial, trial_forces)
+                    # Contacts that open, close or begin to slide change the forces at once: the residual need not fall
+                    # in every step.
+                    better = iteration == 1 or trial_size < max(
+                        (1.0 - 1e-4 * length) * max(recent, default=np.inf), self.tolerance
+                    )
+                    if better:
+                        break
+                length *= 0.5
+            if better:
+                before, velocities, forces, free, size = size, trial, trial_forces, trial_free, trial_size
+                recent = [*recent[1 - _MEMORY :], size]
+                # After a whole step the contact velocities are those that were solved for, by linearity.
+                if length == 1.0 and size <= self.tolerance:
+                    return CoupledResult(velocities, contacts, forces, True, size, iteration, tangents), response
+                slow = size > _SLOW * before or length < 1.0
+            else:
+                slow = True
+                if fresh:
+                    break
+            fresh = False
+            if slow:
+                tangent = problem.tangent(self.factors, velocities, tension)
+                response = ContactResponse.of(tangent, contacts)
+                tangents, fresh = tangents + 1, True
+        return CoupledResult(velocities, contacts, forces, False, size, iteration, tangents), response

@@ -1,0 +1,164 @@
+"""One implicit Euler step as an equation for the end velocity that keeps linear and angular momentum (Eq. 4, 6)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.fem.elasticity import Damping
+from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.muscles.tension import MuscleTension
+
+_NEGLIGIBLE = 1e-3
+"""Of the largest T / L of the muscles: those below it do not count in a tangent."""
+
+
+@dataclass(frozen=True)
+class StepProblem:
+    """M (v - v0) + dt alpha M v = dt (P^T f(x + dt v) + M g + f_contact), f of elasticity, damping and muscles.
+
+    Implicit Euler alone eats spin: with x+ = x + dt v the momentum changes by dt sum r x f with the arms r of the
+    step's *start*, about which the forces at its end are not free of torque. P^T takes that torque off as the inertia
+    of a rigid turn, M (w x r): P is v less the rigid turn with v's angular momentum. So L+ = L + dt sum r x (f_contact
+    - alpha M v) holds to rounding, contact velocities are those that are solved for, and ``spin`` is the size of what
+    was taken off.
+    """
+
+    body: SoftBody
+    state: BodyState
+    dt: float
+    """Seconds."""
+    drag: float = 0.0
+    """alpha of Rayleigh damping (drag against the air), 1/s."""
+
+    @cached_property
+    def damping(self) -> Damping:
+        """What the body's damping resists."""
+        return self.body.assembly.damping(self.state.positions, self.dt)
+
+    @cached_property
+    def mass(self) -> np.ndarray:
+        """(N, 1) kg."""
+        return self.body.node_mass[:, None]
+
+    @cached_property
+    def turns(self) -> np.ndarray:
+        """(3N, 3) nodal velocities e_k x r of the rigid turns about the centre of mass, arms r at the start of the
+        step.
+        """
+        arms = self.state.positions - self.body.centre_of_mass(self.state.positions)
+        return np.stack([np.cross(axis, arms).ravel() for axis in np.eye(3)], axis=1)
+
+    @cached_property
+    def momenta(self) -> np.ndarray:
+        """(3, 3N) angular momentum of nodal velocities about the centre of mass, arms at the start of the step."""
+        return (self.turns * np.repeat(self.body.node_mass, 3)[:, None]).T
+
+    @cached_property
+    def inertia(self) -> np.ndarray:
+        """(3, 3) kg m^2 at the start of the step."""
+        return self.momenta @ self.turns
+
+    @property
+    def unit(self) -> float:
+        """dt times the weight, N s: what residuals are told in."""
+        return self.dt * self.body.weight
+
+    def end_positions(self, velocities: np.ndarray) -> np.ndarray:
+        """(N, 3) x + dt v."""
+        return self.state.positions + self.dt * velocities
+
+    def feasible(self, velocities: np.ndarray) -> bool:
+        """Whether no element is inverted at the end of ``velocities`` (N, 3)."""
+        return bool(self.body.assembly.determinants(self.end_positions(velocities)).min() > 0.0)
+
+    def internal_gradient(self, velocities: np.ndarray, tension: MuscleTension | None) -> np.ndarray:
+        """(N, 3) newtons, minus the forces of elasticity, damping and muscles at the end of ``velocities`` (N, 3)."""
+        end = self.end_positions(velocities)
+        gradient = self.body.assembly.gradient(end, self.damping)
+        return gradient if tension is None else gradient - tension.forces(end)
+
+    def spin(self, internal_gradient: np.ndarray) -> np.ndarray:
+        """(3,) rad/s that the step gives back: the rigid turn whose momentum implicit Euler would have eaten."""
+        return self.dt * np.linalg.solve(self.inertia, self.turns.T @ internal_gradient.ravel())
+
+    def residual(self, velocities: np.ndarray, tension: MuscleTension | None) -> np.ndarray:
+        """(N, 3) N s, left side less right side of the equation without contact forces; not finite where an element is
+        inverted.
+        """
+        internal = self.internal_gradient(velocities, tension)
+        turned = (self.turns @ self.spin(internal)).reshape(velocities.shape)
+        change = (1.0 + self.dt * self.drag) * velocities - self.state.velocities - self.dt * self.body.gravity - turned
+        return self.mass * change + self.dt * internal
+
+    def tangent(self, factors: SparseFactors, velocities: np.ndarray, tension: MuscleTension | None) -> Tangent:
+        """The derivative of the residual at ``velocities`` (N, 3), or a definite one near it, factored by
+        ``factors``.
+        """
+        definite = factors.update(self._entries(velocities, projected=False))
+        across, rates = np.zeros((len(self.turns), 0)), np.zeros(0)
+        if tension is not None:
+            across, rates = tension.stiffness(self.end_positions(velocities)).factors(least=_NEGLIGIBLE)
+        if factors.ready and len(rates) > 0:
+            through = factors.solve(across)
+            small = across.T @ through
+            small[np.diag_indices_from(small)] += 1.0 / (self.dt**2 * rates)
+            small = 0.5 * (small + small.T)
+            # Haynsworth: negative eigenvalues of the sum = those of S + positive ones of the small matrix - pulling
+            # directions.
+            positive = int((np.linalg.eigvalsh(small) > 0.0).sum())
+            if factors.negative_pivots + positive == int((rates > 0.0).sum()):
+                return Tangent(self, factors, across, through, np.linalg.inv(small))
+        if not definite:
+            factors.update(self._entries(velocities, projected=True))
+        nothing = np.zeros((len(self.turns), 0))
+        return Tangent(self, factors, nothing, nothing, np.zeros((0, 0)))
+
+    def _entries(self, velocities: np.ndarray, *, projected: bool) -> np.ndarray:
+        """Upper entries of S = (1 + dt alpha) M + dt C + dt^2 K at the end of ``velocities``."""
+        assembly = self.body.assembly
+        end = self.end_positions(velocities)
+        entries = assembly.matrix_entries(end, self.damping, factor=self.dt**2, projected=projected)
+        entries[assembly.diagonal_entries] += (1.0 + self.dt * self.drag) * np.repeat(self.body.node_mass, 3)
+        return entries
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """Inverse J^-1 of the derivative of a step's residual: S of the elements, the muscles' stiffness by Woodbury, the
+    momentum kept.
+
+    J = S + dt^2 (K_a - M turns I^-1 turns^T (K + K_a)). Its inverse is that of S + dt^2 K_a with so much of a turn
+    added that each column of the result has the angular momentum of the impulse.
+    """
+
+    problem: StepProblem
+    factors: SparseFactors
+    across: np.ndarray
+    """(3N, 2m) directions across the muscles that count."""
+    through: np.ndarray
+    """(3N, 2m) S^-1 of them."""
+    small: np.ndarray
+    """(2m, 2m) inverse of the capacitance matrix."""
+
+    @cached_property
+    def _turning(self) -> tuple[np.ndarray, np.ndarray]:
+        turned = self._plain(self.problem.momenta.T)
+        return turned, np.linalg.inv((1.0 + self.problem.dt * self.problem.drag) * self.problem.momenta @ turned)
+
+    def _plain(self, impulses: np.ndarray) -> np.ndarray:
+        plain = self.factors.solve(impulses)
+        if self.across.shape[1] == 0:
+            return plain
+        return plain - self.through @ (self.small @ (self.across.T @ plain))
+
+    def solve(self, impulses: np.ndarray) -> np.ndarray:
+        """(3N,) or (3N, m) m/s that ``impulses`` of that shape, N s, bring about."""
+        problem, plain = self.problem, self._plain(impulses)
+        turned, inverse = self._turning
+        mass_ratio = 1.0 + problem.dt * problem.drag
+        missing = problem.turns.T @ impulses - mass_ratio * (problem.momenta @ plain)
+        return plain + turned @ (inverse @ missing)
