@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 
@@ -63,9 +61,8 @@ def small_problem(
     P = 2.0 * rows.T @ rows + 1e-7 * np.eye(layout.variables)
     m = np.arange(activations)
     P[m, m] += 1e-3
-    set_of: Any = SimpleNamespace(frame=frame, count=contacts)
     linear = LinearResponse(base, response)
-    A, offset = contact_rows(linear, set_of, shift, layout, FRICTION, 1.0)
+    A, offset = contact_rows(linear, frame, shift, layout, FRICTION, 1.0)
     program = ContactProgram(layout, FRICTION, P, 2.0 * rows.T @ gap, float(gap @ gap), A, offset)
     return SmallProblem(program, linear, frame, shift)
 
