@@ -209,7 +209,7 @@ def _quadratic_cost(
 
 def contact_rows(
     linear: LinearResponse,
-    frame: sparse.csr_matrix,
+    frame: sparse.csr_matrix | np.ndarray,
     shift: np.ndarray,
     layout: ContactLayout,
     friction: float,
