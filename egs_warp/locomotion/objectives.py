@@ -61,6 +61,25 @@ def node_velocities(body: SoftBody, target: np.ndarray, weight: float) -> Object
     return Objective("pose", sparse.csr_matrix(sparse.diags(shares)), shares * target.ravel(), weight)
 
 
+def straining_velocities(body: SoftBody, positions: np.ndarray, target: np.ndarray, weight: float) -> Objective:
+    """Of velocities (N, 3) the part that strains the body as a whole, the same everywhere: a pose to move towards that
+    leaves the finer shape to the body's elasticity, where it goes to objectives of their own, and how it turns to its
+    angular momentum.
+
+    The six rows are orthonormal in the mean over the mass, so the weight compares with that of ``node_velocities``.
+    """
+    arms = positions - body.centre_of_mass(positions)
+    rigid = [np.tile(axis, (len(arms), 1)) for axis in np.eye(3)] + [np.cross(axis, arms) for axis in np.eye(3)]
+    pairs = [(i, k) for i in range(3) for k in range(i, 3)]
+    strains = [np.outer(arms[:, i], np.eye(3)[k]) + np.outer(arms[:, k], np.eye(3)[i]) for i, k in pairs]
+    weights = np.sqrt(np.repeat(body.node_mass / body.mass, 3))
+    modes = np.stack([mode.ravel() for mode in (*rigid, *strains)], axis=1)
+    orthonormal, triangle = np.linalg.qr(modes * weights[:, None])
+    kept = 6 + np.flatnonzero(np.abs(np.diag(triangle)[6:]) > 1e-6 * np.abs(triangle).max())
+    rows = sparse.csr_matrix((orthonormal[:, kept] * weights[:, None]).T)
+    return Objective("pose", rows, rows @ target.ravel(), weight)
+
+
 @dataclass(frozen=True)
 class BodyPart:
     """The whole body or a part of it (a foot, the head, the base): some nodes and their masses."""

@@ -45,6 +45,8 @@ TOUCH_DOWN = 0.06
 foot."""
 LONGEST_LANDING = 9.0
 """Of sqrt(H / g): a body that is not calm by then counts as at rest."""
+BLEND = 0.3
+"""Of sqrt(H / g): the time in which a phase's pose takes over from the last one's."""
 
 
 class JumpPhase(Enum):
@@ -99,7 +101,7 @@ class Jump:
         self._start_base = self._start_com[:2] + self.pose.base_offset
         self._time_unit = float(np.sqrt(body.height / self.gravity))
         self._airborne_weight = max(AIRBORNE_POSE / body.stiffening**2, self.weights.pose)
-        self._last_pose = np.eye(3)
+        self._last_pose = self._pose_before = np.eye(3)
         self._asked: np.ndarray | None = None
         self._flew = False
         self._calm = Calm(body)
@@ -169,8 +171,11 @@ class Jump:
             following[self.phase] = True
         if following[self.phase]:
             self.phase = list(JumpPhase)[list(JumpPhase).index(self.phase) + 1]
-            self._entered = time
-        if self.phase is JumpPhase.FLIGHT:
+            self._entered, self._pose_before = time, self._last_pose
+        if self.phase is JumpPhase.FLIGHT and not self.left_ground:
+            # Poses are told from how the body stands, which is turned where it lands.
+            turned = self.ground.turn(self.facing.turn)
+            self._last_pose, self._pose_before = self._last_pose @ turned.T, self._pose_before @ turned.T
             self.pose = self._landing
         elif self.phase is JumpPhase.LAND and self._calm.held(seen.velocity, time):
             self.phase = JumpPhase.REST
@@ -220,11 +225,13 @@ class Jump:
         velocity = self._balanced(seen, np.array([*(seen.velocity[:2] + change + short), up]), dt)
         self._asked = velocity[:2]
         upright = self.pose.over_base(landing, self._base_of_landing(), self.facing.turned)
-        tilt = self.pose.turn_towards(state, upright) / plan.flight_time
+        # From what keeps it upright to what brings it to the landing's tilt by then.
+        share = min(elapsed / plan.thrust_time, 1.0)
+        tilt = share * self.pose.turn_towards(state, upright) / plan.flight_time
+        standing = self.pose.over_base(position, self._start_base, self.facing.turned)
+        tilt = tilt + (1.0 - share) * self._upright(state, standing)
         spin = self.facing.thrust_spin(tilt, state, self.ground.axes[2], plan.flight_time)
-        return self._write(
-            state, velocity, self.pose.over_base(position, self._start_base, self.facing.turned), spin, dt
-        )
+        return self._write(state, velocity, standing, spin, dt)
 
     def _fly(self, state: BodyState, seen: Measurement, dt: float) -> list[Objective | SpinObjective]:
         touch_down, left = self._touch_down(seen, dt)
@@ -312,6 +319,9 @@ class Jump:
         left: float | None = None,
     ) -> list[Objective | SpinObjective]:
         """``left``: seconds before the landing, of a body in the air."""
+        # Where a phase begins with another pose than the last ended with, the way between them is gone in some steps.
+        share = min((state.time + dt - self._entered) / (BLEND * self._time_unit), 1.0)
+        pose = self._pose_before + share * share * (3.0 - 2.0 * share) * (pose - self._pose_before)
         rate = (pose - self._last_pose) / dt
         if np.abs(rate).max() > 5.0 / self._time_unit:
             rate = np.zeros((3, 3))

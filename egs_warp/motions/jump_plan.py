@@ -15,6 +15,10 @@ FURTHEST_LEAN = 0.35
 """Of the way from under the centre of mass to the front of the feet."""
 DEEPEST_CROUCH = 0.3
 """Of the height of the centre of mass; a higher jump thrusts harder instead."""
+ONSET, RAMP = 0.3, 0.4
+"""Share of its full strength with which a thrust begins, where the crouch has left it, and share of its time until it
+is reached.
+"""
 
 
 @dataclass(frozen=True)
@@ -65,10 +69,30 @@ class JumpPlan:
         return start + blend * self._down + carried * self._onset, slope * self._down + rate * self._onset
 
     def thrust(self, start: np.ndarray, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
-        """The same, ``elapsed`` seconds into the thrust: a steady acceleration to the speed of the take-off."""
-        onset, take_off = self._onset, np.array([self.speed_forward, 0.0, self.speed_up])
-        position = start + self._down + onset * elapsed + 0.5 * (take_off - onset) * elapsed**2 / self.thrust_time
-        return position, onset + (take_off - onset) * elapsed / self.thrust_time
+        """The same, ``elapsed`` seconds into the thrust, which grows to a steady acceleration to the take-off's
+        speed.
+        """
+        gained = np.array([self.speed_forward, 0.0, self.speed_up]) - self._onset
+        speed, way = ramped(elapsed / self.thrust_time)
+        position = start + self._down + self._onset * elapsed + way * self.thrust_time * gained
+        return position, self._onset + speed * gained
+
+
+def ramped(share: float) -> tuple[float, float]:
+    """Speed and way, of the speed gained and of that speed times the thrust's time, when a ``share`` of that time has
+    passed.
+
+    The push grows from ``ONSET`` to its full strength over the first ``RAMP`` of the thrust: muscles cannot be switched
+    on at once.
+    """
+    ramp = min(share, RAMP)
+    speed = ONSET * ramp + (1.0 - ONSET) * ramp**2 / (2.0 * RAMP)
+    way = ONSET * ramp**2 / 2.0 + (1.0 - ONSET) * ramp**3 / (6.0 * RAMP)
+    rest = share - ramp
+    way += speed * rest + 0.5 * rest**2
+    speed += rest
+    whole = 1.0 - 0.5 * (1.0 - ONSET) * RAMP
+    return speed / whole, way / whole
 
 
 def plan_jump(
@@ -93,8 +117,8 @@ def plan_jump(
     speed_up = np.sqrt(2.0 * gravity * rise) + 0.5 * gravity * step
     acceleration = 1.6 * gravity
     stroke = max(speed_up**2 / (2.0 * acceleration), extension + 0.02 * height)
-    thrust_time = 2.0 * stroke / speed_up
-    # Every step goes its whole way at the speed of its end: half a step's way more than steady acceleration takes.
+    thrust_time = stroke / (ramped(1.0)[1] * speed_up)
+    # Every step goes its whole way at the speed of its end: half a step's way more than the thrust itself.
     stroke += 0.5 * speed_up * step
     flight_time = np.sqrt(2.0 * rise / gravity) + np.sqrt(2.0 * max(rise - target.rise, 0.0) / gravity)
     # A body that comes in with speed v stops over its base if that is ahead by v sqrt(h/g) (the capture point); the
@@ -103,7 +127,8 @@ def plan_jump(
     footprint_help = min(0.3 * support_ahead, 0.5 * target.distance * capture_time / flight_time)
     speed_forward = (target.distance - lean + footprint_help) / (flight_time + capture_time + 0.5 * thrust_time)
     crouch_depth = min(stroke - extension, DEEPEST_CROUCH * com_height)
-    thrust_time = max(2.0 * (crouch_depth + extension) / speed_up - step, 2.0 * step)
+    way = crouch_depth + extension - 0.5 * speed_up * step
+    thrust_time = max(way / (ramped(1.0)[1] * speed_up), 2.0 * step)
     return JumpPlan(
         crouch_depth=float(crouch_depth),
         extension=float(extension),

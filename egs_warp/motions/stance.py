@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.geometry.frames import best_turn
 from egs_warp.geometry.plane import Plane
-from egs_warp.locomotion.objectives import Objective, SpinObjective, centre_of_mass_velocity, node_velocities
+from egs_warp.locomotion.objectives import Objective, SpinObjective, centre_of_mass_velocity, straining_velocities
 from egs_warp.locomotion.stepper import StepReport
 
 SOLE = 0.06
@@ -215,7 +215,7 @@ class PoseFamily:
         return [
             centre_of_mass_velocity(body, velocity, weights.com),
             SpinObjective(momentum, weights.spin),
-            node_velocities(body, pose_velocity, weights.pose),
+            straining_velocities(body, state.positions, pose_velocity, weights.pose),
         ]
 
     def turn_towards(self, state: BodyState, pose: np.ndarray) -> np.ndarray:

@@ -25,6 +25,7 @@ from egs_warp.locomotion.objectives import (
     part_position,
     part_turning,
     part_velocity,
+    straining_velocities,
 )
 from tests.support.meshes import block_mesh
 
@@ -73,6 +74,38 @@ def test_node_rows_measure_the_mass_weighted_distance_from_the_target() -> None:
     gradient = 2.0 * objective.rows.T @ (objective.rows @ v.ravel() - objective.target)
     slope = (cost(v + 1e-4 * along) - cost(v - 1e-4 * along)) / 2e-4
     assert slope == pytest.approx(gradient @ along.ravel(), rel=1e-8)
+
+
+def test_straining_rows_see_uniform_strain_alone_and_all_of_it() -> None:
+    """Of an affine motion the mean square of what is left without its rigid part; nothing of a rigid motion or of one
+    that changes no uniform strain.
+    """
+    rng = np.random.default_rng(4)
+    state = shaken_state()
+    target = rng.standard_normal(state.positions.shape)
+    objective = straining_velocities(BODY, state.positions, target, 0.3)
+    assert objective.rows.get_shape()[0] == 6 and objective.weight == 0.3
+    arms = state.positions - BODY.centre_of_mass(state.positions)
+    mass = BODY.node_mass[:, None] / BODY.mass
+
+    def square(velocities: np.ndarray) -> float:
+        return float(((objective.rows @ velocities.ravel()) ** 2).sum())
+
+    rigid = rng.standard_normal(3) + np.cross(rng.standard_normal(3), arms)
+    assert square(rigid) < 1e-20
+    affine = arms @ rng.standard_normal((3, 3)).T
+    spin = np.linalg.solve(
+        BODY.inertia(state.positions), (BODY.node_mass[:, None] * np.cross(arms, affine)).sum(axis=0)
+    )
+    strained = affine - np.cross(spin, arms)
+    assert square(affine + rigid) == pytest.approx((mass * strained**2).sum(), rel=1e-10)
+    assert np.allclose(objective.target, objective.rows @ target.ravel())
+    # A motion across all affine ones, in the mean over the mass, is not seen.
+    modes = np.eye(9).reshape(9, 3, 3)
+    spanned = np.stack([(arms @ mode).ravel() for mode in modes] + [np.tile(a, len(arms)) for a in np.eye(3)], axis=1)
+    weight = np.repeat(mass.ravel(), 3)
+    fit = np.linalg.solve(spanned.T @ (weight[:, None] * spanned), spanned.T @ (weight * target.ravel()))
+    assert square((target.ravel() - spanned @ fit).reshape(-1, 3)) < 1e-20
 
 
 def place(part: BodyPart, frame: Coordinates, positions: np.ndarray) -> np.ndarray:

@@ -30,17 +30,28 @@ def test_a_body_that_does_as_planned_reaches_height_and_distance(target: JumpTar
         lean=0.2 * target.distance,
     )
 
-    # Thrust: from rest at the bottom of the crouch, steadily faster, to take-off stretched by the extension.
-    speeds = np.linspace(0.0, 1.0, 2001)[1:] * plan.speed_up
-    risen = speeds.mean() * plan.thrust_time
-    assert risen + 0.5 * plan.speed_up * STEP == pytest.approx(plan.crouch_depth + plan.extension, rel=1e-3)
-    push = plan.speed_up / plan.thrust_time
+    # Thrust: from rest at the bottom of the crouch, a push that grows and then stays, to take-off stretched by the
+    # extension; with pushes p over the way s it gains speed_up^2 / 2 = mean of p over s x way.
+    times = np.linspace(0.0, plan.thrust_time, 4001)
+    moves = [plan.thrust(np.zeros(3), time) for time in times]
+    up, speeds = np.array([place[2] for place, _ in moves]), np.array([speed[2] for _, speed in moves])
+    assert np.allclose(np.diff(up) / np.diff(times), 0.5 * (speeds[1:] + speeds[:-1]), atol=1e-6 * plan.speed_up)
+    assert speeds[0] == pytest.approx(0.0, abs=1e-12) and speeds[-1] == pytest.approx(plan.speed_up)
+    way = up[-1] - up[0]
+    assert way + 0.5 * plan.speed_up * STEP == pytest.approx(plan.crouch_depth + plan.extension, rel=1e-6)
+    assert up[-1] == pytest.approx(plan.extension - 0.5 * plan.speed_up * STEP, rel=1e-6)
+    pushes = np.diff(speeds) / np.diff(times)
+    full = pushes[-1]
+    assert pushes[0] == pytest.approx(0.3 * full, rel=2e-3)
+    assert pushes[800] == pytest.approx(0.65 * full, rel=2e-3)
+    assert np.allclose(pushes[1601:], full, rtol=1e-6)
+    push = plan.speed_up**2 / (2.0 * way)
     deepest = 0.3 * com_height
     shallow = plan.crouch_depth < deepest
     assert 0.0 < plan.extension < target.height and plan.crouch_depth > 0.0
     # At 1.6 g, and harder where the crouch is as deep as the body can.
     if shallow:
-        assert push == pytest.approx(1.6 * GRAVITY)
+        assert push == pytest.approx(1.6 * GRAVITY, rel=1e-6)
     else:
         assert plan.crouch_depth == pytest.approx(deepest) and push > 1.6 * GRAVITY
 
