@@ -6,7 +6,7 @@ FRAMES ?=
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-rest test-all setup lint types docs pictures build examples clean
+.PHONY: demo test test-rest test-all setup lint types docs pictures build web examples clean
 
 demo: $(VENV)/demo.stamp
 	$(BIN)/python examples/jump.py --out out/jump $(FRAMES:%=--frames %)
@@ -46,8 +46,15 @@ docs: setup
 pictures: setup
 	$(BIN)/python docs/make_pictures.py
 
+# The page of egs-warp view, from its TypeScript sources; needs node 20 or newer. The wheel and the sdist hold it built.
+PAGE := egs_warp/web/page
+web: egs_warp/web/page.html
+
+egs_warp/web/page.html: $(PAGE)/package-lock.json $(PAGE)/build.mjs $(PAGE)/tsconfig.json $(wildcard $(PAGE)/src/*)
+	cd $(PAGE) && npm ci --no-audit --no-fund --loglevel=error && npm run --silent build
+
 # Wheel and sdist into out/dist, both tried in an empty environment outside of the tree.
-build: setup
+build: setup web
 	VENV=$(VENV) .ci/package
 
 $(VENV)/demo.stamp: pyproject.toml constraints.txt
@@ -57,6 +64,7 @@ $(VENV)/demo.stamp: pyproject.toml constraints.txt
 
 $(VENV)/setup.stamp: $(VENV)/demo.stamp
 	$(PIP) -e ".[torch,dev,docs]"
+	if command -v npm > /dev/null; then $(MAKE) web; else echo "no npm: egs-warp view waits for make web"; fi
 	touch $@
 
 clean:

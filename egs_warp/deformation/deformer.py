@@ -93,11 +93,12 @@ class Deformer:
         self._degree = cloud.sh_degree
         self._carrier = CageCarrier(embedding.cage)
         with wp.ScopedDevice(cloud.device):
-            self._plan = carried_cage.ArmPlan()
-            self._plan.mean_tets = empty(cloud.count, wp.int32, cloud.device)
-            self._plan.end_tets = empty((6, cloud.count), wp.int32, cloud.device)
-            self._plan.shares = empty((6, cloud.count), wp.float32, cloud.device)
-            self._plan.bulges = empty((3, cloud.count), wp.float32, cloud.device)
+            self.plan = carried_cage.ArmPlan()
+            """What each Gaussian asks of the cage, the same in every frame."""
+            self.plan.mean_tets = empty(cloud.count, wp.int32, cloud.device)
+            self.plan.end_tets = empty((6, cloud.count), wp.int32, cloud.device)
+            self.plan.shares = empty((6, cloud.count), wp.float32, cloud.device)
+            self.plan.bulges = empty((3, cloud.count), wp.float32, cloud.device)
             self._deformed = DeformedGaussians(
                 GaussianCloud(
                     means=wp.empty_like(cloud.means),
@@ -123,7 +124,7 @@ class Deformer:
                 cage.inverse_edges,
                 LEAST_BRIDGE * cage.extent,
             ],
-            outputs=[self._plan],
+            outputs=[self.plan],
             device=cloud.device,
         )
 
@@ -169,7 +170,7 @@ class Deformer:
             rest.log_scales,
             self.max_stretch,
             self._carrier.carry(positions),
-            self._plan,
+            self.plan,
         ]
 
 

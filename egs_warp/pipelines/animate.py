@@ -17,7 +17,9 @@ from egs_warp.locomotion.stepper import LocomotionSettings
 from egs_warp.locomotion.trajectory import audit, measure
 from egs_warp.motions.request import LARGEST_TARGET, LARGEST_TURN
 from egs_warp.motions.script import motion as script
+from egs_warp.pipelines import drawn
 from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.drawn import DrawnCreature
 from egs_warp.pipelines.film import Film, draw_film
 from egs_warp.pipelines.performance import Performance, simulate
 from egs_warp.pipelines.report import (
@@ -142,6 +144,7 @@ def animate(
         performance, film, source=source, notes=(*notes, *performance.sequence.cut_short()), seed=options.seed
     )
     performance.trajectory.placed(creature.frame).save(folder / "trajectory.npz")
+    DrawnCreature.of(film.splats, film.camera, creature.muscles).save(folder / drawn.FILE)
     creature.cage.mesh.write_vtu(folder / "cage.vtu")
     report.write(folder / "report.json")
     return report
@@ -171,7 +174,7 @@ def _report(performance: Performance, film: Film, *, source: str, notes: tuple[s
         muscles=MuscleFacts(creature.muscles.fibre_count, creature.muscles.segment_count),
         gaussians=GaussianCounts(
             creature.cloud.count,
-            film.gaussian_count,
+            film.splats.count,
             creature.geometry.left_out,
             creature.geometry.left_out_opacity,
         ),

@@ -31,8 +31,9 @@ SPLIT_KEY_FRAMES = 24
 class Film:
     """What was drawn, and what it cost."""
 
-    gaussian_count: int
-    """Of the cloud drawn, splits among them."""
+    splats: GaussianCloud
+    """What was drawn, at rest, splits among them."""
+    camera: Camera
     milliseconds: dict[str, list[float]]
     """Of each frame, by stage; the splits, made once, are shared out among the frames."""
 
@@ -89,7 +90,7 @@ def draw_film(
     labels = [f"{trajectory.time[frames[i]]:.2f} s" for i in wanted]
     write_png(folder / "sheet.png", contact_sheet(kept, 4, labels))
     milliseconds["split"] = [splitting / len(frames)]
-    return Film(split.cloud.count, milliseconds)
+    return Film(split.cloud, camera, milliseconds)
 
 
 def _behind(

@@ -1,0 +1,46 @@
+"""``egs-warp view``: a run in the browser, or as one file that opens in any."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from egs_warp.commands.flags import Commands
+from egs_warp.errors import UserError
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the subparsers ``commands``."""
+    view = commands.add_parser("view", help="see a run in the browser, from any side")
+    view.add_argument(
+        "runs", metavar="run", type=Path, nargs="+", help="folder that animate wrote; two are shown side by side"
+    )
+    view.add_argument("--export", type=Path, help="write one HTML file that opens without a server, and end")
+    view.add_argument("--background", type=Path, help="capture behind the creature; else background.ply of the run")
+    view.add_argument("--port", type=int, default=0, help="of this machine's own address (any that is free)")
+    view.add_argument("--no-browser", action="store_true", help="only print the address")
+    view.set_defaults(run=_view)
+
+
+def _view(chosen: argparse.Namespace) -> int:
+    from egs_warp.web.page import export_page
+    from egs_warp.web.recording import Recording
+
+    folders: list[Path] = chosen.runs
+    if len(folders) > 2:
+        raise UserError(f"{folders[2]}: at most two runs are shown side by side; leave this one out")
+    recordings = [Recording.read(folder, background=chosen.background) for folder in folders]
+    if chosen.export is not None:
+        size = export_page(chosen.export, recordings)
+        print(f"wrote {chosen.export} ({size / 1e6:.1f} MB)")
+        return 0
+    import webbrowser
+
+    from egs_warp.web.server import PageServer
+
+    server = PageServer([recording.bytes for recording in recordings], port=chosen.port)
+    print(f"open {server.address}\nend with Ctrl-C", flush=True)
+    if not chosen.no_browser:
+        webbrowser.open(server.address)
+    server.serve()
+    return 0

@@ -1,0 +1,100 @@
+"""``creature.npz``: what the pictures of a run were drawn from, so that a page can draw them again from any side."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.io.atomic import atomic_write
+from egs_warp.muscles.muscle_set import MuscleSet
+
+FILE = "creature.npz"
+_SPLATS = ("means", "rotations", "log_scales", "opacity_logits", "sh")
+_CAMERA = ("rotation", "translation", "width", "height", "fx", "fy", "cx", "cy", "near", "far")
+
+
+@dataclass(frozen=True)
+class DrawnCreature:
+    """Splats, muscles and camera of a run; metres, all in the frame of the body. P end points, M segments, F fibres."""
+
+    splats: GaussianCloud
+    """At rest, after splitting: embedded in the rest cage of the trajectory they are drawn as the film draws them."""
+    camera: Camera
+    """Of the film."""
+    muscle_ends: sp.csr_matrix
+    """(P, N) end points are this times the node positions."""
+    muscle_segments: np.ndarray
+    """(M, 2) int32, end points of each segment."""
+    muscle_bounds: np.ndarray
+    """(M,) metres: the most that ``activations`` of the trajectory can be."""
+    fibre_from_segment: np.ndarray
+    """(M,) int32."""
+    fibre_names: tuple[str, ...]
+    """(F,)"""
+    fibre_kinds: tuple[str, ...]
+    """(F,)"""
+
+    @classmethod
+    def of(cls, splats: GaussianCloud, camera: Camera, muscles: MuscleSet) -> DrawnCreature:
+        """From what a film was drawn with."""
+        return cls(
+            splats,
+            camera,
+            muscles.end_rows,
+            muscles.segments,
+            muscles.bounds,
+            muscles.fibre_from_segment,
+            muscles.fibre_names,
+            tuple(kind.value for kind in muscles.fibre_kinds),
+        )
+
+    def save(self, path: Path) -> None:
+        """Write ``creature.npz`` (docs/guide/report.md); the same creature gives the same bytes."""
+        arrays: dict[str, Any] = {name: getattr(self.splats, name).numpy() for name in _SPLATS}
+        arrays |= {f"camera_{name}": np.asarray(getattr(self.camera, name)) for name in _CAMERA}
+        arrays |= {
+            "muscle_end_starts": self.muscle_ends.indptr.astype(np.int32),
+            "muscle_end_nodes": self.muscle_ends.indices.astype(np.int32),
+            "muscle_end_weights": self.muscle_ends.data,
+            "muscle_segments": self.muscle_segments,
+            "muscle_bounds": self.muscle_bounds,
+            "fibre_from_segment": self.fibre_from_segment,
+            "fibre_names": np.array(self.fibre_names, dtype=np.str_),
+            "fibre_kinds": np.array(self.fibre_kinds, dtype=np.str_),
+        }
+        with atomic_write(path) as temporary, temporary.open("wb") as stream:
+            np.savez(stream, **arrays)
+
+    @classmethod
+    def load(cls, path: Path, *, node_count: int, device: str | None = None) -> DrawnCreature:
+        """Read what ``save`` wrote for a cage of ``node_count`` nodes. Raises ``UserError`` for any other file."""
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                arrays = {name: data[name] for name in data.files}
+            camera: dict[str, Any] = {name: arrays[f"camera_{name}"] for name in _CAMERA}
+            whole: dict[str, Any] = {name: int(camera[name]) for name in ("width", "height")}
+            real: dict[str, Any] = {name: float(camera[name]) for name in ("fx", "fy", "cx", "cy", "near", "far")}
+            starts = arrays["muscle_end_starts"]
+            rows = (arrays["muscle_end_weights"], arrays["muscle_end_nodes"], starts)
+            return cls(
+                GaussianCloud.from_numpy(*(arrays[name] for name in _SPLATS), device=device),
+                Camera(**whole, **real, rotation=camera["rotation"], translation=camera["translation"]),
+                sp.csr_matrix(rows, shape=(len(starts) - 1, node_count)),
+                arrays["muscle_segments"],
+                arrays["muscle_bounds"],
+                arrays["fibre_from_segment"],
+                tuple(map(str, arrays["fibre_names"])),
+                tuple(map(str, arrays["fibre_kinds"])),
+            )
+        except FileNotFoundError as error:
+            raise UserError(f"{path}: is missing; run egs-warp animate again, which writes it") from error
+        except (OSError, KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
+            raise UserError(f"{path}: cannot be read ({error}); run egs-warp animate again, which writes it") from error

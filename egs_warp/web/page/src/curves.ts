@@ -1,0 +1,89 @@
+// Small curves that move with the time line.
+
+import { element } from "./dom";
+import type { FrameSource } from "./source";
+
+const COLOURS = ["#d9dee8", "#ffca61", "#7fd1b8", "#5cadff", "#ff8f73"];
+
+export class Curves {
+  readonly panel = element("section", { class: "curves", "aria-label": "Curves of the audit" });
+  private readonly rows: { canvas: HTMLCanvasElement; value: HTMLElement }[] = [];
+
+  constructor(
+    private readonly source: FrameSource,
+    seek: (place: number) => void,
+  ) {
+    for (const { title, unit } of source.header.facts.curves) {
+      const canvas = element("canvas", { class: "curve" });
+      const value = element("output", { class: "value" });
+      const row = element(
+        "div",
+        { class: "row" },
+        element("span", { class: "label" }, title, " ", element("small", {}, unit)),
+        value,
+        canvas,
+      );
+      canvas.addEventListener("pointerdown", (event) => {
+        const box = canvas.getBoundingClientRect();
+        seek(((event.clientX - box.left) / box.width) * (source.frames.length - 1));
+      });
+      this.panel.append(row);
+      this.rows.push({ canvas, value });
+    }
+  }
+
+  draw(place: number): void {
+    if (this.panel.hidden) return;
+    const { frames } = this.source;
+    const now = frames[Math.min(Math.round(place), frames.length - 1)];
+    this.rows.forEach(({ canvas, value }, k) => {
+      const values = frames.map((frame) => frame.curves[k] ?? 0);
+      value.textContent = said(now?.curves[k] ?? 0);
+      plot(canvas, values, place / Math.max(frames.length - 1, 1), COLOURS[k % COLOURS.length]!);
+    });
+  }
+}
+
+function said(value: number): string {
+  const size = Math.abs(value);
+  return size !== 0 && size < 1e-3 ? value.toExponential(0) : value.toFixed(size < 10 ? 2 : 0);
+}
+
+function plot(canvas: HTMLCanvasElement, values: number[], share: number, colour: string): void {
+  const ratio = Math.min(window.devicePixelRatio, 2);
+  const [width, height] = [canvas.clientWidth * ratio, canvas.clientHeight * ratio];
+  if (width === 0) return;
+  canvas.width = width;
+  canvas.height = height;
+  const context = canvas.getContext("2d");
+  if (context === null) return;
+  const low = Math.min(0, ...values);
+  const high = Math.max(...values, low + 1e-12);
+  const x = (k: number): number => (k / Math.max(values.length - 1, 1)) * width;
+  const y = (value: number): number => height - 2 * ratio - ((value - low) / (high - low)) * (height - 4 * ratio);
+  context.strokeStyle = "#2c313a";
+  context.lineWidth = ratio;
+  context.beginPath();
+  context.moveTo(0, y(0));
+  context.lineTo(width, y(0));
+  context.stroke();
+  const trace = (): void => {
+    context.beginPath();
+    values.forEach((value, k) => context.lineTo(x(k), y(value)));
+    context.stroke();
+  };
+  context.lineJoin = "round";
+  context.lineWidth = 1.4 * ratio;
+  context.strokeStyle = colour;
+  context.globalAlpha = 0.3;
+  trace();
+  context.globalAlpha = 1;
+  context.save();
+  context.beginPath();
+  context.rect(0, 0, share * width, height);
+  context.clip();
+  trace();
+  context.restore();
+  context.fillStyle = colour;
+  context.fillRect(share * width - 0.5 * ratio, 0, ratio, height);
+}

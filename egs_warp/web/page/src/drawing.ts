@@ -1,0 +1,107 @@
+// How Spark draws its sorted splats here: with the cut, the low-pass and the edge of our own renderer
+// (docs/concepts/renderer.md), and many splats to an instance, since a small instance costs as much as a large one, in
+// software a hundred times more than what is in it.
+
+import { SparkRenderer } from "@sparkjsdev/spark";
+import * as THREE from "three";
+
+const BATCH = 256;
+
+/** Quads, so many to an instance; Spark says how many splats are to be drawn. */
+class Batches extends THREE.InstancedBufferGeometry {
+  constructor(count: { value: number }) {
+    super();
+    const corners = new Float32Array(9 * BATCH);
+    for (let k = 0; k < BATCH; k++) {
+      corners.set([0, 2, k, -Math.sqrt(3), -1, k, Math.sqrt(3), -1, k], 9 * k);
+    }
+    this.setAttribute("position", new THREE.BufferAttribute(corners, 3));
+    Object.defineProperty(this, "instanceCount", {
+      get: () => Math.ceil(count.value / BATCH),
+      set: (splats: number) => {
+        count.value = splats;
+      },
+    });
+  }
+}
+
+const VERTEX = /* glsl */ `
+precision highp float;
+precision highp int;
+precision highp usampler2D;
+precision highp usampler2DArray;
+#include <splatDefines>
+
+uniform vec2 renderSize;
+uniform vec3 renderToViewPos;
+uniform mat3 renderToViewBasis;
+uniform usampler2D ordering;
+uniform usampler2DArray extSplats;
+uniform usampler2DArray extSplats2;
+uniform int splatCount;
+out vec2 place;
+flat out vec4 rgba;
+
+void main() {
+  gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
+  int rank = gl_InstanceID * ${BATCH} + int(position.z);
+  if (rank >= splatCount) return;
+  uint index = texelFetch(ordering, ivec2((rank >> 2) & 4095, rank >> 14), 0)[rank & 3];
+  if (index == 0xffffffffu) return;
+  ivec3 texel = splatTexCoord(int(index));
+  vec3 mean, squares, products;
+  unpackSplatExtCov(texelFetch(extSplats, texel, 0), texelFetch(extSplats2, texel, 0), mean, rgba, squares, products);
+  float cut = log(255.0 * rgba.a);
+  vec3 p = renderToViewBasis * mean + renderToViewPos;
+  vec4 middle = projectionMatrix * vec4(p, 1.0);
+  if (!(cut > 0.0) || -middle.w > middle.z || middle.w <= 0.0) return;
+  // The Jacobian is taken no further out than 15 % beyond the picture, where it would grow without bound.
+  vec2 focal = 0.5 * renderSize * vec2(projectionMatrix[0][0], projectionMatrix[1][1]);
+  vec2 slope = clamp(p.xy / -p.z, -0.65 * renderSize / focal, 0.65 * renderSize / focal);
+  vec3 right = vec3(focal.x, 0.0, focal.x * slope.x) / -p.z;
+  vec3 up = vec3(0.0, focal.y, focal.y * slope.y) / -p.z;
+  right = right * renderToViewBasis;
+  up = up * renderToViewBasis;
+  mat3 covariance = mat3(squares.x, products.x, products.y, products.x, squares.y, products.z, products.y, products.z, squares.z);
+  vec3 spread = covariance * right;
+  float a = dot(right, spread) + 0.3, b = dot(up, spread), d = dot(up, covariance * up) + 0.3;
+  float half_ = 0.5 * (a - d), root = sqrt(half_ * half_ + b * b), mid = 0.5 * (a + d);
+  float large = mid + root, small = max(mid - root, 0.3);
+  vec2 axis = root < 1e-6 * mid ? vec2(1.0, 0.0) : normalize(half_ > 0.0 ? vec2(half_ + root, b) : vec2(b, root - half_));
+  float reach = sqrt(2.0 * cut);
+  vec2 offset = reach * (position.x * sqrt(large) * axis + position.y * sqrt(small) * vec2(-axis.y, axis.x));
+  vec2 seen = abs(middle.xy) / middle.w * renderSize - renderSize;
+  if (max(seen.x, seen.y) > 2.0 * reach * sqrt(large)) return;
+  place = reach * position.xy;
+  gl_Position = vec4(middle.xy + 2.0 * offset / renderSize * middle.w, middle.zw);
+}`;
+
+const FRAGMENT = /* glsl */ `
+precision highp float;
+in vec2 place;
+flat in vec4 rgba;
+out vec4 colour;
+
+void main() {
+  float alpha = min(rgba.a * exp(-0.5 * dot(place, place)), 0.999);
+  if (alpha < 1.0 / 255.0) discard;
+  colour = vec4(rgba.rgb * alpha, alpha);
+}`;
+
+export function splatRenderer(renderer: THREE.WebGLRenderer, onDirty: () => void): SparkRenderer {
+  const splatCount = { value: 0 };
+  const spark = new SparkRenderer({
+    renderer,
+    accumExtSplats: true,
+    covSplats: true,
+    enableLod: false,
+    sortRadial: false,
+    vertexShader: VERTEX,
+    fragmentShader: FRAGMENT,
+    extraUniforms: { splatCount },
+    onDirty,
+  });
+  spark.geometry.dispose();
+  spark.geometry = new Batches(splatCount);
+  return spark;
+}

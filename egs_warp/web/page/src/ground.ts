@@ -1,0 +1,107 @@
+// The ground: a grid that fades with the distance, and the creature's soft shadow on it.
+
+import * as THREE from "three";
+
+const SHADOW_SIDE = 256;
+
+export class Ground {
+  readonly mesh: THREE.Mesh<THREE.PlaneGeometry, THREE.ShaderMaterial>;
+  private readonly target: THREE.WebGLRenderTarget;
+  private readonly camera: THREE.OrthographicCamera;
+  private readonly caster: THREE.Mesh;
+  private readonly casters = new THREE.Scene();
+  private readonly points: THREE.BufferAttribute;
+
+  constructor(
+    surface: Int32Array,
+    nodeCount: number,
+    private readonly height: number,
+    reach: number,
+  ) {
+    this.target = new THREE.WebGLRenderTarget(SHADOW_SIDE, SHADOW_SIDE, { depthBuffer: false });
+    const half = 1.5 * height;
+    this.camera = new THREE.OrthographicCamera(-half, half, half, -half, -100 * height, 100 * height);
+    const geometry = new THREE.BufferGeometry();
+    this.points = new THREE.BufferAttribute(new Float32Array(3 * nodeCount), 3);
+    geometry.setAttribute("position", this.points);
+    geometry.setIndex(new THREE.BufferAttribute(new Uint32Array(surface), 1));
+    this.caster = new THREE.Mesh(
+      geometry,
+      new THREE.ShaderMaterial({
+        uniforms: { height: { value: height } },
+        vertexShader: `varying float z; void main() { z = position.z; gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); }`,
+        fragmentShader: `uniform float height; varying float z;
+          void main() { float dark = 1.0 / (1.0 + 6.0 * max(z, 0.0) / height); gl_FragColor = vec4(dark, 0.0, 0.0, 1.0); }`,
+        side: THREE.DoubleSide,
+        depthTest: false,
+        blending: THREE.CustomBlending,
+        blendEquation: THREE.MaxEquation,
+        blendSrc: THREE.OneFactor,
+        blendDst: THREE.OneFactor,
+      }),
+    );
+    this.caster.frustumCulled = false;
+    this.casters.add(this.caster);
+    const material = new THREE.ShaderMaterial({
+      uniforms: {
+        shade: { value: this.target.texture },
+        centre: { value: new THREE.Vector2() },
+        shadeCentre: { value: new THREE.Vector2() },
+        shadeHalf: { value: half },
+        reach: { value: reach },
+        cell: { value: 0.25 * height },
+        softness: { value: 0.04 },
+      },
+      vertexShader: `varying vec3 place; void main() { vec4 p = modelMatrix * vec4(position, 1.0); place = p.xyz; gl_Position = projectionMatrix * viewMatrix * p; }`,
+      fragmentShader: `
+        varying vec3 place; uniform sampler2D shade; uniform vec2 centre, shadeCentre; uniform float shadeHalf, reach, cell, softness;
+        float line(vec2 p, float width) {
+          vec2 d = abs(fract(p / cell + 0.5) - 0.5) * cell, w = fwidth(p) * width;
+          vec2 l = clamp(1.0 - d / w, 0.0, 1.0) * clamp(0.35 * cell / w, 0.0, 1.0);
+          return max(l.x, l.y);
+        }
+        void main() {
+          vec2 p = place.xy;
+          float fade = smoothstep(1.0, 0.25, distance(p, centre) / reach);
+          vec3 colour = mix(vec3(0.105, 0.115, 0.13), vec3(0.21, 0.23, 0.26), line(p, 1.1));
+          vec2 uv = 0.5 + 0.5 * (p - shadeCentre) / shadeHalf;
+          if (all(lessThan(abs(uv - 0.5), vec2(0.5)))) {
+            float dark = 0.0;
+            for (int i = 0; i < 12; i++) {
+              float a = 2.399963 * float(i), r = sqrt((float(i) + 0.5) / 12.0) * softness;
+              dark += texture2D(shade, uv + r * vec2(cos(a), sin(a))).r;
+            }
+            colour *= 1.0 - 0.06 * dark;
+          }
+          gl_FragColor = vec4(colour, fade);
+        }`,
+      transparent: true,
+      depthWrite: false,
+    });
+    this.mesh = new THREE.Mesh(new THREE.PlaneGeometry(2 * reach, 2 * reach), material);
+    this.mesh.renderOrder = -10;
+  }
+
+  centreOn(x: number, y: number): void {
+    this.mesh.position.set(x, y, 0);
+    (this.mesh.material.uniforms.centre!.value as THREE.Vector2).set(x, y);
+  }
+
+  /** Draws the shadow of the cage at node `positions`, whose centre of mass is `middle`. */
+  cast(renderer: THREE.WebGLRenderer, positions: Float32Array, middle: THREE.Vector3): void {
+    if (!this.mesh.visible) return;
+    (this.points.array as Float32Array).set(positions);
+    this.points.needsUpdate = true;
+    const { uniforms } = this.mesh.material;
+    (uniforms.shadeCentre!.value as THREE.Vector2).set(middle.x, middle.y);
+    uniforms.softness!.value = 0.02 + 0.05 * Math.min(Math.max(middle.z / this.height - 0.2, 0), 1.5);
+    this.camera.position.set(middle.x, middle.y, 0);
+    const before = { target: renderer.getRenderTarget(), colour: renderer.getClearColor(new THREE.Color()), alpha: renderer.getClearAlpha() };
+    renderer.setRenderTarget(this.target);
+    renderer.setClearColor(0x000000, 1);
+    renderer.clear();
+    renderer.render(this.casters, this.camera);
+    renderer.setRenderTarget(before.target);
+    renderer.setClearColor(before.colour, before.alpha);
+  }
+}

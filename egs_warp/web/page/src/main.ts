@@ -1,0 +1,263 @@
+// The page: finds its runs, lays out the stages and the controls, and keeps time.
+
+import { Curves } from "./curves";
+import { button, element, icon, save } from "./dom";
+import { FilmRecorder } from "./film";
+import { Player } from "./player";
+import { fromAddress, fromElement, fromSocket, type FrameSource } from "./source";
+import { Stage, type Preset, type Tick } from "./stage";
+import "./style.css";
+
+const SPEEDS = [0.1, 0.25, 0.5, 1, 2];
+const LAYERS: { name: Tick; title: string; on: boolean; key: string }[] = [
+  { name: "splats", title: "Creature", on: true, key: "1" },
+  { name: "scene", title: "Scene", on: true, key: "2" },
+  { name: "ground", title: "Ground", on: true, key: "3" },
+  { name: "cage", title: "Cage", on: false, key: "4" },
+  { name: "muscles", title: "Muscles", on: false, key: "5" },
+  { name: "contacts", title: "Contacts and forces", on: false, key: "6" },
+  { name: "path", title: "Centre of mass", on: false, key: "7" },
+];
+const PRESETS: { name: Preset; title: string }[] = [
+  { name: "film", title: "Film" },
+  { name: "front", title: "Front" },
+  { name: "side", title: "Side" },
+  { name: "top", title: "Top" },
+];
+
+/** The runs of this page: carried within it, sent by a socket, or lying beside it. */
+async function findRuns(): Promise<FrameSource[]> {
+  const carried = [...document.querySelectorAll<HTMLElement>("script[data-run]")];
+  if (carried.length > 0) return Promise.all(carried.map(fromElement));
+  const asked = new URLSearchParams(location.search);
+  if (asked.has("live")) {
+    const address = new URL("live", location.href);
+    address.protocol = address.protocol.replace("http", "ws");
+    address.search = "";
+    return [await fromSocket(address.href, (connected) => document.body.classList.toggle("lost", !connected))];
+  }
+  const count = Number(asked.get("runs") ?? "1");
+  return Promise.all(Array.from({ length: count }, (_, k) => fromAddress(`run/${k}`)));
+}
+
+function webgl2(): boolean {
+  return document.createElement("canvas").getContext("webgl2") !== null;
+}
+
+function tell(message: string): void {
+  document.getElementById("page")?.replaceChildren(element("p", { class: "told", role: "alert" }, message));
+}
+
+class Page {
+  readonly stages: Stage[] = [];
+  readonly player: Player;
+  private readonly curves: Curves;
+  private readonly film = new FilmRecorder();
+  private readonly playButton: HTMLButtonElement;
+  private readonly slider = element("input", { type: "range", min: "0", step: "any", class: "line", "aria-label": "Time" });
+  private readonly clock = element("output", { class: "clock" });
+  private readonly boxes = new Map<Tick, HTMLInputElement>();
+  private before = 0;
+
+  constructor(root: HTMLElement, sources: FrameSource[]) {
+    this.player = new Player(sources, () => this.update());
+    const views = element("div", { class: sources.length > 1 ? "views two" : "views" });
+    const first = sources[0] as FrameSource;
+    document.title = `${first.header.facts.title} \u2013 egs_warp`;
+    root.replaceChildren(views);
+    for (const source of sources) {
+      const canvas = element("canvas", { class: "view", tabindex: "0", "aria-label": source.header.facts.title });
+      views.append(element("figure", {}, canvas, element("figcaption", {}, source.header.facts.title)));
+      const stage = new Stage(canvas, source);
+      this.stages.push(stage);
+      source.onFrame = () => this.update();
+    }
+    for (const stage of this.stages) {
+      stage.controls.addEventListener("change", () => {
+        for (const other of this.stages) if (other !== stage) other.copyView(stage);
+      });
+    }
+    this.curves = new Curves(first, (place) => this.player.seek(place));
+    this.playButton = button("play", "Play (space)", () => this.player.toggle());
+    this.playButton.classList.add("play");
+    root.append(this.tools(), this.curves.panel, this.dock());
+    this.curves.panel.hidden = true;
+    new ResizeObserver(() => {
+      for (const stage of this.stages) stage.resize();
+      this.curves.draw(this.player.place);
+    }).observe(views);
+    document.addEventListener("keydown", (event) => this.pressed(event));
+    for (const { name, on } of LAYERS) for (const stage of this.stages) stage.tick(name, on && this.shown(name, stage));
+    this.update();
+    requestAnimationFrame((now) => this.tick(now));
+  }
+
+  /** The layer as a user ticks it. */
+  setLayer(name: Tick, on: boolean): void {
+    const box = this.boxes.get(name);
+    if (box !== undefined) box.checked = on;
+    for (const stage of this.stages) stage.tick(name, on);
+    this.update();
+  }
+
+  private shown(name: Tick, stage: Stage): boolean {
+    // A captured scene has a ground of its own.
+    return name !== "ground" || !stage.hasScene;
+  }
+
+  private tools(): HTMLElement {
+    const layers = element("div", { class: "menu", hidden: "" });
+    for (const { name, title, on, key } of LAYERS) {
+      if (name === "scene" && !this.stages.some((stage) => stage.hasScene)) continue;
+      const box = element("input", { type: "checkbox", id: `layer-${name}` });
+      box.checked = on && this.stages.some((stage) => this.shown(name, stage));
+      box.addEventListener("change", () => this.setLayer(name, box.checked));
+      this.boxes.set(name, box);
+      layers.append(element("label", {}, box, element("span", {}, title), element("kbd", {}, key)));
+    }
+    const views = element("div", { class: "menu", hidden: "" });
+    for (const { name, title } of PRESETS) {
+      const made = element("button", { type: "button", class: "item", id: `view-${name}` }, title);
+      made.addEventListener("click", () => {
+        for (const stage of this.stages) stage.preset(name);
+      });
+      views.append(made);
+    }
+    const follow = element("input", { type: "checkbox", id: "follow" });
+    follow.addEventListener("change", () => {
+      for (const stage of this.stages) stage.follow = follow.checked;
+    });
+    views.append(element("label", {}, follow, element("span", {}, "Follow the creature")));
+    const toggle = (opened: HTMLElement, other: HTMLElement) => () => {
+      opened.hidden = !opened.hidden;
+      other.hidden = true;
+    };
+    const record = button("record", "Record a video of the whole run", () => this.record(record));
+    return element(
+      "nav",
+      { class: "tools", "aria-label": "View" },
+      button("layers", "Layers", toggle(layers, views)),
+      button("view", "Camera", toggle(views, layers)),
+      button("curves", "Curves (c)", () => this.toggleCurves()),
+      button("camera", "Screenshot (s)", () => void this.screenshot()),
+      record,
+      layers,
+      views,
+    );
+  }
+
+  private dock(): HTMLElement {
+    this.slider.addEventListener("input", () => this.player.seek(Number(this.slider.value)));
+    const speed = element("select", { class: "speed", "aria-label": "Speed", title: "Speed" });
+    for (const value of SPEEDS) speed.append(element("option", { value: String(value) }, `${value}\u00d7`));
+    speed.value = "1";
+    speed.addEventListener("change", () => {
+      this.player.speed = Number(speed.value);
+    });
+    const loop = button("loop", "Loop (l)", () => {
+      this.player.loop = !this.player.loop;
+      loop.setAttribute("aria-pressed", String(this.player.loop));
+    });
+    loop.id = "loop";
+    loop.setAttribute("aria-pressed", "true");
+    return element("footer", { class: "dock" }, this.playButton, this.slider, this.clock, speed, loop);
+  }
+
+  private toggleCurves(): void {
+    this.curves.panel.hidden = !this.curves.panel.hidden;
+    this.curves.draw(this.player.place);
+  }
+
+  private async screenshot(): Promise<void> {
+    for (const stage of this.stages) {
+      await stage.settle();
+      save(await stage.picture(), `${this.fileName()}-${Math.round(this.player.place)}.png`);
+    }
+  }
+
+  private record(pressed: HTMLButtonElement): void {
+    const [stage] = this.stages;
+    if (stage === undefined) return;
+    if (this.film.recording) {
+      this.film.stop();
+      this.player.playing = false;
+      pressed.classList.remove("on");
+      return;
+    }
+    const { loop } = this.player;
+    this.player.seek(0);
+    this.player.loop = false;
+    this.film.start(stage.canvas, (blob, ending) => save(blob, `${this.fileName()}.${ending}`));
+    pressed.classList.add("on");
+    this.player.playing = true;
+    const watch = setInterval(() => {
+      if (this.player.playing && this.film.recording) return;
+      clearInterval(watch);
+      this.film.stop();
+      this.player.loop = loop;
+      pressed.classList.remove("on");
+    }, 50);
+  }
+
+  private fileName(): string {
+    const { title } = (this.stages[0] as Stage).source.header.facts;
+    return title.replace(/[^\p{L}\p{N}]+/gu, "-").replace(/^-|-$/g, "") || "run";
+  }
+
+  private pressed(event: KeyboardEvent): void {
+    if (event.target instanceof HTMLSelectElement || event.ctrlKey || event.metaKey || event.altKey) return;
+    const layer = LAYERS.find(({ key }) => key === event.key);
+    if (layer !== undefined) this.setLayer(layer.name, !(this.boxes.get(layer.name)?.checked ?? false));
+    else if (event.key === " ") this.player.toggle();
+    else if (event.key === "ArrowRight") this.player.step(1);
+    else if (event.key === "ArrowLeft") this.player.step(-1);
+    else if (event.key === "c") this.toggleCurves();
+    else if (event.key === "s") void this.screenshot();
+    else if (event.key === "l") document.getElementById("loop")?.click();
+    else return;
+    event.preventDefault();
+  }
+
+  /** Shows where the player stands. */
+  private update(): void {
+    const { player } = this;
+    for (const stage of this.stages) stage.show(player.place);
+    this.slider.max = String(player.last);
+    this.slider.value = String(player.place);
+    this.slider.style.setProperty("--done", `${(100 * player.place) / Math.max(player.last, 1)}%`);
+    this.clock.textContent = `${player.seconds.toFixed(2)} / ${(player.last / player.rate).toFixed(2)} s`;
+    this.playButton.innerHTML = icon(player.playing ? "pause" : "play");
+    this.curves.draw(player.place);
+  }
+
+  private tick(now: number): void {
+    const elapsed = this.before === 0 ? 0 : (now - this.before) / 1000;
+    this.before = now;
+    this.player.advance(elapsed);
+    for (const stage of this.stages) stage.draw();
+    requestAnimationFrame((next) => this.tick(next));
+  }
+}
+
+declare global {
+  interface Window {
+    /** For scripts that drive the page. */
+    egs?: Page;
+  }
+}
+
+async function begin(): Promise<void> {
+  const root = document.getElementById("page") as HTMLElement;
+  if (!webgl2()) {
+    tell("This browser has no WebGL2, which draws the splats. Another browser, or hardware acceleration in its settings, will do.");
+    return;
+  }
+  tell("Loading\u2026");
+  try {
+    window.egs = new Page(root, await findRuns());
+  } catch (error) {
+    tell(error instanceof Error ? error.message : String(error));
+  }
+}
+
+void begin();

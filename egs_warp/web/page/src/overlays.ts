@@ -1,0 +1,198 @@
+// What the mechanics knows, drawn over the splats: cage, muscles, contacts, centre of mass.
+
+import * as THREE from "three";
+import { floatsOf, indicesOf, type Frame, type Header } from "./packets";
+import { Strokes } from "./strokes";
+
+export type Layer = "cage" | "muscles" | "contacts" | "path";
+
+/** Three mixes in linear light. */
+const linear = (hex: number): number[] => new THREE.Color(hex).toArray();
+
+const COLOURS = {
+  cage: linear(0x9fb8dc),
+  relaxed: linear(0x6f7a8a),
+  contracts: linear(0xff5a3c),
+  extends: linear(0x4aa8ff),
+  force: linear(0xffc24a),
+  cone: linear(0x7fd1b8),
+  past: linear(0xc3a6ff),
+  future: linear(0x6f6390),
+  plumb: linear(0x6f7a8a),
+};
+const CONE_SIDES = 14;
+/** Length of an arrow of one body weight, in body heights. */
+const WEIGHT_LENGTH = 0.5;
+
+export class Overlays {
+  readonly group = new THREE.Group();
+  private readonly strokes: Record<Layer, Strokes> = {
+    cage: new Strokes(1, 0.4, 10),
+    muscles: new Strokes(2.5, 0.9, 11),
+    contacts: new Strokes(3, 1, 14),
+    path: new Strokes(2.5, 0.95, 12),
+  };
+  private readonly cones = new Strokes(1, 0.4, 13);
+  private readonly middle: THREE.Mesh;
+  private readonly feet: THREE.Points;
+  private readonly visible = new Set<Layer>();
+  private readonly ends: Float32Array;
+  /** Of each frame. */
+  private readonly path: THREE.Vector3[] = [];
+
+  constructor(
+    private readonly header: Header,
+    private readonly centres: (frame: Frame) => THREE.Vector3,
+  ) {
+    for (const strokes of [...Object.values(this.strokes), this.cones]) this.group.add(strokes.object);
+    const height = header.facts.height;
+    this.middle = new THREE.Mesh(
+      new THREE.SphereGeometry(0.018 * height, 20, 14),
+      new THREE.MeshBasicMaterial({ color: 0xf4f6fa, depthTest: false, transparent: true }),
+    );
+    this.middle.renderOrder = 14;
+    this.feet = new THREE.Points(
+      new THREE.BufferGeometry(),
+      new THREE.PointsMaterial({
+        color: 0x7fd1b8,
+        size: 8,
+        sizeAttenuation: false,
+        map: disc(),
+        depthTest: false,
+        transparent: true,
+      }),
+    );
+    this.feet.renderOrder = 15;
+    this.feet.frustumCulled = false;
+    this.group.add(this.middle, this.feet);
+    this.ends = new Float32Array(3 * (indicesOf(header, "muscle_end_starts").length - 1));
+    this.apply();
+  }
+
+  show(layer: Layer, visible: boolean): void {
+    if (visible) this.visible.add(layer);
+    else this.visible.delete(layer);
+    this.apply();
+  }
+
+  /** `positions` may lie between two frames; `frame` is the nearest. */
+  update(frame: Frame, positions: Float32Array, frames: Frame[]): void {
+    if (this.visible.has("cage")) this.drawCage(positions);
+    if (this.visible.has("muscles")) this.drawMuscles(frame, positions);
+    if (this.visible.has("contacts")) this.drawContacts(frame);
+    if (this.visible.has("path")) this.drawPath(frame, frames);
+  }
+
+  private apply(): void {
+    for (const [layer, strokes] of Object.entries(this.strokes)) strokes.object.visible = this.visible.has(layer as Layer);
+    this.middle.visible = this.visible.has("path");
+    this.feet.visible = this.cones.object.visible = this.visible.has("contacts");
+  }
+
+  private drawCage(positions: Float32Array): void {
+    const edges = indicesOf(this.header, "edges");
+    const lines = new Float32Array(3 * edges.length);
+    for (let k = 0; k < edges.length; k++) lines.set(positions.subarray(3 * edges[k]!, 3 * edges[k]! + 3), 3 * k);
+    this.strokes.cage.set(lines, tinted(edges.length, COLOURS.cage));
+  }
+
+  private drawMuscles(frame: Frame, positions: Float32Array): void {
+    const starts = indicesOf(this.header, "muscle_end_starts");
+    const nodes = indicesOf(this.header, "muscle_end_nodes");
+    const weights = floatsOf(this.header, "muscle_end_weights");
+    this.ends.fill(0);
+    for (let end = 0; end + 1 < starts.length; end++) {
+      for (let k = starts[end]!; k < starts[end + 1]!; k++) {
+        for (let axis = 0; axis < 3; axis++) this.ends[3 * end + axis]! += weights[k]! * positions[3 * nodes[k]! + axis]!;
+      }
+    }
+    const segments = indicesOf(this.header, "muscle_segments");
+    const lines = new Float32Array(3 * segments.length);
+    const colours = new Float32Array(3 * segments.length);
+    for (let k = 0; k < segments.length; k++) {
+      lines.set(this.ends.subarray(3 * segments[k]!, 3 * segments[k]! + 3), 3 * k);
+      const level = (frame.activations[k >> 1] ?? 0) / 127;
+      const towards = level > 0 ? COLOURS.contracts : COLOURS.extends;
+      const share = Math.sqrt(Math.abs(level));
+      for (let c = 0; c < 3; c++) colours[3 * k + c] = COLOURS.relaxed[c]! + share * (towards[c]! - COLOURS.relaxed[c]!);
+    }
+    this.strokes.muscles.set(lines, colours);
+  }
+
+  private drawContacts(frame: Frame): void {
+    const { height, weight, friction } = this.header.facts;
+    const scale = (WEIGHT_LENGTH * height) / weight;
+    const arrows = new Lines();
+    const cones = new Lines();
+    const points: number[] = [];
+    for (let k = 0; k < frame.contacts.length; k += 9) {
+      const [point, normal, force] = [0, 3, 6].map((at) => new THREE.Vector3().fromArray(frame.contacts, k + at)) as [
+        THREE.Vector3,
+        THREE.Vector3,
+        THREE.Vector3,
+      ];
+      points.push(...point.toArray());
+      const pressed = scale * force.dot(normal);
+      if (pressed < 1e-3 * height) continue;
+      arrows.add(point, point.clone().addScaledVector(force, scale), COLOURS.force);
+      const side = new THREE.Vector3(Math.abs(normal.x) < 0.9 ? 1 : 0, Math.abs(normal.x) < 0.9 ? 0 : 1, 0);
+      side.addScaledVector(normal, -side.dot(normal)).normalize();
+      const other = new THREE.Vector3().crossVectors(normal, side);
+      const rim = (j: number): THREE.Vector3 => {
+        const angle = (2 * Math.PI * j) / CONE_SIDES;
+        return point
+          .clone()
+          .addScaledVector(normal, pressed)
+          .addScaledVector(side, friction * pressed * Math.cos(angle))
+          .addScaledVector(other, friction * pressed * Math.sin(angle));
+      };
+      for (let j = 0; j < CONE_SIDES; j++) {
+        cones.add(rim(j), rim(j + 1), COLOURS.cone);
+        if (j % 3 === 0) cones.add(point, rim(j), COLOURS.cone);
+      }
+    }
+    this.strokes.contacts.set(arrows.points, arrows.colours);
+    this.cones.set(cones.points, cones.colours);
+    this.feet.geometry.setAttribute("position", new THREE.Float32BufferAttribute(points, 3));
+  }
+
+  private drawPath(frame: Frame, frames: Frame[]): void {
+    const lines = new Lines();
+    const every = this.path;
+    for (const one of frames.slice(every.length)) every.push(this.centres(one));
+    for (let k = 0; k + 1 < every.length; k++) {
+      lines.add(every[k]!, every[k + 1]!, k < frame.index ? COLOURS.past : COLOURS.future);
+    }
+    const now = this.middle.position.copy(this.centres(frame));
+    lines.add(now, now.clone().setZ(0), COLOURS.plumb);
+    this.strokes.path.set(lines.points, lines.colours);
+  }
+}
+
+class Lines {
+  readonly points: number[] = [];
+  readonly colours: number[] = [];
+
+  add(from: THREE.Vector3, to: THREE.Vector3, colour: readonly number[]): void {
+    this.points.push(...from.toArray(), ...to.toArray());
+    this.colours.push(...colour, ...colour);
+  }
+}
+
+/** A round dot. */
+function disc(): THREE.Texture {
+  const side = 32;
+  const canvas = document.createElement("canvas");
+  canvas.width = canvas.height = side;
+  const context = canvas.getContext("2d") as CanvasRenderingContext2D;
+  context.fillStyle = "#fff";
+  context.arc(side / 2, side / 2, side / 2 - 1, 0, 2 * Math.PI);
+  context.fill();
+  return new THREE.CanvasTexture(canvas);
+}
+
+function tinted(count: number, colour: readonly number[]): Float32Array {
+  const colours = new Float32Array(3 * count);
+  for (let k = 0; k < colours.length; k++) colours[k] = colour[k % 3]!;
+  return colours;
+}

@@ -1,0 +1,135 @@
+// What the page is sent: one header, then a packet for each frame (egs_warp/web/packets.py is the writer).
+
+export interface Curve {
+  name: string;
+  title: string;
+  unit: string;
+}
+
+export interface Facts {
+  title: string;
+  rate: number;
+  frames: number;
+  height: number;
+  weight: number;
+  friction: number;
+  curves: Curve[];
+  fibres: { name: string; kind: string }[];
+  camera: { position: [number, number, number]; forward: [number, number, number]; fov: number };
+  audit: Record<string, number>;
+  motion: { name: string; reached?: Record<string, number> }[];
+  notes: string[];
+  degree: { splats: number; scene: number };
+}
+
+export type Numbers = Float32Array | Int32Array | Uint8Array;
+
+export interface Header {
+  facts: Facts;
+  arrays: Map<string, Numbers>;
+}
+
+export interface Frame {
+  index: number;
+  time: number;
+  positions: Float32Array;
+  /** -127 to 127 of the most that each segment can do. */
+  activations: Int8Array;
+  /** Nine numbers a contact: point, normal, force. */
+  contacts: Float32Array;
+  curves: Float32Array;
+}
+
+const MAGIC = "EGSPAGE1";
+
+interface Listed {
+  type: string;
+  shape: number[];
+  start: number;
+}
+
+/** The header at the start of `bytes`, and where what follows it begins. */
+export function readHeader(bytes: ArrayBuffer): { header: Header; end: number } {
+  const whole = new DataView(bytes);
+  const text = new TextDecoder();
+  if (bytes.byteLength < 12 || text.decode(new Uint8Array(bytes, 0, 8)) !== MAGIC) {
+    throw new Error("this is no run of egs_warp");
+  }
+  const length = whole.getUint32(8, true);
+  const { arrays: listed, bytes: size, ...facts } = JSON.parse(text.decode(new Uint8Array(bytes, 12, length)));
+  const base = Math.ceil((12 + length) / 8) * 8;
+  const arrays = new Map<string, Numbers>();
+  for (const [name, { type, shape, start }] of Object.entries(listed as Record<string, Listed>)) {
+    const count = shape.reduce((product, side) => product * side, 1);
+    arrays.set(name, view(type, bytes, base + start, count));
+  }
+  return { header: { facts: facts as Facts, arrays }, end: base + (size as number) };
+}
+
+function view(type: string, bytes: ArrayBuffer, start: number, count: number): Numbers {
+  switch (type) {
+    case "float32":
+      return new Float32Array(bytes, start, count);
+    case "int32":
+      return new Int32Array(bytes, start, count);
+    case "uint8":
+      return new Uint8Array(bytes, start, count);
+    default:
+      throw new Error(`numbers of type ${type}`);
+  }
+}
+
+/** One frame; it starts at a multiple of four bytes. */
+export function readFrame(bytes: ArrayBuffer, start: number): Frame {
+  const words = new Uint32Array(bytes, start, 8);
+  const [nodes, segments, contacts, curves] = [words[2], words[3], words[4], words[5]] as [number, number, number, number];
+  let at = start + 32;
+  const floats = (count: number): Float32Array => {
+    const values = new Float32Array(bytes, at, count);
+    at += 4 * count;
+    return values;
+  };
+  const positions = floats(3 * nodes);
+  const activations = new Int8Array(bytes, at, segments);
+  at += 4 * Math.ceil(segments / 4);
+  return {
+    index: words[0] as number,
+    time: new Float32Array(bytes, start + 4, 1)[0] as number,
+    positions,
+    activations,
+    contacts: floats(9 * contacts),
+    curves: floats(curves),
+  };
+}
+
+/** All frames of a file after its header, each with its length before it. */
+export function readFrames(bytes: ArrayBuffer, start: number): Frame[] {
+  const whole = new DataView(bytes);
+  const frames: Frame[] = [];
+  let at = start;
+  while (at + 4 <= bytes.byteLength) {
+    const length = whole.getUint32(at, true);
+    if (at + 4 + length > bytes.byteLength) break;
+    frames.push(readFrame(bytes, at + 4));
+    at += 4 + length;
+  }
+  return frames;
+}
+
+export function floatsOf(header: Header, name: string): Float32Array {
+  const values = header.arrays.get(name);
+  if (!(values instanceof Float32Array)) throw new Error(`the run has no ${name}`);
+  return values;
+}
+
+export function indicesOf(header: Header, name: string): Int32Array {
+  const values = header.arrays.get(name);
+  if (!(values instanceof Int32Array)) throw new Error(`the run has no ${name}`);
+  return values;
+}
+
+export function bytesOf(header: Header, name: string): Uint8Array {
+  const values = header.arrays.get(name);
+  if (!(values instanceof Uint8Array)) throw new Error(`the run has no ${name}`);
+  return values;
+}

@@ -1,0 +1,109 @@
+// Splats that the cage carries in a shader: means, F Sigma F^T and the turned colour bands (Eq. 14, 15), drawn by Spark.
+
+import { dyno, SplatGenerator } from "@sparkjsdev/spark";
+import * as THREE from "three";
+import { floatTexture, TEXTURE_WIDTH } from "./cage";
+import { bytesOf, floatsOf, indicesOf, type Header } from "./packets";
+import { CARRY_GLSL } from "./carry.glsl";
+
+export interface CarriedSplats {
+  generator: SplatGenerator;
+  /** Told that the cage has moved. */
+  moved(): void;
+}
+
+/** The splats `name` of a run, carried by the maps in `cage`; `still` ones all lie in its first tetrahedron. */
+export function carriedSplats(
+  header: Header,
+  name: "splats" | "scene",
+  cage: THREE.DataTexture,
+  { still }: { still: boolean },
+): CarriedSplats {
+  const means = floatsOf(header, `${name}_means`);
+  const count = means.length / 3;
+  const degree = header.facts.degree[name];
+  const splats = floatTexture(4 * count);
+  const rotations = floatsOf(header, `${name}_rotations`);
+  const scales = floatsOf(header, `${name}_scales`);
+  const opacities = floatsOf(header, `${name}_opacities`);
+  const colours = floatsOf(header, `${name}_colours`);
+  const codes = still ? undefined : indicesOf(header, "mean_tets");
+  const armRows = still ? new Float32Array(0) : floatsOf(header, "arms");
+  let arm = 0;
+  for (let i = 0; i < count; i++) {
+    const code = codes?.[i] ?? 0;
+    const out = splats.values.subarray(16 * i, 16 * i + 16);
+    out.set(means.subarray(3 * i, 3 * i + 3), 0);
+    out[3] = code;
+    out.set(rotations.subarray(4 * i, 4 * i + 4), 4);
+    out.set(scales.subarray(3 * i, 3 * i + 3), 8);
+    out[11] = opacities[i] as number;
+    out.set(colours.subarray(3 * i, 3 * i + 3), 12);
+    out[15] = code < 0 ? arm++ : 0;
+  }
+  const arms = floatTexture(4 * Math.max(1, arm));
+  for (let k = 0; k < arm; k++) arms.values.set(armRows.subarray(15 * k, 15 * k + 15), 16 * k);
+  const eye = new THREE.Vector3();
+  const uniforms = {
+    splats: dyno.dynoSampler2D(splats.texture, "egsSplats"),
+    arms: dyno.dynoSampler2D(arms.texture, "egsArms"),
+    bands: dyno.dynoSampler2D(bandTexture(bytesOf(header, `${name}_bands`), count, degree), "egsBands"),
+    bandScales: dyno.dynoSampler2D(scaleTexture(floatsOf(header, `${name}_band_scales`)), "egsBandScales"),
+    cage: dyno.dynoSampler2D(cage, "egsCage"),
+    eye: dyno.dynoVec3(eye, "egsEye"),
+    degree: dyno.dynoConst("int", degree),
+  };
+  const covGenerator = dyno.dynoBlock({ index: "int" }, { covsplat: dyno.CovSplat }, ({ index }) => {
+    if (index === undefined) throw new Error("Spark gave no index");
+    const carry = new dyno.Dyno({
+      inTypes: {
+        index: "int",
+        splats: "sampler2D",
+        arms: "sampler2D",
+        bands: "sampler2D",
+        bandScales: "sampler2D",
+        cage: "sampler2D",
+        eye: "vec3",
+        degree: "int",
+      },
+      outTypes: { covsplat: dyno.CovSplat },
+      inputs: { index, ...uniforms },
+      globals: () => [dyno.defineGsplat, dyno.defineCovSplat, CARRY_GLSL],
+      statements: ({ inputs: i, outputs }) => [
+        `${outputs.covsplat} = egsCarried(${i.index}, ${i.splats}, ${i.arms}, ${i.bands}, ${i.bandScales}, ${i.cage}, ${i.eye}, ${i.degree});`,
+      ],
+    });
+    return { covsplat: carry.outputs.covsplat };
+  });
+  const generator = new SplatGenerator({
+    numSplats: count,
+    covGenerator,
+    update: ({ camera }) => {
+      camera?.getWorldPosition(eye);
+    },
+  });
+  generator.frustumCulled = false;
+  return { generator, moved: () => generator.updateVersion() };
+}
+
+/** One texel of three bytes for each coefficient above band 0. */
+function bandTexture(bands: Uint8Array, count: number, degree: number): THREE.DataTexture {
+  const each = (degree + 1) ** 2 - 1;
+  const texels = Math.max(1, each * count);
+  const rows = Math.ceil(texels / TEXTURE_WIDTH);
+  const values = new Uint8Array(4 * TEXTURE_WIDTH * rows);
+  for (let k = 0; k < each * count; k++) {
+    for (let c = 0; c < 3; c++) values[4 * k + c] = bands[3 * k + c] as number;
+  }
+  const texture = new THREE.DataTexture(values, TEXTURE_WIDTH, rows, THREE.RGBAFormat, THREE.UnsignedByteType);
+  texture.needsUpdate = true;
+  return texture;
+}
+
+function scaleTexture(scales: Float32Array): THREE.DataTexture {
+  const { texture, values } = floatTexture(16);
+  scales.forEach((scale, k) => {
+    values[4 * k] = scale;
+  });
+  return texture;
+}

@@ -1,0 +1,217 @@
+// One run on one canvas: splats, overlays, ground and camera.
+
+import type { SparkRenderer } from "@sparkjsdev/spark";
+import * as THREE from "three";
+import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+import { Cage, stillCage } from "./cage";
+import { splatRenderer } from "./drawing";
+import { Ground } from "./ground";
+import { Overlays, type Layer } from "./overlays";
+import { floatsOf, indicesOf, type Frame } from "./packets";
+import type { FrameSource } from "./source";
+import { carriedSplats, type CarriedSplats } from "./splats";
+
+export const BACKGROUND = 0x14161a;
+export type Preset = "film" | "front" | "side" | "top";
+export type Tick = Layer | "splats" | "scene" | "ground";
+
+export class Stage {
+  readonly renderer: THREE.WebGLRenderer;
+  readonly camera = new THREE.PerspectiveCamera();
+  readonly controls: OrbitControls;
+  /** Whether the camera goes along with the centre of mass. */
+  follow = false;
+  private readonly scene = new THREE.Scene();
+  private readonly spark: SparkRenderer;
+  private readonly cage: Cage;
+  private readonly splats: CarriedSplats;
+  private readonly still: CarriedSplats | undefined;
+  private readonly overlays: Overlays;
+  private readonly ground: Ground;
+  private readonly masses: Float32Array;
+  private readonly bounds: { middle: THREE.Vector3; size: number };
+  private readonly positions: Float32Array;
+  private readonly followed = new THREE.Vector3();
+  private filmFov = 30;
+  private dirty = true;
+
+  constructor(
+    readonly canvas: HTMLCanvasElement,
+    readonly source: FrameSource,
+  ) {
+    const { header } = source;
+    // Spark advises against multisampling: splats gain nothing by it.
+    this.renderer = new THREE.WebGLRenderer({ canvas, antialias: false, powerPreference: "high-performance" });
+    this.renderer.setClearColor(BACKGROUND, 1);
+    this.camera.up.set(0, 0, 1);
+    this.masses = floatsOf(header, "node_mass");
+    const rest = floatsOf(header, "rest");
+    this.positions = new Float32Array(rest);
+    this.cage = new Cage(rest, indicesOf(header, "tets"));
+    this.splats = carriedSplats(header, "splats", this.cage.texture, { still: false });
+    this.spark = splatRenderer(this.renderer, () => this.invalidate());
+    this.scene.add(this.spark, this.splats.generator);
+    if (header.arrays.has("scene_means")) {
+      this.still = carriedSplats(header, "scene", stillCage(), { still: true });
+      this.scene.add(this.still.generator);
+    }
+    this.overlays = new Overlays(header, (frame) => this.centre(frame.positions));
+    this.scene.add(this.overlays.group);
+    this.bounds = this.reach();
+    const { height } = header.facts;
+    this.ground = new Ground(indicesOf(header, "surface"), rest.length / 3, height, 3.5 * height + 1.5 * this.bounds.size);
+    this.ground.centreOn(this.bounds.middle.x, this.bounds.middle.y);
+    this.ground.mesh.visible = this.still === undefined;
+    this.scene.add(this.ground.mesh);
+    this.controls = new OrbitControls(this.camera, canvas);
+    this.controls.enableDamping = true;
+    this.controls.dampingFactor = 0.12;
+    this.controls.zoomToCursor = true;
+    this.controls.addEventListener("change", () => this.invalidate());
+    this.preset("film");
+    this.show(0);
+  }
+
+  get hasScene(): boolean {
+    return this.still !== undefined;
+  }
+
+  invalidate(): void {
+    this.dirty = true;
+  }
+
+  tick(layer: Tick, visible: boolean): void {
+    if (layer === "splats") this.splats.generator.visible = visible;
+    else if (layer === "ground") this.ground.mesh.visible = visible;
+    else if (layer === "scene") {
+      if (this.still !== undefined) this.still.generator.visible = visible;
+    } else this.overlays.show(layer, visible);
+    this.invalidate();
+  }
+
+  /** The run at `place` frames; what lies between two of them is mixed. */
+  show(place: number): void {
+    const { frames } = this.source;
+    const at = Math.min(place, frames.length - 1);
+    const before = frames[Math.floor(at)] as Frame;
+    const after = frames[Math.min(Math.floor(at) + 1, frames.length - 1)] as Frame;
+    const share = at - Math.floor(at);
+    for (let k = 0; k < this.positions.length; k++) {
+      this.positions[k] = before.positions[k]! + share * (after.positions[k]! - before.positions[k]!);
+    }
+    this.cage.carry(this.positions);
+    this.splats.moved();
+    this.overlays.update(share < 0.5 ? before : after, this.positions, frames);
+    const middle = this.centre(this.positions);
+    if (this.follow) {
+      const moved = middle.clone().sub(this.followed);
+      this.camera.position.add(moved);
+      this.controls.target.add(moved);
+    }
+    this.followed.copy(middle);
+    this.ground.cast(this.renderer, this.positions, middle);
+    this.invalidate();
+  }
+
+  preset(name: Preset): void {
+    const { camera } = this.source.header.facts;
+    this.filmFov = camera.fov;
+    const { middle, size } = this.bounds;
+    if (name === "film") {
+      const eye = new THREE.Vector3(...camera.position);
+      const forward = new THREE.Vector3(...camera.forward);
+      this.look(eye, eye.clone().addScaledVector(forward, Math.max(middle.clone().sub(eye).dot(forward), 1e-3)));
+    } else {
+      const ways = { front: [1, 0, 0.12], side: [0, -1, 0.12], top: [0, -1e-3, 1] } as const;
+      const way = new THREE.Vector3(...ways[name]).normalize();
+      const distance = (0.62 * size) / Math.tan((Math.PI * camera.fov) / 360);
+      this.look(middle.clone().addScaledVector(way, distance), middle);
+    }
+    this.resize();
+  }
+
+  look(eye: THREE.Vector3, target: THREE.Vector3): void {
+    this.camera.position.copy(eye);
+    this.controls.target.copy(target);
+    this.controls.update();
+    this.invalidate();
+  }
+
+  /** Another stage's camera. */
+  copyView(from: Stage): void {
+    this.camera.position.copy(from.camera.position);
+    this.controls.target.copy(from.controls.target);
+    this.camera.lookAt(this.controls.target);
+    this.invalidate();
+  }
+
+  resize(): void {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    if (width === 0 || height === 0) return;
+    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
+    this.renderer.setSize(width, height, false);
+    const aspect = width / height;
+    // A film is square: its sides stay within a window that is taller than wide.
+    const half = Math.tan((Math.PI * this.filmFov) / 360) / Math.min(aspect, 1);
+    this.camera.fov = (360 / Math.PI) * Math.atan(half);
+    this.camera.aspect = aspect;
+    const { height: body } = this.source.header.facts;
+    this.camera.near = 0.02 * body;
+    this.camera.far = 400 * body;
+    this.camera.updateProjectionMatrix();
+    this.invalidate();
+  }
+
+  /** Draws where something has changed; true if it did. */
+  draw(): boolean {
+    this.controls.update();
+    if (!this.dirty) return false;
+    this.dirty = false;
+    this.renderer.render(this.scene, this.camera);
+    return true;
+  }
+
+  /** Draws once the splats are sorted for this very view. */
+  async settle(): Promise<void> {
+    for (let round = 0; round < 2; round++) {
+      this.camera.updateMatrixWorld();
+      this.splats.moved();
+      this.renderer.render(this.scene, this.camera);
+      await this.spark.update({ scene: this.scene, camera: this.camera });
+      while (this.spark.sorting) await new Promise((resolve) => setTimeout(resolve, 5));
+    }
+    this.dirty = false;
+    this.renderer.render(this.scene, this.camera);
+  }
+
+  /** A picture of what is seen now. */
+  picture(): Promise<Blob> {
+    // A canvas holds its picture until the browser has shown it.
+    this.renderer.render(this.scene, this.camera);
+    return new Promise((resolve, reject) => {
+      this.canvas.toBlob((blob) => (blob ? resolve(blob) : reject(new Error("no picture came"))), "image/png");
+    });
+  }
+
+  private centre(positions: Float32Array): THREE.Vector3 {
+    const sum = new THREE.Vector3();
+    let total = 0;
+    this.masses.forEach((mass, k) => {
+      total += mass;
+      sum.x += mass * positions[3 * k]!;
+      sum.y += mass * positions[3 * k + 1]!;
+      sum.z += mass * positions[3 * k + 2]!;
+    });
+    return sum.divideScalar(total);
+  }
+
+  private reach(): { middle: THREE.Vector3; size: number } {
+    const box = new THREE.Box3();
+    for (const frame of this.source.frames) {
+      for (let k = 0; k < frame.positions.length; k += 3) {
+        box.expandByPoint(new THREE.Vector3().fromArray(frame.positions, k));
+      }
+    }
+    return { middle: box.getCenter(new THREE.Vector3()), size: box.getSize(new THREE.Vector3()).length() };
+  }
+}

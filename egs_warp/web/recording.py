@@ -1,0 +1,221 @@
+"""A finished run as the page is sent it: ``trajectory.npz``, ``creature.npz``, ``report.json`` and the scene behind."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from egs_warp.deformation.deformer import Deformer
+from egs_warp.deformation.embedding import embed_gaussians
+from egs_warp.deformation.rigid import in_body_frame
+from egs_warp.errors import UserError
+from egs_warp.geometry.body_frame import BodyFrame
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.io.capture import read_capture
+from egs_warp.io.text import parse_json, read_text
+from egs_warp.locomotion.rollout import FRAME_RATE
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.pipelines import drawn
+from egs_warp.pipelines.drawn import DrawnCreature
+from egs_warp.web.packets import Frame, header, with_length
+
+CURVES = (
+    ("height", "Centre of mass", "H"),
+    ("force", "Ground force", "m g"),
+    ("friction", "Friction used", "of the cone"),
+    ("gap", "Smallest gap", "H"),
+    ("residual", "Momentum residual", "m g"),
+)
+"""Name, what the page calls it, and its unit."""
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Read a run's trajectory. Raises ``UserError`` where there is none, or another kind of file."""
+    try:
+        return Trajectory.load(path)
+    except FileNotFoundError as error:
+        raise UserError(f"{path}: is missing; give the folder that egs-warp animate wrote (--out)") from error
+    except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise UserError(f"{path}: is no trajectory ({error}); run egs-warp animate again, which writes it") from error
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A finished run."""
+
+    folder: Path
+    trajectory: Trajectory
+    creature: DrawnCreature
+    report: dict[str, Any]
+    scene: GaussianCloud | None
+    """What is behind the creature, in its frame."""
+
+    @classmethod
+    def read(cls, folder: Path, *, background: Path | None = None) -> Recording:
+        """Read the ``folder`` of a run; ``background`` is a capture behind it, else its own ``background.ply``.
+
+        Raises ``UserError`` for a folder that is no run.
+        """
+        if not folder.is_dir():
+            raise UserError(f"{folder}: is no folder; give the one that egs-warp animate wrote (--out)")
+        trajectory = read_trajectory(folder / "trajectory.npz")
+        creature = DrawnCreature.load(folder / drawn.FILE, node_count=len(trajectory.rest_positions))
+        report = parse_json(read_text(folder / "report.json"), folder / "report.json")
+        if not isinstance(report, dict):
+            raise UserError(f"{folder / 'report.json'}: is no report; run egs-warp animate again, which writes it")
+        own = folder / "background.ply"
+        file = background or (own if own.is_file() else None)
+        scene = None
+        if file is not None:
+            t = trajectory
+            frame = BodyFrame(t.body_axes, t.body_origin, t.metres_per_unit)
+            scene = in_body_frame(read_capture(file).cloud, frame)
+        return cls(folder, trajectory, creature, report, scene)
+
+    @property
+    def title(self) -> str:
+        """Capture and motions."""
+        motions = self.report.get("motion", [])
+        names = [str(m.get("name", "")) for m in motions if isinstance(m, dict)] if isinstance(motions, list) else []
+        return " \u00b7 ".join(filter(None, [str(self.report.get("source", self.folder.name)), " \u2192 ".join(names)]))
+
+    @cached_property
+    def steps(self) -> np.ndarray:
+        """(n,) the step that is nearest to each frame at 60 Hz."""
+        time = self.trajectory.time
+        frames = np.arange(round(FRAME_RATE * (time[-1] - time[0])) + 1) / FRAME_RATE + time[0]
+        after = (
+            np.clip(np.searchsorted(time, frames), 1, max(len(time) - 1, 1)) if len(time) > 1 else frames.astype(int)
+        )
+        return np.where(frames - time[after - 1] < time[after] - frames, after - 1, after) if len(time) > 1 else after
+
+    def header(self) -> bytes:
+        """All that does not change from frame to frame."""
+        t, made = self.trajectory, self.creature
+        camera, report = made.camera, self.report
+        facts = {
+            "title": self.title,
+            "rate": FRAME_RATE,
+            "frames": len(self.steps),
+            "height": t.height,
+            "weight": float(t.node_mass.sum() * np.linalg.norm(t.gravity)),
+            "friction": t.friction,
+            "curves": [{"name": name, "title": title, "unit": unit} for name, title, unit in CURVES],
+            "fibres": [{"name": n, "kind": k} for n, k in zip(made.fibre_names, made.fibre_kinds, strict=True)],
+            "camera": {
+                "position": camera.centre.tolist(),
+                "forward": camera.rotation[2].tolist(),
+                "fov": float(np.degrees(2.0 * np.arctan(0.5 * camera.height / camera.fy))),
+            },
+            "audit": report.get("audit", {}),
+            "motion": report.get("motion", []),
+            "notes": report.get("notes", []),
+            "degree": {"splats": made.splats.sh_degree, "scene": self.scene.sh_degree if self.scene else 0},
+        }
+        mesh = TetMesh(t.rest_positions, t.tets)
+        deformer = Deformer(made.splats, embed_gaussians(made.splats, mesh))
+        arrays = {
+            "rest": t.rest_positions.astype(np.float32),
+            "tets": t.tets.astype(np.int32),
+            "node_mass": t.node_mass.astype(np.float32),
+            "planes": t.planes.astype(np.float32),
+            "surface": mesh.boundary_faces().astype(np.int32),
+            "edges": _edges(mesh.boundary_faces()),
+            "muscle_end_starts": made.muscle_ends.indptr.astype(np.int32),
+            "muscle_end_nodes": made.muscle_ends.indices.astype(np.int32),
+            "muscle_end_weights": made.muscle_ends.data.astype(np.float32),
+            "muscle_segments": made.muscle_segments.astype(np.int32),
+            "fibre_from_segment": made.fibre_from_segment.astype(np.int32),
+            "mean_tets": deformer.plan.mean_tets.numpy(),
+            "arms": _arms(deformer),
+            **_splat_arrays("splats", made.splats),
+        }
+        if self.scene is not None:
+            arrays |= _splat_arrays("scene", self.scene)
+        return header(facts, arrays)
+
+    def frames(self) -> Iterator[Frame]:
+        """At 60 Hz."""
+        t = self.trajectory
+        curves = _curves(t)
+        bounds = np.maximum(self.creature.muscle_bounds, 1e-12)
+        for index, step in enumerate(self.steps):
+            # Step i leads to state i + 1, so what is seen in a state is what the step before it did.
+            chosen = np.flatnonzero(t.contact_step == step - 1)
+            points = np.einsum("cw,cwi->ci", t.contact_weights[chosen], t.positions[step][t.contact_nodes[chosen]])
+            quiet = np.zeros(len(bounds))
+            yield Frame(
+                index,
+                float(t.time[step]),
+                t.positions[step],
+                t.activations[step - 1] / bounds if step > 0 else quiet,
+                np.concatenate([points, t.contact_normal[chosen], t.contact_force[chosen]], axis=1),
+                curves[step],
+            )
+
+    def bytes(self) -> bytes:
+        """The whole run in one piece."""
+        return b"".join([self.header(), *(with_length(frame.packet()) for frame in self.frames())])
+
+
+def _edges(faces: np.ndarray) -> np.ndarray:
+    pairs = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    return np.unique(pairs, axis=0).astype(np.int32)
+
+
+def _arms(deformer: Deformer) -> np.ndarray:
+    """(n', 15) float32: six tetrahedra, six shares and three bulges of those Gaussians that no one tetrahedron carries
+    alone, in their order.
+    """
+    plan = deformer.plan
+    rows = plan.mean_tets.numpy() < 0
+    parts = (plan.end_tets.numpy(), plan.shares.numpy(), plan.bulges.numpy())
+    return np.concatenate([part[:, rows].T for part in parts], axis=1).astype(np.float32)
+
+
+def _splat_arrays(name: str, cloud: GaussianCloud) -> dict[str, np.ndarray]:
+    """Higher bands of the colour as bytes: 128 + 127 v over the largest of all splats for each coefficient."""
+    sh = cloud.sh.numpy()
+    rest = sh[:, 1:]
+    scale = np.maximum(np.abs(rest).max(axis=(0, 2), initial=0.0), 1e-6).astype(np.float32)
+    return {
+        f"{name}_means": cloud.means.numpy(),
+        f"{name}_rotations": cloud.rotations.numpy(),
+        f"{name}_scales": np.exp(cloud.log_scales.numpy()),
+        f"{name}_opacities": cloud.opacities().astype(np.float32),
+        f"{name}_colours": 0.5 + np.float32(SH_BAND_0) * sh[:, 0],
+        f"{name}_bands": np.rint(128.0 + 127.0 * rest / scale[:, None]).astype(np.uint8),
+        f"{name}_band_scales": scale,
+    }
+
+
+def _curves(t: Trajectory) -> np.ndarray:
+    """(F+1, K) in the order of ``CURVES``; definitions in docs/guide/report.md."""
+    mass = float(t.node_mass.sum())
+    gravity = float(np.linalg.norm(t.gravity))
+    weight, steps = mass * gravity, len(t.time) - 1
+    up = -t.gravity / gravity
+    com = np.einsum("n,fni->fi", t.node_mass, t.positions) / mass
+    normal = np.einsum("ci,ci->c", t.contact_force, t.contact_normal)
+    tangent = np.linalg.norm(t.contact_force - normal[:, None] * t.contact_normal, axis=1)
+    force = np.zeros((steps, 3))
+    np.add.at(force, t.contact_step, t.contact_force)
+    pressed, rubbed = np.zeros(steps), np.zeros(steps)
+    np.add.at(pressed, t.contact_step, normal)
+    np.add.at(rubbed, t.contact_step, tangent)
+    momentum = np.einsum("n,fni->fi", t.node_mass, t.velocities)
+    residual = np.diff(momentum, axis=0) / np.diff(t.time)[:, None] - mass * t.gravity - force + t.drag * momentum[1:]
+    used = rubbed / np.maximum(t.friction * pressed, 1e-9 * weight)
+    of_steps = np.stack(
+        [np.linalg.norm(force, axis=1) / weight, used, np.linalg.norm(residual, axis=1) / weight], axis=1
+    )
+    # The first state has no step before it.
+    padded = np.concatenate([of_steps[:1] if steps else np.zeros((1, 3)), of_steps])
+    return np.stack([com @ up / t.height, padded[:, 0], padded[:, 1], t.min_gap / t.height, padded[:, 2]], axis=1)

@@ -1,0 +1,200 @@
+"""A server for this machine alone: the page, its runs, and a socket that sends frames as they are made."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import secrets
+import socket
+from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from typing import Protocol
+from urllib.parse import urlsplit
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import HTMLResponse, PlainTextResponse, Response
+from starlette.routing import BaseRoute, Route, WebSocketRoute
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from egs_warp.errors import ArgumentError
+from egs_warp.web.page import page_text
+
+HOST = "127.0.0.1"
+LARGEST_MESSAGE = 65_536
+"""Bytes that a page may send at once; more closes its socket."""
+_NAMES = frozenset({"127.0.0.1", "localhost"})
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    # Spark's module is WebAssembly in a worker, both within the page.
+    "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline' 'wasm-unsafe-eval' blob: data:;"
+    " worker-src blob: data:; style-src 'unsafe-inline'; img-src data: blob:; media-src blob:; connect-src 'self' data:"
+    " blob:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
+}
+
+
+class FrameFeed(Protocol):
+    """What a socket is sent from: a recording, or a solver that runs."""
+
+    def header(self) -> bytes:
+        """All that does not change (``packets.header``)."""
+        ...
+
+    def packets(self) -> AsyncIterator[bytes]:
+        """Frames (``Frame.packet``) as they are made."""
+        ...
+
+    def receive(self, message: dict[str, object]) -> None:
+        """Something that the page asks. Raises ``ValueError`` for what makes no sense."""
+        ...
+
+
+class PageServer:
+    """The page at a secret address of this machine."""
+
+    def __init__(
+        self,
+        runs: Sequence[Callable[[], bytes]],
+        *,
+        port: int = 0,
+        feed: FrameFeed | None = None,
+        token: str | None = None,
+    ) -> None:
+        """``runs`` make the bytes of each run, once; ``port`` 0 is any that is free; ``feed`` is sent to one client.
+
+        Raises ``UserError`` for a port that is taken.
+        """
+        self.token = token or secrets.token_urlsafe(24)
+        self._page = page_text()
+        self._runs = list(runs)
+        self._made: dict[int, bytes] = {}
+        self._feed = feed
+        self._fed = False
+        self._socket = _listening(port)
+        self.port: int = self._socket.getsockname()[1]
+        secret = f"/{self.token}"
+        routes: list[BaseRoute] = [
+            Route(f"{secret}/", self._send_page),
+            Route(f"{secret}/run/{{number:int}}", self._send_run),
+        ]
+        if feed is not None:
+            routes.append(WebSocketRoute(f"{secret}/live", self._send_frames))
+        app = _SameMachine(Starlette(routes=routes), self.port)
+        settings = uvicorn.Config(
+            app, log_level="warning", access_log=False, ws_max_size=LARGEST_MESSAGE, server_header=False, lifespan="off"
+        )
+        self._server = uvicorn.Server(settings)
+
+    @property
+    def address(self) -> str:
+        """Of the page; who has it may see the run."""
+        query = "?live" if self._feed is not None else f"?runs={len(self._runs)}" if len(self._runs) > 1 else ""
+        return f"http://{HOST}:{self.port}/{self.token}/{query}"
+
+    def serve(self) -> None:
+        """Until ``stop``, or an interrupt from the keyboard."""
+        with contextlib.suppress(KeyboardInterrupt):
+            self._server.run(sockets=[self._socket])
+
+    def stop(self) -> None:
+        """End ``serve``, from any thread."""
+        self._server.should_exit = True
+
+    async def _send_page(self, request: Request) -> Response:
+        return HTMLResponse(self._page, headers=_HEADERS)
+
+    async def _send_run(self, request: Request) -> Response:
+        number = int(request.path_params["number"])
+        if number >= len(self._runs):
+            return PlainTextResponse("there is no such run", 404, headers=_HEADERS)
+        if number not in self._made:
+            self._made[number] = await asyncio.to_thread(self._runs[number])
+        return Response(self._made[number], media_type="application/octet-stream", headers=_HEADERS)
+
+    async def _send_frames(self, page: WebSocket) -> None:
+        feed = self._feed
+        assert feed is not None
+        await page.accept()
+        if self._fed:
+            await page.close(1013, "another page watches this run already; close it first")
+            return
+        self._fed = True
+        try:
+            with contextlib.suppress(WebSocketDisconnect):
+                await page.send_bytes(await asyncio.to_thread(feed.header))
+                await _first_to_end(_listen(page, feed), _speak(page, feed))
+        finally:
+            self._fed = False
+
+
+async def _first_to_end(*ways: Coroutine[None, None, None]) -> None:
+    """Run all until one ends; raises what that one raised."""
+    tasks = [asyncio.create_task(way) for way in ways]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def _speak(page: WebSocket, feed: FrameFeed) -> None:
+    async for packet in feed.packets():
+        await page.send_bytes(packet)
+    await page.close(1000, "the run is over")
+
+
+async def _listen(page: WebSocket, feed: FrameFeed) -> None:
+    while True:
+        try:
+            message = json.loads(await page.receive_text())
+            if not isinstance(message, dict):
+                raise ValueError("not an object")
+            feed.receive(message)
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            # One line back, and the run goes on.
+            await page.send_text(json.dumps({"error": f"this message makes no sense: {str(error)[:200]}"}))
+
+
+class _SameMachine:
+    """Lets through only what a page of this very server asks: no other site gets at it by the user's browser."""
+
+    def __init__(self, app: ASGIApp, port: int) -> None:
+        self._app = app
+        self._hosts = {f"{name}:{port}" for name in _NAMES}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        asked = HTTPConnection(scope)
+        origin = asked.headers.get("origin")
+        # Browsers always tell a socket's origin.
+        stranger = urlsplit(origin).netloc not in self._hosts if origin is not None else scope["type"] == "websocket"
+        if asked.headers.get("host") not in self._hosts or stranger:
+            if scope["type"] == "websocket":
+                await send({"type": "websocket.close", "code": 1008})
+            else:
+                await PlainTextResponse("not from here", 403, headers=_HEADERS)(scope, receive, send)
+            return
+        await self._app(scope, receive, send)
+
+
+def _listening(port: int) -> socket.socket:
+    made = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        made.bind((HOST, port))
+        made.listen(16)
+    except (OSError, OverflowError) as error:
+        made.close()
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ArgumentError("port", f"cannot be used ({reason}); give another, or 0 for any", value=port) from error
+    return made

@@ -1,0 +1,51 @@
+"""A server of the page in a thread, and a feed of frames for its socket."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from egs_warp.web.recording import Recording
+from egs_warp.web.server import FrameFeed, PageServer
+
+
+class RecordedFeed:
+    """A recording sent frame by frame, over and over."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self.received: list[dict[str, object]] = []
+
+    def header(self) -> bytes:
+        """See ``FrameFeed``."""
+        return self._recording.header()
+
+    async def packets(self) -> AsyncIterator[bytes]:
+        """See ``FrameFeed``."""
+        while True:
+            for frame in self._recording.frames():
+                yield frame.packet()
+                await asyncio.sleep(0.01)
+
+    def receive(self, message: dict[str, object]) -> None:
+        """See ``FrameFeed``; only a pause makes sense."""
+        if message.get("type") != "pause":
+            raise ValueError(f"type {message.get('type')}")
+        self.received.append(message)
+
+
+@contextmanager
+def served(*runs: Recording, feed: FrameFeed | None = None, **place: Any) -> Iterator[PageServer]:
+    """A server that runs within the block; ``place`` is its port and token."""
+    server = PageServer([run.bytes for run in runs], feed=feed, **place)
+    thread = threading.Thread(target=server.serve)
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.stop()
+        thread.join(timeout=20)
+        assert not thread.is_alive()

@@ -1,0 +1,287 @@
+"""The page in a real Chromium, which draws in software where there is no GPU."""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from egs_warp.deformation.deformer import Deformer
+from egs_warp.deformation.embedding import embed_gaussians
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.render.rasteriser import render_gaussians
+from egs_warp.web.page import PAGE, export_page
+from egs_warp.web.recording import Recording
+from tests.support.pages import RecordedFeed, served
+
+_BROWSER = os.environ.get("EGS_WARP_BROWSER") or next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.xdist_group("page"),
+    pytest.mark.skipif(not PAGE.is_file(), reason="the page is not built; make web builds it"),
+    pytest.mark.skipif(_BROWSER is None, reason="no Chromium; install it, or set EGS_WARP_BROWSER"),
+]
+_BACKGROUND = (0x14 / 255.0, 0x16 / 255.0, 0x1A / 255.0)
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    playwright = pytest.importorskip("playwright.sync_api")
+    with playwright.sync_playwright() as started:
+        arguments = ["--enable-unsafe-swiftshader", "--use-angle=swiftshader", "--no-sandbox"]
+        browser = started.chromium.launch(executable_path=_BROWSER, args=arguments)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def recording(run_folder: Path) -> Recording:
+    return Recording.read(run_folder)
+
+
+@pytest.fixture(scope="module")
+def file(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("page") / "page.html"
+    export_page(path, [recording])
+    return path.as_uri()
+
+
+def _opened(chromium: Any, address: str, width: int = 480, height: int = 480) -> tuple[Any, list[str]]:
+    """The page once it stands, and what the browser complains of."""
+    page = chromium.new_page(viewport={"width": width, "height": height})
+    complaints: list[str] = []
+    page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.goto(address)
+    _wait(page, "window.egs !== undefined")
+    return page, complaints
+
+
+def _wait(page: Any, condition: str) -> None:
+    """Until the JavaScript ``condition`` holds; Playwright's own waiting is what the page's security policy forbids."""
+    for _ in range(1200):
+        if page.evaluate(condition):
+            return
+        page.wait_for_timeout(50)
+    raise AssertionError(condition)
+
+
+def _picture(page: Any, stage: int = 0) -> np.ndarray:
+    """(H, W, 3) 0 to 1: the canvas of a stage, its splats sorted."""
+    text = page.evaluate(
+        """async (k) => {
+            const stage = window.egs.stages[k];
+            await stage.settle();
+            const bytes = new Uint8Array(await (await stage.picture()).arrayBuffer());
+            return btoa(bytes.reduce((text, byte) => text + String.fromCharCode(byte), ""));
+        }""",
+        stage,
+    )
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(text))).convert("RGB"), np.float64) / 255.0
+
+
+def _own_picture(recording: Recording, page: Any, frame: int) -> np.ndarray:
+    """The same frame through the page's own camera, by our renderer."""
+    seen = page.evaluate(
+        """() => {
+            const { camera, controls, canvas } = window.egs.stages[0];
+            return [camera.position.toArray(), controls.target.toArray(), camera.fov, canvas.width, canvas.height];
+        }"""
+    )
+    eye, target, fov, width, height = seen
+    up = np.array([0.0, 0.0, 1.0])
+    camera = Camera.look_at(
+        np.array(eye), np.array(target), up, width=width, height=height, vertical_fov_degrees=fov, near=0.02
+    )
+    t, splats = recording.trajectory, recording.creature.splats
+    deformer = Deformer(splats, embed_gaussians(splats, TetMesh(t.rest_positions, t.tets)))
+    cloud = deformer.deform(t.positions[recording.steps[frame]]).cloud
+    return np.clip(render_gaussians(cloud, camera, background=_BACKGROUND).colour.numpy(), 0.0, 1.0)
+
+
+def _psnr_on_body(ours: np.ndarray, theirs: np.ndarray) -> float:
+    body = np.abs(ours - np.array(_BACKGROUND)).max(axis=-1) > 0.02
+    assert 0.02 < body.mean() < 0.9
+    return float(-10.0 * np.log10(((ours - theirs)[body] ** 2).mean()))
+
+
+@pytest.mark.parametrize("preset", ["film", "front", "top"])
+def test_canvas_is_like_our_own_picture_of_the_same_frame_and_camera(
+    chromium: Any, file: str, recording: Recording, preset: str
+):
+    page, complaints = _opened(chromium, file)
+    page.evaluate("(name) => { egs.setLayer('ground', false); egs.stages[0].preset(name); }", preset)
+    for frame in (0, 12):
+        page.evaluate("(frame) => egs.player.seek(frame)", frame)
+        assert _psnr_on_body(_own_picture(recording, page, frame), _picture(page)) >= 40.0
+    assert complaints == []
+    page.close()
+
+
+def test_motion_is_seen(chromium: Any, file: str, recording: Recording):
+    """The teeth of the comparison: another frame, and splats that stay, are far off."""
+    page, _ = _opened(chromium, file)
+    page.evaluate("egs.setLayer('ground', false); egs.player.seek(12)")
+    assert _psnr_on_body(_own_picture(recording, page, 0), _picture(page)) < 35.0
+    page.close()
+
+
+def test_play_advances_and_loops(chromium: Any, file: str):
+    page, complaints = _opened(chromium, file)
+    page.click("button.play")
+    _wait(page, "egs.player.place > 3")
+    _wait(page, "egs.player.place > 9")
+    _wait(page, "egs.player.place < 6")
+    page.keyboard.press(" ")
+    stopped = page.evaluate("egs.player.place")
+    page.wait_for_timeout(200)
+    assert page.evaluate("egs.player.place") == stopped
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate("egs.player.place") == min(round(stopped) + 1, 12)
+    page.click("#loop")
+    page.select_option(".speed", "2")
+    page.evaluate("egs.player.seek(0)")
+    page.click("button.play")
+    _wait(page, "!egs.player.playing && egs.player.place === 12")
+    assert page.text_content(".clock") == "0.20 / 0.20 s"
+    assert complaints == []
+    page.close()
+
+
+def test_each_layer_shows(chromium: Any, file: str):
+    page, complaints = _opened(chromium, file)
+    page.evaluate("egs.player.seek(8)")
+    page.click("[title=Layers]")
+    before = _picture(page)
+    for layer in ("cage", "muscles", "contacts", "path", "ground", "splats"):
+        page.click(f"#layer-{layer}")
+        after = _picture(page)
+        assert (np.abs(after - before).max(axis=-1) > 0.05).mean() > 2e-4, layer
+        before = after
+    assert complaints == []
+    page.close()
+
+
+def test_curves_move_with_the_time_line(chromium: Any, file: str):
+    page, complaints = _opened(chromium, file)
+    page.click("[title^=Curves]")
+    said = []
+    for frame in (0, 12):
+        page.evaluate("(frame) => egs.player.seek(frame)", frame)
+        said.append(page.text_content(".row .value"))
+    assert page.locator(".curve").count() == 5 and said[0] != said[1]
+    page.locator(".curve").first.click(position={"x": 100, "y": 5})
+    assert 0 < page.evaluate("egs.player.place") < 12
+    assert complaints == []
+    page.close()
+
+
+def test_orbit_turns_the_camera(chromium: Any, file: str):
+    page, _ = _opened(chromium, file)
+    before = page.evaluate("egs.stages[0].camera.position.toArray()")
+    page.mouse.move(240, 200)
+    page.mouse.down()
+    page.mouse.move(340, 200, steps=4)
+    page.mouse.up()
+    page.wait_for_timeout(100)
+    after = page.evaluate("egs.stages[0].camera.position.toArray()")
+    assert np.linalg.norm(np.subtract(after, before)) > 0.2
+    page.close()
+
+
+def test_screenshot_and_video_are_files(chromium: Any, file: str, tmp_path: Path):
+    page, complaints = _opened(chromium, file)
+    with page.expect_download() as picture:
+        page.keyboard.press("s")
+    assert picture.value.suggested_filename == "pawn-jump-0.png"
+    picture.value.save_as(tmp_path / "picture.png")
+    assert Image.open(tmp_path / "picture.png").size == (480, 480)
+    with page.expect_download(timeout=60_000) as video:
+        page.click("[title^=Record]")
+    video.value.save_as(tmp_path / "video")
+    assert (tmp_path / "video").stat().st_size > 2000
+    assert (tmp_path / "video").read_bytes()[:4] == b"\x1aE\xdf\xa3" or b"ftyp" in (tmp_path / "video").read_bytes()[
+        :16
+    ]
+    assert complaints == []
+    page.close()
+
+
+def test_a_phone_shows_creature_and_controls(chromium: Any, file: str):
+    page, complaints = _opened(chromium, file, 360, 740)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    for part in (".dock", ".tools", ".play", ".line"):
+        box = page.locator(part).bounding_box()
+        assert box["x"] >= 0 and box["x"] + box["width"] <= 360 and box["y"] + box["height"] <= 740, part
+    page.evaluate("egs.setLayer('ground', false)")
+    picture = _picture(page)
+    body = np.abs(picture - np.array(_BACKGROUND)).max(axis=-1) > 0.05
+    columns = np.flatnonzero(body.any(axis=0))
+    assert columns.min() > 2 and columns.max() < picture.shape[1] - 3
+    assert complaints == []
+    page.close()
+
+
+def test_two_runs_side_by_side_share_time_and_camera(chromium: Any, recording: Recording):
+    with served(recording, recording) as server:
+        page, complaints = _opened(chromium, server.address, 800, 400)
+        page.evaluate("egs.setLayer('ground', false); egs.stages[0].preset('side'); egs.player.seek(6)")
+        first, second = _picture(page, 0), _picture(page, 1)
+        assert first.shape == second.shape
+        assert np.abs(first - second).max() < 0.02
+        assert complaints == []
+        page.close()
+
+
+def test_frames_of_a_socket_are_shown_and_a_lost_connection_is_taken_up_again(chromium: Any, recording: Recording):
+    with served(feed=RecordedFeed(recording)) as server:
+        page, complaints = _opened(chromium, server.address)
+        _wait(page, "egs.player.place > 3")
+        assert complaints == []
+        port, token = server.port, server.token
+        address = server.address
+    _wait(page, "document.body.classList.contains('lost')")
+    assert page.locator("canvas.view").is_visible()
+    with served(feed=RecordedFeed(recording), port=port, token=token) as server:
+        assert server.address == address
+        count = page.evaluate("egs.stages[0].source.frames.length")
+        _wait(page, f"egs.stages[0].source.frames.length > {count + 3}")
+        assert not page.evaluate("document.body.classList.contains('lost')")
+        page.close()
+
+
+def test_a_server_that_is_gone_is_told(chromium: Any, recording: Recording):
+    page = chromium.new_page()
+    with served(recording) as server:
+        page.route("**/run/0", lambda route: route.fulfill(status=404, body=""))
+        page.goto(server.address)
+        page.wait_for_selector("[role=alert]:has-text('is egs-warp view still running?')")
+    page.close()
+
+
+def test_a_browser_without_webgl2_is_told(file: str):
+    # Playwright runs but once in a process.
+    script = f"""
+from playwright.sync_api import sync_playwright
+with sync_playwright() as started:
+    browser = started.chromium.launch(executable_path={_BROWSER!r}, args=["--disable-3d-apis", "--no-sandbox"])
+    page = browser.new_page()
+    page.goto({file!r})
+    page.wait_for_selector("[role=alert]:has-text('WebGL2')")
+    browser.close()
+"""
+    pytest.importorskip("playwright.sync_api")
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=120)

@@ -1,0 +1,160 @@
+"""What the page is sent of a run."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egs_warp.cli import main
+from egs_warp.deformation.deformer import Deformer
+from egs_warp.deformation.embedding import embed_gaussians
+from egs_warp.errors import UserError
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.io import write_ply
+from egs_warp.web.page import PAGE
+from egs_warp.web.recording import CURVES, Recording
+
+pytestmark = pytest.mark.xdist_group("page")
+needs_page = pytest.mark.skipif(not PAGE.is_file(), reason="the page is not built; make web builds it")
+
+
+def _read(data: bytes) -> tuple[dict, dict[str, np.ndarray], list[dict]]:
+    """A reader after the words of docs/guide/view.md alone."""
+    assert data[:8] == b"EGSPAGE1"
+    length = int(np.frombuffer(data, "<u4", 1, 8)[0])
+    facts = json.loads(data[12 : 12 + length])
+    base = -(-(12 + length) // 8) * 8
+    arrays = {
+        name: np.frombuffer(data, entry["type"], int(np.prod(entry["shape"])), base + entry["start"]).reshape(
+            entry["shape"]
+        )
+        for name, entry in facts["arrays"].items()
+    }
+    frames, at = [], base + facts["bytes"]
+    while at < len(data):
+        size = int(np.frombuffer(data, "<u4", 1, at)[0])
+        words = np.frombuffer(data, "<u4", 8, at + 4)
+        place = at + 36
+        parts = {"index": int(words[0]), "time": float(np.frombuffer(data, "<f4", 1, at + 8)[0])}
+        nodes, segments, contacts, curves = map(int, words[2:6])
+        for name, kind, count in (
+            ("positions", "<f4", 3 * nodes),
+            ("activations", "i1", segments),
+            ("contacts", "<f4", 9 * contacts),
+            ("curves", "<f4", curves),
+        ):
+            parts[name] = np.frombuffer(data, kind, count, place)
+            place += -(-parts[name].nbytes // 4) * 4
+        assert place == at + 4 + size
+        frames.append(parts)
+        at = place
+    return facts, arrays, frames
+
+
+def test_what_is_written_is_read_back_by_the_documented_layout(run_folder: Path):
+    recording = Recording.read(run_folder)
+    facts, arrays, frames = _read(recording.bytes())
+    t = recording.trajectory
+    assert len(frames) == facts["frames"] == 13
+    np.testing.assert_allclose([frame["time"] for frame in frames], np.arange(13) / 60.0, atol=1e-6)
+    for frame in frames:
+        step = recording.steps[frame["index"]]
+        np.testing.assert_allclose(frame["positions"].reshape(-1, 3), t.positions[step], atol=1e-6)
+        assert len(frame["activations"]) == t.activations.shape[1]
+        force = frame["contacts"].reshape(-1, 9)[:, 6:].sum(axis=0)
+        np.testing.assert_allclose(force, t.contact_force[t.contact_step == step - 1].sum(axis=0), atol=1e-3)
+        assert len(frame["curves"]) == len(CURVES)
+    np.testing.assert_array_equal(arrays["splats_means"], recording.creature.splats.means.numpy())
+    assert facts["title"] == "pawn \u00b7 jump"
+
+
+def test_a_frame_is_as_small_as_documented(run_folder: Path):
+    recording = Recording.read(run_folder)
+    nodes, segments = len(recording.trajectory.rest_positions), recording.trajectory.activations.shape[1]
+    for frame in recording.frames():
+        expected = 32 + 12 * nodes + -(-segments // 4) * 4 + 36 * len(frame.contacts) + 4 * len(CURVES)
+        assert len(frame.packet()) == expected
+
+
+def test_the_creature_file_draws_what_the_film_drew(run_folder: Path):
+    """The embedding is made anew from the splats of the file and the rest cage of the trajectory."""
+    recording = Recording.read(run_folder)
+    t, made = recording.trajectory, recording.creature
+    deformer = Deformer(made.splats, embed_gaussians(made.splats, TetMesh(t.rest_positions, t.tets)))
+    carried = deformer.deform(t.positions[-1]).cloud.means.numpy()
+    assert np.isfinite(carried).all()
+    drawn = json.loads((run_folder / "report.json").read_text())["gaussians"]["out"]
+    assert made.splats.count == drawn
+    np.testing.assert_allclose(made.muscle_ends @ np.ones(len(t.rest_positions)), 1.0, atol=1e-9)
+
+
+def test_curves_are_those_of_the_audit(run_folder: Path):
+    recording = Recording.read(run_folder)
+    audit = json.loads((run_folder / "report.json").read_text())["audit"]
+    names = [name for name, _, _ in CURVES]
+    values = np.array([frame.curves for frame in recording.frames()])
+    assert values[:, names.index("residual")].max() <= audit["momentum_residual"] * (1 + 1e-9)
+    assert -values[:, names.index("gap")].min() <= audit["penetration"] * (1 + 1e-9)
+    assert values[:, names.index("friction")].max() <= 1.0 + 1e-6
+
+
+@needs_page
+def test_an_exported_page_holds_its_runs_and_fetches_nothing(run_folder: Path, tmp_path: Path):
+    first, second = tmp_path / "a.html", tmp_path / "b.html"
+    for path in (first, second):
+        assert main(["view", str(run_folder), str(run_folder), "--export", str(path)]) == 0
+    assert first.read_bytes() == second.read_bytes()
+    text = first.read_text()
+    carried = re.findall(r'<script type="application/octet-stream" data-run="\d">([^<]*)</script>', text)
+    assert len(carried) == 2
+    assert gzip.decompress(base64.b64decode(carried[0])) == Recording.read(run_folder).bytes()
+    assert not re.search(r'<(?:script|link|img)[^>]+(?:src|href)="(?!data:)', text)
+
+
+@needs_page
+def test_a_scene_behind_it_travels_too(run_folder: Path, tmp_path: Path):
+    folder = tmp_path / "run"
+    shutil.copytree(run_folder, folder)
+    bare = Recording.read(folder)
+    write_ply(folder / "background.ply", bare.creature.splats)
+    _, arrays, _ = _read(Recording.read(folder).bytes())
+    t = bare.trajectory
+    expected = t.metres_per_unit * ((bare.creature.splats.means.numpy() - t.body_origin) @ t.body_axes.T)
+    np.testing.assert_allclose(arrays["scene_means"], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda folder: shutil.rmtree(folder), "is no folder; give the one that egs-warp animate wrote"),
+        (lambda folder: (folder / "trajectory.npz").unlink(), "trajectory.npz: is missing; give the folder"),
+        (lambda folder: (folder / "trajectory.npz").write_bytes(b"PK\x03\x04 no zip"), "is no trajectory"),
+        (lambda folder: (folder / "creature.npz").unlink(), "creature.npz: is missing; run egs-warp animate again"),
+        (lambda folder: np.savez(folder / "creature.npz", means=np.zeros((2, 3))), "creature.npz: cannot be read"),
+        (lambda folder: (folder / "report.json").write_text("[]"), "report.json: is no report"),
+    ],
+)
+def test_a_folder_that_is_no_run_is_told_in_one_line(
+    run_folder: Path, tmp_path: Path, spoil: Callable[[Path], object], said: str, capsys: pytest.CaptureFixture[str]
+):
+    folder = tmp_path / "run"
+    shutil.copytree(run_folder, folder)
+    spoil(folder)
+    with pytest.raises(UserError, match=re.escape(said)):
+        Recording.read(folder)
+    assert main(["view", str(folder), "--export", str(tmp_path / "page.html")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_three_runs_are_one_too_many(run_folder: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["view", *[str(run_folder)] * 3]) == 2
+    assert "at most two runs" in capsys.readouterr().err
