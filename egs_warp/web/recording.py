@@ -41,7 +41,7 @@ def read_trajectory(path: Path) -> Trajectory:
     try:
         return Trajectory.load(path)
     except FileNotFoundError as error:
-        raise UserError(f"{path}: is missing; give the folder that egs-warp animate wrote (--out)") from error
+        raise UserError(f"{path}: is missing; give the folder that egs-warp animate wrote") from error
     except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise UserError(f"{path}: is no trajectory ({error}); run egs-warp animate again, which writes it") from error
 
@@ -64,7 +64,7 @@ class Recording:
         Raises ``UserError`` for a folder that is no run.
         """
         if not folder.is_dir():
-            raise UserError(f"{folder}: is no folder; give the one that egs-warp animate wrote (--out)")
+            raise UserError(f"{folder}: is no folder; give the one that egs-warp animate wrote")
         trajectory = read_trajectory(folder / "trajectory.npz")
         creature = DrawnCreature.load(folder / drawn.FILE, node_count=len(trajectory.rest_positions))
         report = parse_json(read_text(folder / "report.json"), folder / "report.json")
