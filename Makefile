@@ -47,7 +47,7 @@ pictures: setup
 	$(BIN)/python docs/make_pictures.py
 
 # The page of egs-warp view, from its TypeScript sources; needs node 20 or newer. The wheel and the sdist hold it built.
-PAGE := egs_warp/web/page
+PAGE := egs_warp/web/client
 web: egs_warp/web/page.html
 
 egs_warp/web/page.html: $(PAGE)/package-lock.json $(PAGE)/build.mjs $(PAGE)/tsconfig.json $(wildcard $(PAGE)/src/*)

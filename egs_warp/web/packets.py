@@ -2,7 +2,7 @@
 
 All numbers are little-endian. A header is the 8 bytes ``EGSPAGE1``, the uint32 length of a JSON text, that text in
 UTF-8, zeros up to a multiple of 8, then the arrays that the text lists. Where frames follow in the same file, each
-comes after its uint32 length. ``Frame.packet`` writes a frame; ``page/src/packets.ts`` reads all of it.
+comes after its uint32 length. ``Frame.packet`` writes a frame; ``client/src/packets.ts`` reads all of it.
 """
 
 from __future__ import annotations
