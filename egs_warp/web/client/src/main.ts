@@ -9,6 +9,8 @@ import { Stage, type Preset, type Tick } from "./stage";
 import "./style.css";
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2];
+/** Seconds a picture from which fewer pixels are drawn. */
+const SLOW = 1 / 15;
 const LAYERS: { name: Tick; title: string; on: boolean; key: string }[] = [
   { name: "splats", title: "Creature", on: true, key: "1" },
   { name: "scene", title: "Scene", on: true, key: "2" },
@@ -58,6 +60,8 @@ class Page {
   private readonly clock = element("output", { class: "clock" });
   private readonly boxes = new Map<Tick, HTMLInputElement>();
   private before = 0;
+  /** Seconds between two pictures while the run plays, of late. */
+  private pace = 0;
 
   constructor(root: HTMLElement, sources: FrameSource[]) {
     this.player = new Player(sources, () => this.update());
@@ -169,7 +173,9 @@ class Page {
   }
 
   private async screenshot(): Promise<void> {
+    this.player.playing = false;
     for (const stage of this.stages) {
+      stage.sharpen(1);
       await stage.settle();
       save(await stage.picture(), `${this.fileName()}-${Math.round(this.player.place)}.png`);
     }
@@ -218,6 +224,18 @@ class Page {
     event.preventDefault();
   }
 
+  /** A machine that is slow plays with fewer pixels, as long as it plays. */
+  private keepUp(elapsed: number): void {
+    if (this.film.recording) return;
+    if (!this.player.playing) {
+      this.pace = 0;
+      for (const stage of this.stages) stage.sharpen(1);
+      return;
+    }
+    this.pace = this.pace === 0 ? 1 / 60 : this.pace + 0.05 * (Math.min(elapsed, 0.2) - this.pace);
+    if (this.pace > SLOW) for (const stage of this.stages) stage.sharpen(0.5);
+  }
+
   /** Shows where the player stands. */
   private update(): void {
     const { player } = this;
@@ -234,6 +252,7 @@ class Page {
     const elapsed = this.before === 0 ? 0 : (now - this.before) / 1000;
     this.before = now;
     this.player.advance(elapsed);
+    this.keepUp(elapsed);
     for (const stage of this.stages) stage.draw();
     requestAnimationFrame((next) => this.tick(next));
   }

@@ -21,6 +21,8 @@ export class Stage {
   readonly controls: OrbitControls;
   /** Whether the camera goes along with the centre of mass. */
   follow = false;
+  /** Share of the window's pixels that are drawn along each side; less where a machine is slow. */
+  private sharpness = 1;
   private readonly scene = new THREE.Scene();
   private readonly spark: SparkRenderer;
   private readonly cage: Cage;
@@ -148,7 +150,7 @@ export class Stage {
   resize(): void {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     if (width === 0 || height === 0) return;
-    this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
+    this.renderer.setPixelRatio(this.sharpness * Math.min(window.devicePixelRatio, 2));
     this.renderer.setSize(width, height, false);
     const aspect = width / height;
     // A film is square: its sides stay within a window that is taller than wide.
@@ -160,6 +162,13 @@ export class Stage {
     this.camera.far = 400 * body;
     this.camera.updateProjectionMatrix();
     this.invalidate();
+  }
+
+  /** Draws so many of the window's pixels along each side. */
+  sharpen(share: number): void {
+    if (share === this.sharpness) return;
+    this.sharpness = share;
+    this.resize();
   }
 
   /** Draws where something has changed; true if it did. */
