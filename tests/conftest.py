@@ -34,3 +34,17 @@ def data_dir() -> Path:
 def device(request: pytest.FixtureRequest) -> str:
     """Each Warp device in turn."""
     return request.param
+
+
+@pytest.fixture(scope="session")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What ``egs-warp animate`` writes: twelve frames of a small pawn that crouches. Tests that ask for it carry
+    ``xdist_group("page")``, so that it is made once."""
+    from egs_warp.assets.pawn import pawn
+    from egs_warp.pipelines.animate import AnimateOptions, animate
+
+    folder = tmp_path_factory.mktemp("run")
+    made = pawn(gaussian_count=6000)
+    options = AnimateOptions(frames=12, size=64)
+    animate(made.cloud, folder, plane=made.plane, options=options, source="pawn", quiet=True)
+    return folder

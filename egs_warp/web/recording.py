@@ -2,28 +2,16 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from egs_warp.deformation.deformer import Deformer
-from egs_warp.deformation.embedding import embed_gaussians
-from egs_warp.deformation.rigid import in_body_frame
-from egs_warp.errors import UserError
-from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
-from egs_warp.geometry.tetmesh import TetMesh
-from egs_warp.io.capture import read_capture
-from egs_warp.io.text import parse_json, read_text
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.pipelines import drawn
-from egs_warp.pipelines.drawn import DrawnCreature
+from egs_warp.pipelines.finished_run import FinishedRun
 from egs_warp.web.packets import Frame, header, with_length
 
 CURVES = (
@@ -36,65 +24,9 @@ CURVES = (
 """Name, what the page calls it, and its unit."""
 
 
-def read_trajectory(path: Path) -> Trajectory:
-    """Read a run's trajectory. Raises ``UserError`` where there is none, or another kind of file."""
-    try:
-        return Trajectory.load(path)
-    except FileNotFoundError as error:
-        raise UserError(f"{path}: is missing; give the folder that egs-warp animate wrote") from error
-    except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise UserError(f"{path}: is no trajectory ({error}); run egs-warp animate again, which writes it") from error
-
-
 @dataclass(frozen=True)
-class Recording:
-    """A finished run."""
-
-    folder: Path
-    trajectory: Trajectory
-    creature: DrawnCreature
-    report: dict[str, Any]
-    scene: GaussianCloud | None
-    """What is behind the creature, in its frame."""
-
-    @classmethod
-    def read(cls, folder: Path, *, background: Path | None = None) -> Recording:
-        """Read the ``folder`` of a run; ``background`` is a capture behind it, else its own ``background.ply``.
-
-        Raises ``UserError`` for a folder that is no run.
-        """
-        if not folder.is_dir():
-            raise UserError(f"{folder}: is no folder; give the one that egs-warp animate wrote")
-        trajectory = read_trajectory(folder / "trajectory.npz")
-        creature = DrawnCreature.load(folder / drawn.FILE, node_count=len(trajectory.rest_positions))
-        report = parse_json(read_text(folder / "report.json"), folder / "report.json")
-        if not isinstance(report, dict):
-            raise UserError(f"{folder / 'report.json'}: is no report; run egs-warp animate again, which writes it")
-        own = folder / "background.ply"
-        file = background or (own if own.is_file() else None)
-        scene = None
-        if file is not None:
-            t = trajectory
-            frame = BodyFrame(t.body_axes, t.body_origin, t.metres_per_unit)
-            scene = in_body_frame(read_capture(file).cloud, frame)
-        return cls(folder, trajectory, creature, report, scene)
-
-    @property
-    def title(self) -> str:
-        """Capture and motions."""
-        motions = self.report.get("motion", [])
-        names = [str(m.get("name", "")) for m in motions if isinstance(m, dict)] if isinstance(motions, list) else []
-        return " \u00b7 ".join(filter(None, [str(self.report.get("source", self.folder.name)), " \u2192 ".join(names)]))
-
-    @cached_property
-    def steps(self) -> np.ndarray:
-        """(n,) the step that is nearest to each frame at 60 Hz."""
-        time = self.trajectory.time
-        frames = np.arange(round(FRAME_RATE * (time[-1] - time[0])) + 1) / FRAME_RATE + time[0]
-        after = (
-            np.clip(np.searchsorted(time, frames), 1, max(len(time) - 1, 1)) if len(time) > 1 else frames.astype(int)
-        )
-        return np.where(frames - time[after - 1] < time[after] - frames, after - 1, after) if len(time) > 1 else after
+class Recording(FinishedRun):
+    """A finished run as packets."""
 
     def header(self) -> bytes:
         """All that does not change from frame to frame."""
@@ -119,8 +51,7 @@ class Recording:
             "notes": report.get("notes", []),
             "degree": {"splats": made.splats.sh_degree, "scene": self.scene.sh_degree if self.scene else 0},
         }
-        mesh = TetMesh(t.rest_positions, t.tets)
-        deformer = Deformer(made.splats, embed_gaussians(made.splats, mesh))
+        mesh, deformer = self.mesh, self.deformer()
         arrays = {
             "rest": t.rest_positions.astype(np.float32),
             "tets": t.tets.astype(np.int32),
@@ -145,18 +76,13 @@ class Recording:
         """At 60 Hz."""
         t = self.trajectory
         curves = _curves(t)
-        bounds = np.maximum(self.creature.muscle_bounds, 1e-12)
         for index, step in enumerate(self.steps):
-            # Step i leads to state i + 1, so what is seen in a state is what the step before it did.
-            chosen = np.flatnonzero(t.contact_step == step - 1)
-            points = np.einsum("cw,cwi->ci", t.contact_weights[chosen], t.positions[step][t.contact_nodes[chosen]])
-            quiet = np.zeros(len(bounds))
             yield Frame(
                 index,
                 float(t.time[step]),
                 t.positions[step],
-                t.activations[step - 1] / bounds if step > 0 else quiet,
-                np.concatenate([points, t.contact_normal[chosen], t.contact_force[chosen]], axis=1),
+                self.activations(step),
+                np.concatenate(self.contacts(step), axis=1),
                 curves[step],
             )
 

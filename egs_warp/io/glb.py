@@ -1,0 +1,78 @@
+"""Binary glTF 2.0 with splats as points: KHR_gaussian_splatting, as ratified.
+
+Scales and opacities are as they are, not logarithms; quaternions x, y, z, w; glTF's y is up, which is the
+caller's care.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.io.atomic import atomic_write
+
+_EXTENSION = "KHR_gaussian_splatting"
+_FLOAT = 5126
+_KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+
+
+def write_glb(path: Path | str, cloud: GaussianCloud) -> None:
+    """Write ``cloud``, y up, as one mesh of points. Raises ``UserError`` if the file cannot be written."""
+    means, sh = cloud.means.numpy(), cloud.sh.numpy()
+    opacities = cloud.opacities().astype(np.float32)[:, None]
+    fallback = np.concatenate([np.clip(0.5 + SH_BAND_0 * sh[:, 0], 0.0, 1.0), opacities], axis=1)
+    attributes = {
+        "POSITION": means,
+        "COLOR_0": fallback,
+        f"{_EXTENSION}:ROTATION": cloud.rotations.numpy()[:, [1, 2, 3, 0]],
+        f"{_EXTENSION}:SCALE": np.exp(cloud.log_scales.numpy()),
+        f"{_EXTENSION}:OPACITY": opacities,
+    }
+    for degree in range(cloud.sh_degree + 1):
+        for k in range(2 * degree + 1):
+            attributes[f"{_EXTENSION}:SH_DEGREE_{degree}_COEF_{k}"] = sh[:, degree**2 + k]
+    pieces = [np.ascontiguousarray(values, "<f4").tobytes() for values in attributes.values()]
+    starts = np.cumsum([0, *(len(piece) for piece in pieces)]).tolist()
+    accessors: list[dict[str, object]] = [
+        {"bufferView": k, "componentType": _FLOAT, "count": cloud.count, "type": _KINDS[values.shape[1]]}
+        for k, values in enumerate(attributes.values())
+    ]
+    accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
+    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    splats |= {"sortingMethod": "cameraDistance", "projection": "perspective"}
+    text = json.dumps(
+        {
+            "asset": {"version": "2.0", "generator": "egs_warp"},
+            "extensionsUsed": [_EXTENSION],
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0, "name": "creature"}],
+            "meshes": [
+                {
+                    "primitives": [
+                        {
+                            "mode": 0,
+                            "attributes": {name: k for k, name in enumerate(attributes)},
+                            "extensions": {_EXTENSION: splats},
+                        }
+                    ]
+                }
+            ],
+            "accessors": accessors,
+            "bufferViews": [
+                {"buffer": 0, "byteOffset": start, "byteLength": len(piece), "target": 34962}
+                for start, piece in zip(starts, pieces, strict=False)
+            ],
+            "buffers": [{"byteLength": starts[-1]}],
+        }
+    ).encode()
+    text += b" " * (-len(text) % 4)
+    binary = b"".join(pieces)
+    with atomic_write(path) as temporary, open(temporary, "wb") as file:
+        file.write(np.array([0x46546C67, 2, 28 + len(text) + len(binary), len(text), 0x4E4F534A], "<u4").tobytes())
+        file.write(text)
+        file.write(np.array([len(binary), 0x004E4942], "<u4").tobytes())
+        file.write(binary)

@@ -1,0 +1,76 @@
+"""A finished run as files of other tools: numbered splat files, or one USD stage."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from egs_warp import io
+from egs_warp.deformation.rigid import in_body_frame
+from egs_warp.errors import ArgumentError
+from egs_warp.geometry.body_frame import BodyFrame
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.io.glb import write_glb
+from egs_warp.pipelines.finished_run import FinishedRun
+
+WRITERS: dict[str, tuple[str, Callable[[Path, GaussianCloud], None]]] = {
+    "ply": (".ply", io.write_ply),
+    "compressed-ply": (".compressed.ply", io.write_compressed_ply),
+    "spz": (".spz", io.write_spz),
+    "sog": (".sog", io.write_sog),
+    "splat": (".splat", io.write_splat),
+    "glb": (".glb", write_glb),
+}
+"""Ending and writer of each kind of splat file."""
+_Y_UP = BodyFrame(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3), 1.0)
+
+
+def with_degree(cloud: GaussianCloud, degree: int | None) -> GaussianCloud:
+    """``cloud`` with colour bands up to ``degree``, all of them where that is None."""
+    if degree is None or degree >= cloud.sh_degree:
+        return cloud
+    return replace(cloud, sh=cloud.sh[:, : (degree + 1) ** 2].contiguous())
+
+
+def chosen_frames(run: FinishedRun, *, frame: int | None, every: int) -> np.ndarray:
+    """Indices of frames at 60 Hz: one, or ``every`` so many. Raises ``UserError`` for one that is not there."""
+    count = len(run.steps)
+    if every < 1:
+        raise ArgumentError("every", "give a whole number of at least 1", value=every)
+    if frame is None:
+        return np.arange(0, count, every)
+    if not -count <= frame < count:
+        advice = f"the run has {count} frames; give 0 to {count - 1}, or -1 for the last"
+        raise ArgumentError("frame", advice, value=frame)
+    return np.array([frame % count])
+
+
+def export_splats(
+    run: FinishedRun,
+    folder: Path | str,
+    kind: str,
+    *,
+    frame: int | None = None,
+    every: int = 1,
+    degree: int | None = None,
+    quiet: bool = False,
+) -> list[Path]:
+    """Write ``frame0000.ply`` and so on into ``folder``, numbered at 60 Hz; returns the paths.
+
+    ``kind`` is one of ``WRITERS``. All but ``glb`` lie in the frame and units of the capture, so they fit what is left
+    of it; ``glb`` is in metres, y up, as glTF asks. Raises ``UserError`` for a frame that the run does not have.
+    """
+    ending, write = WRITERS[kind]
+    frames = chosen_frames(run, frame=frame, every=every)
+    target = io.writable_folder(folder)
+    deformer, paths = run.deformer(), []
+    place = _Y_UP if kind == "glb" else run.capture_frame
+    for index in tqdm(frames, desc="export", unit="frame", disable=quiet):
+        cloud = in_body_frame(deformer.deform(run.trajectory.positions[run.steps[index]]).cloud, place)
+        paths.append(target / f"frame{index:04d}{ending}")
+        write(paths[-1], with_degree(cloud, degree))
+    return paths
