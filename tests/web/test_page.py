@@ -15,11 +15,14 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.io import write_ply
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.web.page import PAGE, export_page
 from egs_warp.web.recording import Recording
@@ -285,3 +288,40 @@ with sync_playwright() as started:
 """
     pytest.importorskip("playwright.sync_api")
     subprocess.run([sys.executable, "-c", script], check=True, timeout=120)
+
+
+@pytest.fixture(scope="module")
+def on_a_floor(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The page of the same run over a grey floor of flat Gaussians, which lies behind it as ``background.ply``."""
+    folder = tmp_path_factory.mktemp("floor") / "run"
+    shutil.copytree(run_folder, folder)
+    t = Recording.read(folder).trajectory
+    along = np.linspace(-1.5, 1.5, 50)
+    spots = np.stack([*map(np.ravel, np.meshgrid(along, along)), np.zeros(2500)], axis=1)
+    turn = Rotation.from_matrix(t.body_axes.T).as_quat()[[3, 0, 1, 2]]
+    floor = GaussianCloud.from_numpy(
+        t.in_capture(spots),
+        np.tile(turn, (2500, 1)),
+        np.tile(np.log(np.array([0.05, 0.05, 0.002]) / t.metres_per_unit), (2500, 1)),
+        np.full(2500, 4.0),
+        np.zeros((2500, 1, 3)),
+    )
+    write_ply(folder / "background.ply", floor)
+    path = folder / "page.html"
+    export_page(path, [Recording.read(folder)])
+    return path.as_uri()
+
+
+def test_a_scene_behind_lies_on_the_ground_and_takes_the_shadow(chromium: Any, on_a_floor: str):
+    page, complaints = _opened(chromium, on_a_floor)
+    assert not page.evaluate("document.getElementById('layer-ground').checked")
+    page.evaluate("egs.stages[0].preset('top'); egs.setLayer('splats', false)")
+    picture = _picture(page)
+    # Grey where light is let through, darker under the creature, nowhere outside of the floor's range.
+    middle = picture[picture.shape[0] // 2, picture.shape[1] // 2]
+    assert 0.2 < middle.mean() < 0.35
+    assert abs(np.median(picture[180:300, 10:40]) - 0.5) < 0.03
+    page.evaluate("egs.setLayer('scene', false)")
+    np.testing.assert_allclose(_picture(page)[240, 20], _BACKGROUND, atol=0.01)
+    assert complaints == []
+    page.close()

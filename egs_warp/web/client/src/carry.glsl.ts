@@ -66,7 +66,20 @@ vec3 egsColour(sampler2D bands, sampler2D scales, int index, int degree, vec3 d)
   return c;
 }
 
-CovSplat egsCarried(int index, sampler2D splats, sampler2D arms, sampler2D bands, sampler2D scales, sampler2D cage, vec3 eye, int degree) {
+/* Light that the creature leaves to a splat of the ground at p; place: middle of the shadow, half its side, body height. */
+float egsLight(sampler2D shade, vec4 place, vec3 p) {
+  vec2 uv = 0.5 + 0.5 * (p.xy - place.xy) / place.z;
+  float near = 1.0 - smoothstep(0.02, 0.08, abs(p.z) / place.w);
+  if (near <= 0.0 || any(greaterThan(abs(uv - 0.5), vec2(0.5)))) return 1.0;
+  float dark = 0.0;
+  for (int k = 0; k < 12; k++) {
+    float a = 2.399963 * float(k), r = 0.04 * sqrt((float(k) + 0.5) / 12.0);
+    dark += texture(shade, uv + r * vec2(cos(a), sin(a))).r;
+  }
+  return 1.0 - 0.05 * dark * near;
+}
+
+CovSplat egsCarried(int index, sampler2D splats, sampler2D arms, sampler2D bands, sampler2D scales, sampler2D cage, sampler2D shade, vec4 shadePlace, vec3 eye, int degree) {
   vec4 a = egsTexel(splats, 4 * index), q = egsTexel(splats, 4 * index + 1);
   vec4 s = egsTexel(splats, 4 * index + 2), colour = egsTexel(splats, 4 * index + 3);
   vec3 mean = a.xyz;
@@ -106,6 +119,7 @@ CovSplat egsCarried(int index, sampler2D splats, sampler2D arms, sampler2D bands
   result.flags = GSPLAT_FLAG_ACTIVE;
   result.index = index;
   result.rgba = vec4(max(colour.rgb + egsColour(bands, scales, index, degree, direction), 0.0), s.w);
+  if (shadePlace.z > 0.0) result.rgba.rgb *= egsLight(shade, shadePlace, moved);
   result.xxyyzz = max(vec3(covariance[0][0], covariance[1][1], covariance[2][2]), 1e-16);
   result.xyxzyz = vec3(covariance[1][0], covariance[2][0], covariance[2][1]);
   return result;

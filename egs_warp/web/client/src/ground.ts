@@ -5,6 +5,8 @@ import * as THREE from "three";
 const SHADOW_SIDE = 256;
 
 export class Ground {
+  /** What the creature's shadow is drawn to, and where that lies: middle, half its side, the body's height. */
+  readonly shadow: { texture: THREE.Texture; place: THREE.Vector4 };
   readonly mesh: THREE.Mesh<THREE.PlaneGeometry, THREE.ShaderMaterial>;
   private readonly target: THREE.WebGLRenderTarget;
   private readonly camera: THREE.OrthographicCamera;
@@ -20,6 +22,7 @@ export class Ground {
   ) {
     this.target = new THREE.WebGLRenderTarget(SHADOW_SIDE, SHADOW_SIDE, { depthBuffer: false });
     const half = 1.5 * height;
+    this.shadow = { texture: this.target.texture, place: new THREE.Vector4(0, 0, half, height) };
     this.camera = new THREE.OrthographicCamera(-half, half, half, -half, -100 * height, 100 * height);
     const geometry = new THREE.BufferGeometry();
     this.points = new THREE.BufferAttribute(new Float32Array(3 * nodeCount), 3);
@@ -89,13 +92,14 @@ export class Ground {
 
   /** Draws the shadow of the cage at node `positions`, whose centre of mass is `middle`. */
   cast(renderer: THREE.WebGLRenderer, positions: Float32Array, middle: THREE.Vector3): void {
-    if (!this.mesh.visible) return;
     (this.points.array as Float32Array).set(positions);
     this.points.needsUpdate = true;
     const { uniforms } = this.mesh.material;
     (uniforms.shadeCentre!.value as THREE.Vector2).set(middle.x, middle.y);
     uniforms.softness!.value = 0.02 + 0.05 * Math.min(Math.max(middle.z / this.height - 0.2, 0), 1.5);
     this.camera.position.set(middle.x, middle.y, 0);
+    this.shadow.place.x = middle.x;
+    this.shadow.place.y = middle.y;
     const before = { target: renderer.getRenderTarget(), colour: renderer.getClearColor(new THREE.Color()), alpha: renderer.getClearAlpha() };
     renderer.setRenderTarget(this.target);
     renderer.setClearColor(0x000000, 1);

@@ -12,12 +12,13 @@ export interface CarriedSplats {
   moved(): void;
 }
 
-/** The splats `name` of a run, carried by the maps in `cage`; `still` ones all lie in its first tetrahedron. */
+/** The splats `name` of a run, carried by the maps in `cage`; `still` ones all lie in its first tetrahedron. On those
+ * at the height of the ground a `shadow` may fall. */
 export function carriedSplats(
   header: Header,
   name: "splats" | "scene",
   cage: THREE.DataTexture,
-  { still }: { still: boolean },
+  { still, shadow }: { still: boolean; shadow?: { texture: THREE.Texture; place: THREE.Vector4 } },
 ): CarriedSplats {
   const means = floatsOf(header, `${name}_means`);
   const count = means.length / 3;
@@ -50,6 +51,9 @@ export function carriedSplats(
     bands: dyno.dynoSampler2D(bandTexture(bytesOf(header, `${name}_bands`), count, degree), "egsBands"),
     bandScales: dyno.dynoSampler2D(scaleTexture(floatsOf(header, `${name}_band_scales`)), "egsBandScales"),
     cage: dyno.dynoSampler2D(cage, "egsCage"),
+    // Without a shadow its place has no size, and any texture will do.
+    shade: dyno.dynoSampler2D(shadow?.texture ?? cage, "egsShade"),
+    shadePlace: dyno.dynoVec4(shadow?.place ?? new THREE.Vector4(), "egsShadePlace"),
     eye: dyno.dynoVec3(eye, "egsEye"),
     degree: dyno.dynoConst("int", degree),
   };
@@ -63,6 +67,8 @@ export function carriedSplats(
         bands: "sampler2D",
         bandScales: "sampler2D",
         cage: "sampler2D",
+        shade: "sampler2D",
+        shadePlace: "vec4",
         eye: "vec3",
         degree: "int",
       },
@@ -70,7 +76,7 @@ export function carriedSplats(
       inputs: { index, ...uniforms },
       globals: () => [dyno.defineGsplat, dyno.defineCovSplat, CARRY_GLSL],
       statements: ({ inputs: i, outputs }) => [
-        `${outputs.covsplat} = egsCarried(${i.index}, ${i.splats}, ${i.arms}, ${i.bands}, ${i.bandScales}, ${i.cage}, ${i.eye}, ${i.degree});`,
+        `${outputs.covsplat} = egsCarried(${i.index}, ${i.splats}, ${i.arms}, ${i.bands}, ${i.bandScales}, ${i.cage}, ${i.shade}, ${i.shadePlace}, ${i.eye}, ${i.degree});`,
       ],
     });
     return { covsplat: carry.outputs.covsplat };

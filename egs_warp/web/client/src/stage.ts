@@ -53,16 +53,17 @@ export class Stage {
     this.splats = carriedSplats(header, "splats", this.cage.texture, { still: false });
     this.spark = splatRenderer(this.renderer, () => this.invalidate());
     this.scene.add(this.spark, this.splats.generator);
-    if (header.arrays.has("scene_means")) {
-      this.still = carriedSplats(header, "scene", stillCage(), { still: true });
-      this.scene.add(this.still.generator);
-    }
     this.overlays = new Overlays(header, (frame) => this.centre(frame.positions));
     this.scene.add(this.overlays.group);
     this.bounds = this.reach();
     const { height } = header.facts;
     this.ground = new Ground(indicesOf(header, "surface"), rest.length / 3, height, 3.5 * height + 1.5 * this.bounds.size);
     this.ground.centreOn(this.bounds.middle.x, this.bounds.middle.y);
+    if (header.arrays.has("scene_means")) {
+      const { shadow } = this.ground;
+      this.still = carriedSplats(header, "scene", stillCage(), { still: true, shadow });
+      this.scene.add(this.still.generator);
+    }
     this.ground.mesh.visible = this.still === undefined;
     this.scene.add(this.ground.mesh);
     this.controls = new OrbitControls(this.camera, canvas);
