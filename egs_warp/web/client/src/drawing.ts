@@ -5,7 +5,7 @@
 import { SparkRenderer } from "@sparkjsdev/spark";
 import * as THREE from "three";
 
-const BATCH = 256;
+const BATCH = 1024;
 
 /** Quads, so many to an instance; Spark says how many splats are to be drawn. */
 class Batches extends THREE.InstancedBufferGeometry {
