@@ -8,9 +8,10 @@ from typing import Any
 import warp as wp
 
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.kernels.render.backward import pixel_gradients_kernel, project_backward_kernel
+from egs_warp.kernels.render.backward import pose_backward_kernel, project_backward_kernel
 from egs_warp.kernels.render.compositing import composite_backward_block_kernel, composite_backward_tile_kernel
 from egs_warp.kernels.render.ellipse import TILE_PIXELS
+from egs_warp.kernels.render.pixel_gradients import pixel_gradients_kernel
 from egs_warp.launching import empty, launch_again, launch_rows
 from egs_warp.render.compositing import RenderedImage
 from egs_warp.render.projection import ProjectedGaussians
@@ -101,15 +102,22 @@ def backward(
         pose_rotation=empty(count, wp.mat33, device) if want_pose else None,
         pose_translation=empty(count, wp.vec3, device) if want_pose else None,
     )
+    by_gaussian = {"device": device, "threads": threads}
+    walked_back = [projected.slot_end, moments]
+    places = [cloud.means, cloud.rotations, cloud.log_scales]
     launch_rows(
         project_backward_kernel,
         count,
-        inputs=[
-            *(view, int(antialiased), cloud.means, cloud.rotations, cloud.log_scales, cloud.opacity_logits, cloud.sh),
-            *(projected.ellipse, projected.slot_end, moments),
-        ],
-        outputs=[getattr(gradients, name) for name in gradients.__dataclass_fields__],
-        device=device,
-        threads=threads,
+        inputs=[view, int(antialiased), *places, cloud.opacity_logits, cloud.sh, *walked_back],
+        outputs=[*(gradients.means, gradients.rotations, gradients.log_scales, gradients.opacity_logits, gradients.sh)],
+        **by_gaussian,
     )
+    if want_pose or want_screen:
+        launch_rows(
+            pose_backward_kernel,
+            count,
+            inputs=[view, int(antialiased), *places, cloud.sh, *walked_back],
+            outputs=[gradients.screen, gradients.pose_rotation, gradients.pose_translation],
+            **by_gaussian,
+        )
     return gradients
