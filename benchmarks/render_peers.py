@@ -14,7 +14,7 @@ import torch
 import warp as wp
 
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import SH_BAND_0
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.render.autograd import render_torch
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.tiles import TileLists
@@ -53,9 +53,20 @@ def garden_scene(points: dict[str, np.ndarray], *, grid: int, seed: int, device:
     )
 
 
-def garden_camera(points: dict[str, np.ndarray], *, width: int, height: int) -> Camera:
-    """First camera of the garden, its image resampled to ``width`` x ``height``."""
-    view, k = points["viewmats"][0].astype(float), points["Ks"][0].astype(float)
+def cloud_of(scene: Scene) -> GaussianCloud:
+    """The capture's own terms, from tensors already in them, without a copy."""
+    return GaussianCloud(
+        means=wp.from_torch(scene.means.detach(), dtype=wp.vec3),
+        rotations=wp.from_torch(scene.rotations.detach(), dtype=wp.vec4),
+        log_scales=wp.from_torch(scene.scales.detach(), dtype=wp.vec3),
+        opacity_logits=wp.from_torch(scene.opacities.detach(), dtype=wp.float32),
+        sh=wp.from_torch(scene.colours.detach(), dtype=wp.vec3),
+    )
+
+
+def garden_camera(points: dict[str, np.ndarray], *, width: int, height: int, number: int = 0) -> Camera:
+    """One of the garden's three cameras, its image resampled to ``width`` x ``height``."""
+    view, k = points["viewmats"][number].astype(float), points["Ks"][number].astype(float)
     x, y = width / float(points["width"]), height / float(points["height"])
     return Camera(width, height, k[0, 0] * x, k[1, 1] * y, k[0, 2] * x, k[1, 2] * y, view[:3, :3], view[:3, 3])
 
@@ -94,23 +105,26 @@ def _once_per_camera(make: Callable[[Camera], Any]) -> Callable[[Camera], Any]:
     return get
 
 
-def gsplat_renderer() -> Renderer:
+def gsplat_matrices(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+    """Pose (1, 4, 4) and intrinsics (1, 3, 3) on the GPU."""
+    view = torch.eye(4)
+    view[:3, :3] = torch.as_tensor(camera.rotation)
+    view[:3, 3] = torch.as_tensor(camera.translation)
+    k = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
+    return view[None].float().cuda(), k[None].float().cuda()
+
+
+def gsplat_renderer(*, packed: bool) -> Renderer:
     """gsplat 1.5.3; raises ImportError where it is not installed."""
     from gsplat.rendering import rasterization
 
-    def matrices(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
-        view = torch.eye(4)
-        view[:3, :3] = torch.as_tensor(camera.rotation)
-        view[:3, 3] = torch.as_tensor(camera.translation)
-        k = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
-        return view[None].float().cuda(), k[None].float().cuda()
-
-    matrices_of = _once_per_camera(matrices)
+    matrices_of = _once_per_camera(gsplat_matrices)
 
     def draw(scene: Scene, camera: Camera) -> torch.Tensor:
         colours, _, _ = rasterization(
             *(scene.means, scene.rotations, scene.scales, scene.opacities, scene.colours),
             *(*matrices_of(camera), camera.width, camera.height),
+            packed=packed,
         )
         return colours[0]
 

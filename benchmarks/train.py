@@ -16,7 +16,7 @@ import numpy as np
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.cameras import read_points
 from egs_warp.io.video import contact_sheet
-from egs_warp.pipelines.train_capture import TrainResult, score_photo, train
+from egs_warp.pipelines.train_capture import PhotoScore, score_photo, train
 from egs_warp.render import render_gaussians
 from harness import Row, Table, data_folder, flags, report
 from train_peers import has_gsplat, train_with_gsplat
@@ -32,12 +32,8 @@ _WARM_UP = 20
 """Steps of both before the first timed case, so that kernels are compiled."""
 
 
-def row_of(case: str, method: str, cloud: GaussianCloud, seconds: float, result: TrainResult) -> Row:
-    """Scores of one cloud on the photos of ``result``."""
-    scores = [
-        score_photo(cloud, view, result.background, held_out=score.held_out)
-        for view, score in zip(result.views, result.scores, strict=True)
-    ]
+def row_of(case: str, method: str, cloud: GaussianCloud, seconds: float, scores: Sequence[PhotoScore]) -> Row:
+    """Means of the ``scores`` of one cloud."""
     row: Row = {"case": case, "method": method, "gaussians": cloud.count, "seconds": seconds}
     for which, out in (("held_out", True), ("trained_on", False)):
         chosen = [score for score in scores if score.held_out is out]
@@ -65,8 +61,8 @@ def run_case(case: str, options: argparse.Namespace, table: Table) -> tuple[list
         device=options.device,
         stage=stage,
     )
-    clouds = {OURS: result.cloud}
-    rows = [row_of(case, OURS, result.cloud, marks["judging"] - marks["training"], result)]
+    clouds = {OURS: (result.cloud, result.background)}
+    rows = [row_of(case, OURS, result.cloud, marks["judging"] - marks["training"], result.scores)]
     rows[0]["left_out"] = [one.name for one in result.left_out]
     if has_peer:
         trained = [
@@ -82,15 +78,21 @@ def run_case(case: str, options: argparse.Namespace, table: Table) -> tuple[list
             seed=options.seed,
             device=options.device,
         )
-        clouds[GSPLAT] = peer.cloud
-        rows.append(row_of(case, GSPLAT, peer.cloud, peer.seconds, result))
+        # Each is judged over what it was trained over: where light gets through, another colour would count against it.
+        behind = result.background if result.cut_out else (0.0, 0.0, 0.0)
+        scores = [
+            score_photo(peer.cloud, view, behind, held_out=score.held_out)
+            for view, score in zip(result.views, result.scores, strict=True)
+        ]
+        clouds[GSPLAT] = (peer.cloud, behind)
+        rows.append(row_of(case, GSPLAT, peer.cloud, peer.seconds, scores))
     for row in rows:
         table.row(*(row[name] for name in _SHOWN))
     shown = next(number for number, score in enumerate(result.scores) if score.held_out)
     view = result.views[shown]
     frames = [np.rint(view.image * 255).astype(np.uint8)]
     frames += [
-        render_gaussians(cloud, view.camera, background=result.background).colour_srgb8() for cloud in clouds.values()
+        render_gaussians(cloud, view.camera, background=behind).colour_srgb8() for cloud, behind in clouds.values()
     ]
     return rows, contact_sheet(frames, len(frames), [f"{case}: photo", *clouds])
 

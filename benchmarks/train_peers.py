@@ -56,8 +56,8 @@ def train_with_gsplat(
     """gsplat 1.5.3 as its ``simple_trainer.py mcmc`` sets it up, MCMC strategy untouched but for the cap.
 
     The world is scaled to the cameras; it begins with triangulated points or a random cube; SH gets one degree more
-    each 1,000 steps. Photos with alpha are laid over a random colour each step, as ours are; SSIM is ``likeness.ssim``,
-    for fused_ssim is another package.
+    each 1,000 steps; what is behind is black. Photos with alpha are laid over a random colour each step, as ours are;
+    SSIM is ``likeness.ssim``, for fused_ssim is another package.
     """
     from gsplat import rasterization  # type: ignore[import-not-found]
     from gsplat.strategy import MCMCStrategy  # type: ignore[import-not-found]

@@ -6,8 +6,11 @@ rows from several threads run side by side.
 
 from __future__ import annotations
 
+import math
 import os
+import sys
 import threading
+from collections import OrderedDict
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -25,6 +28,9 @@ Device: TypeAlias = wp.Device | str | None
 
 _MIN_ROWS_PER_CHUNK = 2048
 """Below this many light rows a launch's own cost (about 20 us) is no longer small against its work."""
+
+_ALIGNMENT = 256
+"""Bytes: what the widest loads of a GPU ask for."""
 
 _LAST_CHUNKS_PER_THREAD = 24
 """The smallest chunk is this part of a thread's share: what one thread may wait for the other at the end."""
@@ -98,7 +104,7 @@ class _Recorded(threading.local):
     """Launches that this thread has made, for it to change and make again."""
 
     def __init__(self) -> None:
-        self.launches: dict[tuple[Any, str], tuple[Any, int]] = {}
+        self.launches: dict[tuple[Any, str], tuple[Any, int, list[Any]]] = {}
 
 
 _recorded = _Recorded()
@@ -107,10 +113,11 @@ _recorded = _Recorded()
 def launch_again(kernel: Any, dim: int, *, inputs: Sequence[Any], outputs: Sequence[Any], device: wp.Device) -> None:
     """``wp.launch`` on a GPU at half its cost, for kernels that run many times a second.
 
-    The first launch of a thread is kept; the next ones only put in their arguments, whose types are not checked again.
+    The first launch of a thread is kept; the next ones only put in those arguments that are others than last time,
+    whose types are not checked again.
     """
     launches = _recorded.launches
-    kept, kept_dim = launches.get((kernel, device.alias), (None, -1))
+    kept, kept_dim, held = launches.get((kernel, device.alias), (None, -1, []))
     if kept is None:
         kept = wp.launch(kernel, dim, inputs=list(inputs), outputs=list(outputs), device=device, record_cmd=True)
         # None where there is nothing to do.
@@ -124,12 +131,19 @@ def launch_again(kernel: Any, dim: int, *, inputs: Sequence[Any], outputs: Seque
         put = kept.set_param_at_index_from_ctype
         for i, value in enumerate((*inputs, *outputs)):
             if isinstance(value, wp.array):
-                put(i, value.__ctype__())
+                # Where it lies, not the array: that would keep its memory.
+                place = (value.ptr, value.shape, value.strides)
+                if held[i] != place:
+                    put(i, value.__ctype__())
+                    held[i] = place
             elif isinstance(value, int | float):
-                put(i, value)
+                if held[i] != value:
+                    put(i, value)
+                    held[i] = value
             else:
                 kept.set_param_at_index(i, value)
-    launches[kernel, device.alias] = kept, dim
+                held[i] = None
+    launches[kernel, device.alias] = kept, dim, held or [None] * (len(inputs) + len(outputs))
     if dim > 0:
         kept.launch()
 
@@ -168,6 +182,68 @@ def empty(shape: Shape, dtype: Any, device: Device, *, pinned: bool = False) -> 
     as a type.
     """
     return wp.empty(shape, dtype=dtype, device=device, pinned=pinned)
+
+
+def empty_together(device: Device, *wanted: tuple[Shape, Any]) -> list[wp.array]:
+    """Arrays of undefined contents in one piece of memory, each given by its shape and type.
+
+    An allocation on a GPU costs several times a look into it, and small pictures wait for both: arrays that nobody
+    holds any more are given again, as they are, to the next who wants the same on the same stream. Put together what
+    lives equally long: the memory goes when the last of the arrays does.
+    """
+    device = wp.get_device(device)
+    kept = _spare.kept
+    key = (device.alias, device.stream.cuda_stream if device.is_cuda else None, wanted)
+    made = kept.get(key, [])
+    for pieces in made:
+        if _holders(pieces) == _NO_HOLDER:
+            kept.move_to_end(key)
+            return list(pieces)
+    starts, total = [], 0
+    for shape, dtype in wanted:
+        starts.append(total)
+        count = shape if isinstance(shape, int) else math.prod(shape)
+        total += -(-count * wp.types.type_size_in_bytes(dtype) // _ALIGNMENT) * _ALIGNMENT
+    # In rows, for no side of an array may have 2^31 entries.
+    memory = empty((max(total // _ALIGNMENT, 1), _ALIGNMENT), wp.uint8, device)
+    pieces = []
+    for (shape, dtype), start in zip(wanted, starts, strict=True):
+        assert memory.ptr is not None
+        piece = wp.array(ptr=memory.ptr + start, dtype=dtype, shape=shape, device=memory.device)
+        piece._ref = memory
+        pieces.append(piece)
+    if 0 < total <= _POOLED_BYTES:
+        kept[key] = [*made[1 - _POOLED_ALIKE :], pieces]
+        kept.move_to_end(key)
+        while len(kept) > _POOLED_KINDS:
+            kept.popitem(last=False)
+    return list(pieces)
+
+
+def _holders(pieces: list[wp.array]) -> int:
+    return max(map(sys.getrefcount, pieces))
+
+
+_NO_HOLDER = max(map(sys.getrefcount, [object()]))
+"""References to what only one list holds, counted as ``_holders`` does."""
+_POOLED_BYTES, _POOLED_KINDS, _POOLED_ALIKE = 2**25, 16, 4
+"""Largest piece that is kept for the next who wants it, and how many of different kinds and of one kind are."""
+
+
+class _Spare(threading.local):
+    """What this thread made by ``empty_together``, oldest first."""
+
+    def __init__(self) -> None:
+        self.kept: OrderedDict[Any, list[list[wp.array]]] = OrderedDict()
+
+
+_spare = _Spare()
+
+
+def with_room(count: int) -> int:
+    """At least ``count``, at most a quarter more: counts that differ a little then ask for arrays of one size."""
+    step = 1 << max(count.bit_length() - 3, 0)
+    return -(-max(count, 1) // step) * step
 
 
 def zeros(shape: Shape, dtype: Any, device: Device) -> wp.array:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from egs_warp.launching import launch_again, launch_rows
+from egs_warp.launching import empty_together, launch_again, launch_rows, with_room
 
 
 @wp.kernel
@@ -87,3 +87,38 @@ def test_a_launch_made_again_takes_its_new_arguments(device: str) -> None:
     with ThreadPoolExecutor(2) as pool:
         for done in [pool.submit(run, seed) for seed in (1, 2)]:
             done.result()
+
+
+def test_arrays_in_one_piece_of_memory_do_not_touch_and_keep_it(device: str) -> None:
+    wanted = [(7, wp.vec3), ((3, 5), wp.float32), (0, wp.vec4), (1, wp.int64), ((2, 2), wp.vec4)]
+    pieces = empty_together(device, *wanted)
+    for number, (piece, (shape, dtype)) in enumerate(zip(pieces, wanted, strict=True)):
+        assert piece.shape == (shape if isinstance(shape, tuple) else (shape,))
+        assert piece.dtype is dtype and piece.is_contiguous and (piece.ptr or 0) % 16 == 0
+        piece.fill_(number + 1)
+    one = pieces[1]
+    del pieces, piece
+    # What the others had is free for others only once this one is gone.
+    others = [wp.full(64, 9.0, dtype=wp.float32, device=device) for _ in range(50)]
+    assert len(others) == 50 and (one.numpy() == 2).all()
+
+
+def test_arrays_that_nobody_holds_are_given_again(device: str) -> None:
+    wanted = [(11, wp.vec3), (4, wp.float32)]
+    first = empty_together(device, *wanted)
+    places = [piece.ptr for piece in first]
+    assert empty_together(device, *wanted)[0].ptr not in places
+    view = first[1].numpy() if device == "cpu" else pytest.importorskip("torch").as_tensor(first[1], device="cuda")
+    del first
+    # A view from outside keeps the whole, too.
+    assert empty_together(device, *wanted)[0].ptr not in places
+    del view
+    second, third = empty_together(device, *wanted), empty_together(device, *wanted)
+    assert places in ([piece.ptr for piece in pieces] for pieces in (second, third))
+    assert second[0].ptr != third[0].ptr
+
+
+def test_sizes_with_room_are_few_and_not_much_larger() -> None:
+    sizes = [with_room(count) for count in range(1, 100_000)]
+    assert all(count <= size <= max(1.25 * count, count + 1) for count, size in enumerate(sizes, 1))
+    assert len(set(sizes)) < 100

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from functools import cache, lru_cache
 from typing import Any
 
 import torch
@@ -112,24 +113,35 @@ def torch_stream(device: torch.device) -> AbstractContextManager[Any]:
     """Warp works on the stream that torch works on, where there are streams."""
     if device.type != "cuda":
         return nullcontext()
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
+    return wp.ScopedStream(_warp_stream(torch.cuda.current_stream(device)), sync_enter=False)
+
+
+@cache
+def _warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
+    """Made once: there are few streams, and each is used at every step."""
+    return wp.stream_from_torch(stream)
 
 
 def _cloud_of(tensors: tuple[torch.Tensor, ...]) -> GaussianCloud:
     """The contiguous ``tensors`` as a capture without a copy; ``wp.from_torch`` would take twice as long."""
-    device = wp.device_from_torch(tensors[0].device)
+    places = tuple(tensor.data_ptr() for tensor in tensors)
+    return _cloud_at(places, tensors[0].shape[0], tensors[4].shape[1], wp.device_from_torch(tensors[0].device).alias)
 
-    def wrapped(tensor: torch.Tensor, dtype: Any, shape: tuple[int, ...]) -> wp.array:
-        return wp.array(ptr=tensor.data_ptr(), dtype=dtype, shape=shape, device=device)
 
-    means, rotations, log_scales, opacity_logits, sh = tensors
-    count = means.shape[0]
+@lru_cache(maxsize=16)
+def _cloud_at(places: tuple[int, ...], count: int, coefficients: int, device: str) -> GaussianCloud:
+    """The capture whose attributes begin at these addresses; it owns no memory, so it may be made once for all."""
+
+    def wrapped(place: int, dtype: Any, *shape: int) -> wp.array:
+        return wp.array(ptr=place, dtype=dtype, shape=shape, device=device)
+
+    means, rotations, log_scales, opacity_logits, sh = places
     return GaussianCloud(
-        means=wrapped(means, wp.vec3, (count,)),
-        rotations=wrapped(rotations, wp.vec4, (count,)),
-        log_scales=wrapped(log_scales, wp.vec3, (count,)),
-        opacity_logits=wrapped(opacity_logits, wp.float32, (count,)),
-        sh=wrapped(sh, wp.vec3, (count, sh.shape[1])),
+        means=wrapped(means, wp.vec3, count),
+        rotations=wrapped(rotations, wp.vec4, count),
+        log_scales=wrapped(log_scales, wp.vec3, count),
+        opacity_logits=wrapped(opacity_logits, wp.float32, count),
+        sh=wrapped(sh, wp.vec3, count, coefficients),
     )
 
 

@@ -8,10 +8,11 @@ from typing import Any
 import warp as wp
 
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.kernels.render.backward import pixel_gradients_kernel, project_backward_kernel
+from egs_warp.kernels.render.backward import pose_backward_kernel, project_backward_kernel
 from egs_warp.kernels.render.compositing import composite_backward_block_kernel, composite_backward_tile_kernel
 from egs_warp.kernels.render.ellipse import TILE_PIXELS
-from egs_warp.launching import empty, launch_again, launch_rows
+from egs_warp.kernels.render.pixel_gradients import pixel_gradients_kernel
+from egs_warp.launching import empty, empty_together, launch_again, launch_rows, with_room
 from egs_warp.render.compositing import RenderedImage
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.tiles import TileLists
@@ -56,7 +57,7 @@ def backward(
 ) -> CloudGradients:
     """From gradients (H, W) by ``image``'s colour (vec3), alpha and depth (float32); None stands for zero."""
     device, count = cloud.device, cloud.count
-    moments = empty((max(projected.slot_count, 1), 3), wp.vec4, device)
+    (moments,) = empty_together(device, ((with_room(projected.slot_count), 3), wp.vec4))
     walked = [
         *(view.width, view.height, lists.tile_start, lists.gaussian_from_intersection, lists.slot_from_intersection),
         *(projected.ellipse, projected.falloff, projected.colour_depth),
@@ -92,24 +93,31 @@ def backward(
             work=lists.work,
         )
     gradients = CloudGradients(
-        means=empty(count, wp.vec3, device),
-        rotations=empty(count, wp.vec4, device),
-        log_scales=empty(count, wp.vec3, device),
-        opacity_logits=empty(count, wp.float32, device),
-        sh=empty(cloud.sh.shape, wp.vec3, device),
+        *empty_together(
+            device,
+            *((count, wp.vec3), (count, wp.vec4), (count, wp.vec3), (count, wp.float32)),
+            (cloud.sh.shape, wp.vec3),
+        ),
         screen=empty(count, wp.vec2, device) if want_screen else None,
         pose_rotation=empty(count, wp.mat33, device) if want_pose else None,
         pose_translation=empty(count, wp.vec3, device) if want_pose else None,
     )
+    by_gaussian = {"device": device, "threads": threads}
+    walked_back = [projected.slot_end, moments]
+    places = [cloud.means, cloud.rotations, cloud.log_scales]
     launch_rows(
         project_backward_kernel,
         count,
-        inputs=[
-            *(view, int(antialiased), cloud.means, cloud.rotations, cloud.log_scales, cloud.opacity_logits, cloud.sh),
-            *(projected.ellipse, projected.slot_end, moments),
-        ],
-        outputs=[getattr(gradients, name) for name in gradients.__dataclass_fields__],
-        device=device,
-        threads=threads,
+        inputs=[view, int(antialiased), *places, cloud.opacity_logits, cloud.sh, *walked_back],
+        outputs=[*(gradients.means, gradients.rotations, gradients.log_scales, gradients.opacity_logits, gradients.sh)],
+        **by_gaussian,
     )
+    if want_pose or want_screen:
+        launch_rows(
+            pose_backward_kernel,
+            count,
+            inputs=[view, int(antialiased), *places, cloud.sh, *walked_back],
+            outputs=[gradients.screen, gradients.pose_rotation, gradients.pose_translation],
+            **by_gaussian,
+        )
     return gradients

@@ -12,7 +12,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.kernels.render.compositing import composite_tile_kernel
 from egs_warp.kernels.render.ellipse import TILE_PIXELS
 from egs_warp.kernels.render.geometry import composite_geometry_kernel, splat_normals_kernel
-from egs_warp.launching import device_of, empty, launch_rows
+from egs_warp.launching import device_of, empty, empty_together, launch_rows
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.tiles import TileLists
 
@@ -53,9 +53,8 @@ def composite(
     """Blend every tile's Gaussians from front to back over ``background``."""
     device = device_of(projected.ellipse)
     width, height = int(view.width), int(view.height)
-    colour = empty((height, width), wp.vec3, device)
-    alpha = empty((height, width), wp.float32, device)
-    depth = empty((height, width), wp.float32, device)
+    shape = (height, width)
+    colour, alpha, depth = empty_together(device, (shape, wp.vec3), (shape, wp.float32), (shape, wp.float32))
     inputs = [
         width,
         height,

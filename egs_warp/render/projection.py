@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.kernels.render.projection import NOT_FINITE, View, project_kernel
-from egs_warp.launching import device_of, empty, launch_rows
+from egs_warp.launching import device_of, empty, empty_together, launch_rows
 
 _ATTRIBUTES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 
@@ -31,8 +33,16 @@ class ProjectedGaussians:
     """(n,) vec4: red, green, blue (display-referred, at least 0) and z-depth."""
     slot_end: wp.array
     """(n,) int64: number of tiles reached by the Gaussians up to and including this one."""
-    slot_count: int
-    """Number of (Gaussian, tile) pairs."""
+    count_slots: Callable[[], int]
+    """Reads ``slot_count``."""
+
+    @cached_property
+    def slot_count(self) -> int:
+        """Number of (Gaussian, tile) pairs; on a GPU the first to ask waits for it.
+
+        Raises ``UserError`` that names the first Gaussian with a non-finite value, if there is one.
+        """
+        return self.count_slots()
 
 
 def view_from_camera(camera: Camera) -> Any:
@@ -64,15 +74,11 @@ def view_from_camera(camera: Camera) -> Any:
 
 
 def project(cloud: GaussianCloud, view: Any, *, antialiased: bool, threads: int) -> ProjectedGaussians:
-    """Project every Gaussian of ``cloud``; those outside the view, or fainter than 1/255 everywhere, reach no tile.
-
-    Raises ``UserError`` that names the first Gaussian with a non-finite value, if there is one.
-    """
+    """Project every Gaussian of ``cloud``; those outside the view, or fainter than 1/255 everywhere, reach no tile."""
     device, count = cloud.device, cloud.count
-    ellipse = empty(count, wp.vec4, device)
-    falloff = empty(count, wp.vec2, device)
-    colour_depth = empty(count, wp.vec4, device)
-    tile_count = empty(count, wp.int64, device)
+    ellipse, falloff, colour_depth, tile_count = empty_together(
+        device, (count, wp.vec4), (count, wp.vec2), (count, wp.vec4), (count, wp.int64)
+    )
     launch_rows(
         project_kernel,
         count,
@@ -82,10 +88,14 @@ def project(cloud: GaussianCloud, view: Any, *, antialiased: bool, threads: int)
         threads=threads,
     )
     wp.utils.array_scan(tile_count, tile_count, inclusive=True)
-    slot_count = _last(tile_count)
-    if not 0 <= slot_count < 2**30:
-        raise _too_many(cloud, view, tile_count.numpy())
-    return ProjectedGaussians(ellipse, falloff, colour_depth, tile_count, slot_count)
+
+    def count_slots() -> int:
+        slot_count = _last(tile_count)
+        if not 0 <= slot_count < 2**30:
+            raise _too_many(cloud, view, tile_count.numpy())
+        return slot_count
+
+    return ProjectedGaussians(ellipse, falloff, colour_depth, tile_count, count_slots)
 
 
 _read_back = threading.local()

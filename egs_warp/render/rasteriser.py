@@ -52,9 +52,25 @@ def render_gaussians(
     return image
 
 
-def render_views(cloud: GaussianCloud, cameras: Sequence[Camera], **options: Any) -> list[RenderedImage]:
-    """One picture of ``cloud`` for each camera; the options are those of ``render_gaussians``."""
-    return [render_gaussians(cloud, camera, **options) for camera in cameras]
+def render_views(
+    cloud: GaussianCloud, cameras: Sequence[Camera], *, backgrounds: Sequence[Any] | None = None, **options: Any
+) -> list[RenderedImage]:
+    """One picture of ``cloud`` for each camera; the options are those of ``render_gaussians``.
+
+    ``backgrounds`` has one for each camera, where ``background`` is one for all. Raises ``UserError`` where their
+    numbers differ.
+    """
+    if backgrounds is None:
+        return [render_gaussians(cloud, camera, **options) for camera in cameras]
+    if len(backgrounds) != len(cameras) or "background" in options:
+        raise UserError(
+            f"render: {len(backgrounds)} backgrounds for {len(cameras)} cameras"
+            f"{' and one for all' if 'background' in options else ''}; give one for each"
+        )
+    return [
+        render_gaussians(cloud, camera, background=behind, **options)
+        for camera, behind in zip(cameras, backgrounds, strict=True)
+    ]
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from egs_warp.kernels.render.tiles import (
     fill_tiles_kernel,
     finish_lists_kernel,
 )
-from egs_warp.launching import device_of, empty, launch_again, launch_rows, zeros
+from egs_warp.launching import device_of, empty, empty_together, launch_again, launch_rows, with_room, zeros
 from egs_warp.render.projection import ProjectedGaussians
 
 TILE_SIDE = int(TILE)
@@ -55,6 +55,7 @@ def build_tile_lists(projected: ProjectedGaussians, view: Any, *, threads: int) 
 def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, threads: int) -> TileLists:
     """Counting sort in chunks of the depth order, side by side: no pair is compared."""
     device = device_of(projected.ellipse)
+    pairs = projected.slot_count
     slot_counts = np.diff(projected.slot_end.numpy(), prepend=0)
     gaussian_from_visible = np.flatnonzero(slot_counts).astype(np.int32)
     visible_count = len(gaussian_from_visible)
@@ -72,7 +73,7 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, thr
     inner = 8 * np.searchsorted(pairs_done, np.arange(1, chunks) * (pairs_done[-1] / chunks)) if chunks > 1 else []
     edges = np.concatenate([[0], inner, [visible_count]]).astype(np.int32)
     chunk_start = wp.array(edges, dtype=wp.int32, device=device)
-    tile_from_slot, gaussians, slots = (empty(max(projected.slot_count, 1), wp.int32, device) for _ in range(3))
+    tile_from_slot, gaussians, slots = (empty(max(pairs, 1), wp.int32, device) for _ in range(3))
     counts = zeros((chunks, tiles), wp.int32, device)
     walk = {"device": device, "threads": threads, "work": np.ones(chunks)}
     shared = [chunk_start, order, projected.slot_end]
@@ -97,14 +98,19 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int) -> T
     32 bits sort twice as fast as 64.
     """
     device = device_of(projected.ellipse)
-    count, pairs = projected.slot_end.shape[0], projected.slot_count
+    count = projected.slot_end.shape[0]
+    # Memory for about as many pairs as lately: it is taken while the GPU projects, before their number is known.
+    room = _lists_for(_expected.get(device.alias, 0), tiles, device)
+    pairs = projected.slot_count
+    _expected[device.alias] = pairs if pairs <= _LARGE_SORT else 0
     if pairs == 0:
         return TileLists(
             zeros(tiles + 1, wp.int32, device), empty(1, wp.int32, device), empty(1, wp.int32, device), None
         )
-    keys = empty(2 * pairs, wp.uint32, device)
-    # Slots, room to sort them, and the Gaussian of each slot.
-    scratch = empty(3 * pairs, wp.int32, device)
+    if room is None or len(room.gaussians) < pairs or len(room.tile_start) != tiles + 1:
+        room = _lists_for(pairs, tiles, device)
+        assert room is not None
+    keys, scratch = room.keys, room.scratch
     nearest, farthest = (int(np.float32(z).view(np.int32)) for z in (view.near, view.far))
     depth_bits = max((farthest - nearest).bit_length(), 1)
     tile_bits = max(tiles - 1, 1).bit_length()
@@ -119,9 +125,6 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int) -> T
         outputs=[keys, scratch],
         device=device,
     )
-    # What comes out is allocated while the GPU is busy.
-    tile_start = empty(tiles + 1, wp.int32, device)
-    gaussians, slots = (empty(pairs, wp.int32, device) for _ in range(2))
     if pairs > _LARGE_SORT:
         # The sort takes scratch memory inside Warp, which does not report a failure: see first whether there is any.
         empty((pairs, 2), wp.int32, device)
@@ -130,7 +133,34 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int) -> T
         finish_lists_kernel,
         pairs + 1,
         inputs=[pairs, kept_bits, keys, scratch, projected.colour_depth],
-        outputs=[tile_start, gaussians, slots],
+        outputs=[room.tile_start, room.gaussians, room.slots],
         device=device,
     )
-    return TileLists(tile_start, gaussians, slots, None)
+    return TileLists(room.tile_start, room.gaussians, room.slots, None)
+
+
+_expected: dict[str, int] = {}
+"""Number of pairs to expect next, by device."""
+
+
+@dataclass(frozen=True)
+class _Room:
+    """Memory for the lists of so many pairs, and to make them in."""
+
+    keys: wp.array
+    scratch: wp.array
+    """Slots, room to sort them, and the Gaussian of each slot."""
+    tile_start: wp.array
+    gaussians: wp.array
+    slots: wp.array
+
+
+def _lists_for(pairs: int, tiles: int, device: wp.Device) -> _Room | None:
+    if pairs == 0:
+        return None
+    pairs = with_room(pairs)
+    # Two pieces: what the lists are made in goes at once.
+    return _Room(
+        *empty_together(device, (2 * pairs, wp.uint32), (3 * pairs, wp.int32)),
+        *empty_together(device, (tiles + 1, wp.int32), (pairs, wp.int32), (pairs, wp.int32)),
+    )

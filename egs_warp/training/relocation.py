@@ -23,6 +23,10 @@ _EVERY = 100
 """Steps between relocations."""
 _GROWTH = 1.05
 """Least factor by which the number of Gaussians grows at each."""
+_GROWN_AT_BEST, _GROWN_AT_LAST = 0.3, 0.5
+"""Shares of the steps at which a cap that was asked for is reached: early where that is gentle, by half time anyway."""
+_GENTLE = 1.1
+"""Factor above which copies outrun what the photos can tell them apart by."""
 _PULL = 0.01
 """Weight of the mean opacity and of the mean scale over the extent."""
 _JITTER = 5e5
@@ -84,8 +88,8 @@ class Population:
     def evolve(self, step: int, steps: int, growth: Growth) -> None:
         """Jitter the means; now and then move faint Gaussians onto opaque ones and grow.
 
-        A cap that was asked for is reached by half time; else the number grows at the least pace, while ``growth``
-        lets it.
+        A cap that was asked for is reached by half time or before; else the number grows at the least pace, while
+        ``growth`` lets it.
         """
         self._jitter()
         # The last fifth of the steps settles what is there.
@@ -101,8 +105,7 @@ class Population:
                 tensor[places] = tensor[chosen]
             self._forget(torch.cat([places, chosen]))
         count = len(opacity)
-        turns_left = max(1, round((0.5 * steps - step) / _EVERY))
-        pace = _GROWTH if growth.asked is None else max(_GROWTH, (growth.cap / count) ** (1 / turns_left))
+        pace = _GROWTH if growth.asked is None else _pace(growth.cap / count, step, steps)
         more = min(growth.cap, int(pace * count) + 1) - count
         if more > 0:
             chosen = self._draw(torch.sigmoid(self.tensors["opacity_logits"]), more)
@@ -167,6 +170,14 @@ class Population:
                 outputs=[_array(means)],
                 device=wp.device_from_torch(means.device),
             )
+
+
+def _pace(ratio: float, step: int, steps: int) -> float:
+    """Factor of growth at ``step`` of ``steps``, where there are to be ``ratio`` times as many in the end."""
+    best, last = (
+        ratio ** (1 / max(1, round((share * steps - step) / _EVERY))) for share in (_GROWN_AT_BEST, _GROWN_AT_LAST)
+    )
+    return max(_GROWTH, min(best, _GENTLE), last)
 
 
 def _array(tensor: torch.Tensor) -> wp.array:

@@ -160,6 +160,14 @@ def test_several_cameras_and_what_does_not_fit(monkeypatch: pytest.MonkeyPatch) 
             image.colour.numpy(), render_gaussians(cloud, camera, background=(0, 0, 0)).colour.numpy()
         )
 
+    behind = [(0.1, 0.2, 0.3), np.full((10, 40, 3), 0.5)]
+    for camera, back, image in zip(cameras, behind, render_views(cloud, cameras, backgrounds=behind), strict=True):
+        assert np.array_equal(image.colour.numpy(), render_gaussians(cloud, camera, background=back).colour.numpy())
+    with pytest.raises(UserError, match=r"^render: 1 backgrounds for 2 cameras; give one for each$"):
+        render_views(cloud, cameras, backgrounds=behind[:1])
+    with pytest.raises(UserError, match=r"^render: 2 backgrounds for 2 cameras and one for all; give one for each$"):
+        render_views(cloud, cameras, backgrounds=behind, background=(0, 0, 0))
+
     def no_memory(*_: object, **__: object) -> None:
         raise RuntimeError("Failed to allocate 123 bytes on device 'cpu'")
 

@@ -15,7 +15,7 @@ from egs_warp.training.finetune import FinetuneOptions, finetune, views_of_captu
 from egs_warp.training.growth import Growth  # noqa: E402
 from egs_warp.training.likeness import in_tone_of  # noqa: E402
 from egs_warp.training.misfits import misfitting  # noqa: E402
-from egs_warp.training.relocation import Population  # noqa: E402
+from egs_warp.training.relocation import Population, _pace  # noqa: E402
 
 
 def test_gains_and_shifts_of_the_views_are_found_and_their_mean_is_none() -> None:
@@ -112,3 +112,22 @@ def test_pull_and_jitter_are_what_they_say() -> None:
     size = 5e5 * 2e-4 / 4.0 * gate
     moved = tensors["means"].detach().numpy().astype(float)
     np.testing.assert_allclose(np.cov(moved.T), size**2 * sigma @ sigma, atol=0.08 * (size * 0.09) ** 2)
+
+
+def test_the_number_grows_gently_where_there_is_time() -> None:
+    def turns(count: int, cap: int, steps: int) -> tuple[float, float]:
+        """Step at which the cap is reached, and the largest factor."""
+        largest = 1.0
+        for step in range(99, steps, 100):
+            pace = _pace(cap / count, step, steps)
+            largest = max(largest, pace)
+            count = min(cap, int(pace * count) + 1)
+            if count == cap:
+                return step, largest
+        raise AssertionError("never reached")
+
+    step, largest = turns(31_629, 200_000, 7000)
+    assert step <= 2200 and largest <= 1.1
+    step, largest = turns(3_613, 200_000, 7000)
+    assert 3300 <= step <= 3500 and largest > 1.1
+    assert turns(190_000, 200_000, 7000) == (199, pytest.approx(1.05))

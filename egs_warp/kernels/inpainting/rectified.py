@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from egs_warp.kernels.render.projection import sh_sum
+from egs_warp.kernels.render.spherical_harmonics import sh_sum
 
 wp.set_module_options({"enable_backward": False})
 

@@ -3,8 +3,8 @@
 import warp as wp
 
 from egs_warp.kernels.render import composite_cpu, composite_cuda
-from egs_warp.kernels.render.backward import pixel_gradient
 from egs_warp.kernels.render.ellipse import TILE, TILE_PIXELS
+from egs_warp.kernels.render.pixel_gradients import pixel_gradient
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 

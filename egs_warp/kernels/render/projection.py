@@ -3,6 +3,7 @@
 import warp as wp
 
 from egs_warp.kernels.render.ellipse import LOG_255, LOW_PASS, tile_columns, tile_rows
+from egs_warp.kernels.render.spherical_harmonics import sh_sum
 
 wp.set_module_options({"enable_backward": False})
 
@@ -57,38 +58,6 @@ def rotation_matrix(q: wp.vec4) -> wp.mat33:
 
 
 @wp.func
-def sh_sum(sh: wp.array2d[wp.vec3], g: wp.int32, coefficients: wp.int32, d: wp.vec3) -> wp.vec3:
-    """Spherical harmonics of Gaussian ``g`` towards the unit direction ``d``, INRIA signs, without the +0.5."""
-    x = d[0]
-    y = d[1]
-    z = d[2]
-    c = 0.28209479177387814 * sh[g, 0]
-    if coefficients > 1:
-        c = c + 0.4886025119029199 * (-y * sh[g, 1] + z * sh[g, 2] - x * sh[g, 3])
-    if coefficients > 4:
-        xx = x * x
-        yy = y * y
-        zz = z * z
-        c = c + 1.0925484305920792 * (x * y) * sh[g, 4]
-        c = c - 1.0925484305920792 * (y * z) * sh[g, 5]
-        c = c + 0.31539156525252005 * (2.0 * zz - xx - yy) * sh[g, 6]
-        c = c - 1.0925484305920792 * (x * z) * sh[g, 7]
-        c = c + 0.5462742152960396 * (xx - yy) * sh[g, 8]
-    if coefficients > 9:
-        xx = x * x
-        yy = y * y
-        zz = z * z
-        c = c - 0.5900435899266435 * y * (3.0 * xx - yy) * sh[g, 9]
-        c = c + 2.890611442640554 * (x * y) * z * sh[g, 10]
-        c = c - 0.4570457994644658 * y * (4.0 * zz - xx - yy) * sh[g, 11]
-        c = c + 0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy) * sh[g, 12]
-        c = c - 0.4570457994644658 * x * (4.0 * zz - xx - yy) * sh[g, 13]
-        c = c + 1.445305721320277 * z * (xx - yy) * sh[g, 14]
-        c = c - 0.5900435899266435 * x * (xx - 3.0 * yy) * sh[g, 15]
-    return c
-
-
-@wp.func
 def screen_axes(view: View, p: wp.vec3, q: wp.vec4, log_scale: wp.vec3) -> tuple[wp.vec3, wp.vec3]:
     """Rows x and y of J W R S at the camera-space point ``p``: the screen covariance is their Gram matrix."""
     inv_z = 1.0 / p[2]
@@ -104,6 +73,34 @@ def screen_axes(view: View, p: wp.vec3, q: wp.vec4, log_scale: wp.vec3) -> tuple
     row_x = view.fx * inv_z * (right - tx * forward)
     row_y = view.fy * inv_z * (down - ty * forward)
     return wp.cw_mul(row_x, scale), wp.cw_mul(row_y, scale)
+
+
+@wp.struct
+class ScreenCovariance:
+    """Of one Gaussian on the screen, in square pixels: sharp as it is, and with the low-pass added."""
+
+    sharp_xx: wp.float32
+    sharp_yy: wp.float32
+    sharp_determinant: wp.float32
+    xx: wp.float32
+    xy: wp.float32
+    yy: wp.float32
+    determinant: wp.float32
+
+
+@wp.func
+def screen_covariance(row_x: wp.vec3, row_y: wp.vec3) -> ScreenCovariance:
+    """From the rows of ``screen_axes``."""
+    of = ScreenCovariance()
+    of.sharp_xx = wp.dot(row_x, row_x)
+    of.sharp_yy = wp.dot(row_y, row_y)
+    of.xy = wp.dot(row_x, row_y)
+    of.xx = of.sharp_xx + LOW_PASS
+    of.yy = of.sharp_yy + LOW_PASS
+    # Cauchy-Binet: a sum of positive terms, exact where xx yy - xy^2 cancels.
+    of.sharp_determinant = wp.length_sq(wp.cross(row_x, row_y))
+    of.determinant = of.sharp_determinant + LOW_PASS * (of.sharp_xx + of.sharp_yy) + LOW_PASS * LOW_PASS
+    return of
 
 
 @wp.kernel
@@ -142,33 +139,26 @@ def project_kernel(
     if p[2] < view.near or p[2] > view.far:
         return
     row_x, row_y = screen_axes(view, p, q, log_scale)
-    sharp_xx = wp.dot(row_x, row_x)
-    sharp_yy = wp.dot(row_y, row_y)
-    var_xy = wp.dot(row_x, row_y)
-    var_xx = sharp_xx + LOW_PASS
-    var_yy = sharp_yy + LOW_PASS
-    # Cauchy-Binet: a sum of positive terms, exact where var_xx var_yy - var_xy^2 cancels.
-    sharp_determinant = wp.length_sq(wp.cross(row_x, row_y))
-    determinant = sharp_determinant + LOW_PASS * (sharp_xx + sharp_yy) + LOW_PASS * LOW_PASS
+    screen = screen_covariance(row_x, row_y)
     log_opacity = -wp.log(1.0 + wp.exp(-logit))
     if logit < -15.0:
         log_opacity = logit
     if antialiased != 0:
-        log_opacity = log_opacity + 0.5 * wp.log(wp.max(sharp_determinant / determinant, 1.0e-12))
+        log_opacity = log_opacity + 0.5 * wp.log(wp.max(screen.sharp_determinant / screen.determinant, 1.0e-12))
     cut = log_opacity + LOG_255
     # The reach is compared with the image before anything else is worked out: most Gaussians of a large scene end here.
-    if cut <= 0.0 or not wp.isfinite(determinant):
+    if cut <= 0.0 or not wp.isfinite(screen.determinant):
         return
     x = view.fx * p[0] / p[2] + view.cx
     y = view.fy * p[1] / p[2] + view.cy
-    reach_x = wp.sqrt(2.0 * cut * var_xx)
-    reach_y = wp.sqrt(2.0 * cut * var_yy)
+    reach_x = wp.sqrt(2.0 * cut * screen.xx)
+    reach_y = wp.sqrt(2.0 * cut * screen.yy)
     if x + reach_x < 0.5 or y + reach_y < 0.5:
         return
     if x - reach_x > wp.float32(view.width) - 0.5 or y - reach_y > wp.float32(view.height) - 0.5:
         return
-    ellipse = wp.vec4(x, y, 0.5 * var_yy / determinant, -var_xy / var_yy)
-    falloff = wp.vec2(0.5 / var_yy, log_opacity)
+    ellipse = wp.vec4(x, y, 0.5 * screen.yy / screen.determinant, -screen.xy / screen.yy)
+    falloff = wp.vec2(0.5 / screen.yy, log_opacity)
     rows = tile_rows(ellipse, falloff, view.height)
     tiles = wp.int32(0)
     for row in range(rows[0], rows[1] + 1):

@@ -1,0 +1,78 @@
+"""What the renderer offers besides one picture over black, each beside gsplat's own result for the same Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+import render_peers as peers
+from egs_warp.render import render_gaussians, render_views
+from harness import Row, median_ms
+
+_WIDTH, _HEIGHT = 648, 420
+_FAINTER = 0.35
+"""Times the opacities: below an alpha of 0.99 nobody's limit does anything."""
+_BACKGROUNDS = ((0.9, 0.2, 0.1), (0.1, 0.8, 0.3), (0.2, 0.3, 1.0))
+_SEEN = 0.01
+"""Alpha from which a mean depth is compared."""
+
+
+def difference(ours: torch.Tensor, other: torch.Tensor) -> dict[str, float]:
+    """Mean absolute difference, and the share of pixels above 1e-3 (splats that come or go at their alpha cut)."""
+    off = (ours - other).abs()
+    return {"mean": float(off.mean()), "largest": float(off.max()), "above_1e-3": float((off > 1e-3).float().mean())}
+
+
+def mode_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
+    """Antialiased pictures, mean depth, and three cameras with a background each, with the time of the last."""
+    from gsplat.rendering import rasterization  # type: ignore[import-not-found]
+
+    plain = peers.garden_scene(points, grid=1, seed=seed, device="cuda")
+    scene = replace(plain, opacities=plain.opacities.detach() * _FAINTER)
+    cloud = peers.cloud_of(peers.ours_scene(scene))
+    cameras = [peers.garden_camera(points, width=_WIDTH, height=_HEIGHT, number=number) for number in range(3)]
+    matrices = [peers.gsplat_matrices(camera) for camera in cameras]
+    poses, intrinsics = (torch.cat(parts) for parts in zip(*matrices, strict=True))
+    colours = torch.tensor(_BACKGROUNDS, device="cuda")
+    values = (scene.means, scene.rotations, scene.scales, scene.opacities, scene.colours)
+
+    def theirs(which: slice, **options: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        with torch.no_grad():
+            picture, alpha, _ = rasterization(*values, poses[which], intrinsics[which], _WIDTH, _HEIGHT, **options)
+        return picture, alpha
+
+    one, every = slice(0, 1), slice(0, 3)
+    sharp = wp.to_torch(render_gaussians(cloud, cameras[0], background=(0, 0, 0), antialiased=True).colour)
+    depth = wp.to_torch(render_gaussians(cloud, cameras[0]).depth)
+    their_depth, alpha = theirs(one, render_mode="ED")
+    seen = alpha[0, :, :, 0] > _SEEN
+    unit = float(depth[seen].mean())
+    # Packed, gsplat takes no more than one background.
+    their_three = theirs(every, backgrounds=colours, packed=False)[0]
+
+    def ours_of_three() -> list[torch.Tensor]:
+        return [wp.to_torch(image.colour) for image in render_views(cloud, cameras, backgrounds=_BACKGROUNDS)]
+
+    return {
+        "kind": "modes",
+        "gaussians": cloud.count,
+        "width": _WIDTH,
+        "height": _HEIGHT,
+        "difference": {
+            "antialiased": difference(sharp, theirs(one, rasterize_mode="antialiased")[0][0]),
+            "depth": difference(depth[seen] / unit, their_depth[0, :, :, 0][seen] / unit),
+            "three cameras": difference(torch.stack(ours_of_three()), their_three),
+        },
+        "three_cameras": median_ms(
+            {
+                "ours": ours_of_three,
+                "gsplat_unpacked": lambda: theirs(every, backgrounds=colours, packed=False),
+            },
+            repeats=repeats,
+            synchronise=torch.cuda.synchronize,
+        ),
+    }

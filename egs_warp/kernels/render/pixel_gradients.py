@@ -1,0 +1,69 @@
+"""From gradients of a picture to what its splats use up of them, pixel by pixel."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+
+@wp.func
+def pixel_gradient(
+    row: wp.int32,
+    column: wp.int32,
+    colour: wp.array2d[wp.vec3],
+    alpha: wp.array2d[wp.float32],
+    depth: wp.array2d[wp.float32],
+    colour_gradient: wp.array2d[wp.vec3],
+    alpha_gradient: wp.array2d[wp.float32],
+    depth_gradient: wp.array2d[wp.float32],
+) -> tuple[wp.vec4, wp.float32]:
+    """The gradient by a pixel's weighted sums, and the whole that splats from front to back use up.
+
+    With s_i = (colour_i, depth_i) . gradient, the loss is linear in the weights w_i and the final transmittance T:
+    dL/dalpha_i = T_i s_i - (sum of w_j s_j over j > i + T dL/dT) / (1 - alpha_i). The bracket for i = 0 is what is
+    returned; walking from front to back then needs no second pass and no stored state. Empty arrays are zero gradients.
+    """
+    opaque = alpha[row, column]
+    by_colour = wp.vec3()
+    if colour_gradient.shape[0] > 0:
+        by_colour = colour_gradient[row, column]
+    by_alpha = wp.float32(0.0)
+    if alpha_gradient.shape[0] > 0:
+        by_alpha = alpha_gradient[row, column]
+    by_depth_sum = wp.float32(0.0)
+    if depth_gradient.shape[0] > 0 and opaque > 0.0:
+        by_depth_sum = depth_gradient[row, column] / opaque
+    depth_sum = depth[row, column] * opaque
+    by_alpha = by_alpha - by_depth_sum * depth[row, column]
+    # colour holds T times the background already; depth times alpha is the weighted sum of depths.
+    remaining = wp.dot(by_colour, colour[row, column]) + by_depth_sum * depth_sum - (1.0 - opaque) * by_alpha
+    return wp.vec4(by_colour[0], by_colour[1], by_colour[2], by_depth_sum), remaining
+
+
+@wp.kernel
+def pixel_gradients_kernel(
+    first: wp.int32,
+    # In:
+    colour: wp.array2d[wp.vec3],
+    alpha: wp.array2d[wp.float32],
+    depth: wp.array2d[wp.float32],
+    colour_gradient: wp.array2d[wp.vec3],
+    alpha_gradient: wp.array2d[wp.float32],
+    depth_gradient: wp.array2d[wp.float32],
+    # Out:
+    sum_gradient_out: wp.array[wp.vec4],
+    remaining_out: wp.array[wp.float32],
+):
+    """``pixel_gradient`` of every pixel (CPU; a GPU's compositor works it out itself)."""
+    i = wp.tid() + first
+    by_sums, remaining = pixel_gradient(
+        i / colour.shape[1],
+        i % colour.shape[1],
+        colour,
+        alpha,
+        depth,
+        colour_gradient,
+        alpha_gradient,
+        depth_gradient,
+    )
+    sum_gradient_out[i] = by_sums
+    remaining_out[i] = remaining
