@@ -6,7 +6,14 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from egs_warp.commands.flags import Commands, guessed_up, parse_direction, parse_up
+from egs_warp.commands.flags import (
+    Commands,
+    add_inpainter_flags,
+    chosen_inpainter,
+    guessed_up,
+    parse_direction,
+    parse_up,
+)
 from egs_warp.commands.scene_flags import SceneInput, add_object_flags, plane_of, read_scene, say
 from egs_warp.commands.segment import add_straddling_flag, clearing_of
 from egs_warp.errors import UserError
@@ -35,7 +42,7 @@ def add_parser(commands: Commands) -> None:
         "--view-from", help="x,y,z or an axis: from the object to the camera of the video, capture's frame"
     )
     add_straddling_flag(animate)
-    animate.add_argument("--inpainter", help="patch (default), telea, ns, or LaMa's TorchScript file")
+    add_inpainter_flags(animate, default=None)
     animate.add_argument(
         "--background", help="capture to draw behind the object of earlier steps, as inpaint writes it"
     )
@@ -78,7 +85,7 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
     from egs_warp.launching import use_device
     from egs_warp.pipelines.animate import animate
 
-    for name in ("cameras", "view", "straddling", "inpainter", "no_inpaint"):
+    for name in ("cameras", "view", "straddling", "inpainter", "trust", "no_inpaint"):
         if getattr(chosen, name) not in (None, False):
             raise UserError(f"--{name.replace('_', '-')}: needs --object, which says what to take out of a scene")
     asked = _asked(chosen)
@@ -110,7 +117,6 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
 
 def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
     """The object of a scene, cut out of it, over the rest of the scene."""
-    from egs_warp.inpainting.inpainters import inpainter_by_name
     from egs_warp.io.atomic import writable_folder
     from egs_warp.launching import use_device
     from egs_warp.pipelines.animate import animate
@@ -123,7 +129,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
         raise UserError("--inpainter: --no-inpaint leaves the floor as captured; leave one of them out")
     asked = _asked(chosen)
     use_device(chosen.device)
-    inpainter = inpainter_by_name(chosen.inpainter or "patch", device=chosen.device)
+    inpainter = chosen_inpainter(chosen)
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
     given = read_scene(chosen)
     folder = writable_folder(chosen.out)

@@ -14,6 +14,7 @@ from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
     from egs_warp.geometry.plane import Plane
+    from egs_warp.inpainting.inpainters import Inpainter
     from egs_warp.io.capture import Capture
 
 Commands: TypeAlias = "argparse._SubParsersAction[Any]"
@@ -37,6 +38,24 @@ def one_line_errors(program: str) -> Iterator[None]:
     except UserError as error:
         print(f"{program}: {error.told(flag_of)}", file=sys.stderr)
         raise SystemExit(2) from None
+
+
+def add_inpainter_flags(parser: argparse.ArgumentParser, *, default: str | None) -> None:
+    """Add the flags that ``chosen_inpainter`` reads."""
+    parser.add_argument("--inpainter", default=default, help="patch (default), telea, ns, or LaMa's ONNX file")
+    parser.add_argument(
+        "--trust", action="store_true", help="let --inpainter be a TorchScript file, which may run any program"
+    )
+
+
+def chosen_inpainter(chosen: argparse.Namespace, *, seed: int = 0) -> Inpainter:
+    """What ``--inpainter`` names. Raises ``UserError`` for a file that is no network, or that is not trusted."""
+    from egs_warp.inpainting.inpainters import TorchScriptInpainter, inpainter_by_name
+
+    inpainter = inpainter_by_name(chosen.inpainter or "patch", seed=seed, device=chosen.device, trust=chosen.trust)
+    if isinstance(inpainter, TorchScriptInpainter):
+        print(f"egs-warp: warning: {inpainter.path} is trusted to run any program that it carries", file=sys.stderr)
+    return inpainter
 
 
 def parse_up(text: str) -> np.ndarray:

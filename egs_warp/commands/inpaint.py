@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from egs_warp.commands.flags import Commands, parse_plane
+from egs_warp.commands.flags import Commands, add_inpainter_flags, chosen_inpainter, parse_plane
 from egs_warp.errors import UserError
 
 
@@ -26,7 +26,7 @@ def add_parser(commands: Commands) -> None:
     inpaint.add_argument("--hole", help="x,y,z,radius of a round hole, scene units")
     inpaint.add_argument("--out", required=True, type=Path, help="filled capture to write, .ply")
     inpaint.add_argument("--picture", type=Path, help="before, after and depth as PNG (--out with .png)")
-    inpaint.add_argument("--inpainter", default="patch", help="patch (default), telea, ns, or LaMa's TorchScript file")
+    add_inpainter_flags(inpaint, default="patch")
     inpaint.add_argument("--steps", type=int, help="of training against the inpainted picture (100); 0: no PyTorch")
     inpaint.add_argument("--margin", type=float, help="by how much the hole is made larger, of its side (0.01)")
     inpaint.add_argument("--seed", type=int, default=0, help="of the patch search (0)")
@@ -36,7 +36,6 @@ def add_parser(commands: Commands) -> None:
 
 def _inpaint(chosen: argparse.Namespace) -> int:
     from egs_warp.inpainting.inpaint import InpaintOptions, inpaint
-    from egs_warp.inpainting.inpainters import inpainter_by_name
     from egs_warp.inpainting.picture import before_and_after
     from egs_warp.io import read_capture, write_ply
     from egs_warp.io.video import write_png
@@ -60,7 +59,7 @@ def _inpaint(chosen: argparse.Namespace) -> int:
             " or give the plane.json that segment wrote by --plane"
         )
     use_device(chosen.device)
-    inpainter = inpainter_by_name(chosen.inpainter, seed=chosen.seed, device=chosen.device)
+    inpainter = chosen_inpainter(chosen, seed=chosen.seed)
     background = read_capture(chosen.background, device=chosen.device)
     hole = _hole(chosen, plane, recorded, background.cloud)
     result = inpaint(background.cloud, hole, inpainter=inpainter, options=options)

@@ -1,4 +1,4 @@
-"""What can fill a hole in a picture: one small protocol and three that keep it."""
+"""What can fill a hole in a picture: one small protocol and four that keep it."""
 
 from __future__ import annotations
 
@@ -12,9 +12,12 @@ import numpy as np
 
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.inpainting.patch_synthesis import PatchSynthesis
+from egs_warp.io.onnx import OnnxFile, read_onnx
 
 _PAD = 8
 """LaMa takes pictures whose sides are multiples of this."""
+_BRIGHTEST = 4.0
+"""A network that answers more than this counts to 255, not to 1."""
 
 
 class Inpainter(Protocol):
@@ -56,9 +59,48 @@ class OpenCvInpainter:
 
 
 @dataclass(frozen=True)
-class TorchScriptInpainter:
+class OnnxInpainter:
     """LaMa (Suvorov et al. 2022), or any network that takes (1, 3, H, W) in 0 to 1 and a (1, 1, H, W) mask of the hole
-    and returns (1, 3, H, W) in 0 to 1, as a TorchScript file of the user's."""
+    and returns (1, 3, H, W) in 0 to 1 or in 0 to 255, as an ONNX file of the user's.
+
+    Such a file carries no code. OpenCV computes it, on the CPU.
+    """
+
+    path: Path
+
+    def fill(self, image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """As ``Inpainter.fill``. Raises ``UserError`` for a file that is no such network."""
+        file, network = self._load()
+        picture, missing = _padded(image, hole, known)
+        masks = [name for name in file.inputs if "mask" in name.lower()]
+        mask_name = masks[0] if masks else file.inputs[1]
+        picture_name = next(name for name in file.inputs if name != mask_name)
+        try:
+            network.setInput(picture, picture_name)
+            network.setInput(missing, mask_name)
+            values = np.asarray(network.forward(), np.float32)
+        except cv2.error as error:
+            raise _failed(self.path, error, "an ONNX file of LaMa with free height and width") from error
+        return _answer(self.path, values, image, hole, missing.shape[2:])
+
+    def _load(self) -> tuple[OnnxFile, cv2.dnn.Net]:
+        file = read_onnx(self.path)
+        if len(file.inputs) != 2:
+            raise UserError(
+                f"{self.path}: the network takes {len(file.inputs)} inputs ({', '.join(file.inputs)}), expected a"
+                " picture and a mask; give LaMa's ONNX file"
+            )
+        try:
+            return file, cv2.dnn.readNetFromONNX(np.frombuffer(file.data, np.uint8))
+        except cv2.error as error:
+            raise UserError(
+                f"{self.path}: OpenCV does not know this network ({_last_line(error)}); export it as ONNX again"
+            ) from error
+
+
+@dataclass(frozen=True)
+class TorchScriptInpainter:
+    """The same network as a TorchScript file. Loading one runs whatever program it carries: for trusted files only."""
 
     path: Path
     device: str = "cpu"
@@ -67,30 +109,15 @@ class TorchScriptInpainter:
     def fill(self, image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> np.ndarray:
         """As ``Inpainter.fill``. Raises ``UserError`` for a file that is no such network."""
         torch, network = self._load()
-        rows, columns = hole.shape
-        pad = ((0, -rows % _PAD), (0, -columns % _PAD))
-        missing = np.pad(hole | ~known, pad, mode="symmetric").astype(np.float32)
-        picture = np.pad(np.where(known[..., None], image, 0.0), (*pad, (0, 0)), mode="symmetric").astype(np.float32)
+        picture, missing = _padded(image, hole, known)
         try:
             with torch.no_grad():
-                answer = network(
-                    torch.from_numpy(picture.transpose(2, 0, 1)[None]).to(self.device),
-                    torch.from_numpy(missing[None, None]).to(self.device),
-                )
+                answer = network(torch.from_numpy(picture).to(self.device), torch.from_numpy(missing).to(self.device))
             values = np.asarray(answer.detach().cpu().numpy(), np.float32)
         # TorchScript raises plain RuntimeErrors of many lines; AttributeError when the answer is no tensor.
         except (RuntimeError, AttributeError, TypeError) as error:
-            reason = str(error).strip().splitlines()[-1] if str(error).strip() else type(error).__name__
-            raise UserError(
-                f"{self.path}: the network failed on an image (1, 3, H, W) and a mask (1, 1, H, W) ({reason});"
-                " give LaMa's TorchScript file"
-            ) from error
-        if values.shape != (1, 3, *missing.shape) or not np.isfinite(values).all():
-            raise UserError(
-                f"{self.path}: the network returned shape {values.shape} or values that are not finite,"
-                f" expected {(1, 3, *missing.shape)}; give LaMa's TorchScript file"
-            )
-        return _pasted(image, hole, values[0].transpose(1, 2, 0)[:rows, :columns])
+            raise _failed(self.path, error, "LaMa's TorchScript file") from error
+        return _answer(self.path, values, image, hole, missing.shape[2:])
 
     def _load(self) -> tuple[Any, Any]:
         if not self.path.is_file():
@@ -107,20 +134,65 @@ class TorchScriptInpainter:
             ) from error
 
 
-def inpainter_by_name(name: str, *, seed: int = 0, device: str = "cpu") -> Inpainter:
-    """``patch``, ``telea``, ``ns`` or the path of a TorchScript file, which is tried.
+def inpainter_by_name(name: str, *, seed: int = 0, device: str = "cpu", trust: bool = False) -> Inpainter:
+    """``patch``, ``telea``, ``ns`` or the path of an ONNX file, which is tried.
+
+    A TorchScript file runs the program that it carries when it is loaded, so it is refused unless you ``trust`` it.
     Raises ``UserError`` for anything else.
     """
     if name == "patch":
         return PatchSynthesis(seed=seed, device=device)
     if name in (method.value for method in OpenCvMethod):
         return OpenCvInpainter(OpenCvMethod(name))
-    if Path(name).suffix in (".pt", ".pth", ".ts") or Path(name).is_file():
-        network = TorchScriptInpainter(Path(name), device="cuda" if device.startswith("cuda") else "cpu")
-        # A wrong file is told now, not after the minutes that come before the filling.
+    path = Path(name)
+    # A wrong file is told now, not after the minutes that come before the filling.
+    if path.suffix in (".pt", ".pth", ".ts"):
+        if not trust:
+            advice = (
+                "loading a TorchScript file runs the program in it; give an ONNX file, or say that you trust this one"
+            )
+            raise ArgumentError("inpainter", advice, value=name, check=("trust",))
+        script = TorchScriptInpainter(path, device="cuda" if device.startswith("cuda") else "cpu")
+        script._load()
+        return script
+    if path.suffix == ".onnx" or path.is_file():
+        network = OnnxInpainter(path)
         network._load()
         return network
-    raise ArgumentError("inpainter", "give patch, telea, ns or a TorchScript file (.pt)", value=name)
+    raise ArgumentError("inpainter", "give patch, telea, ns or an ONNX file (.onnx)", value=name)
+
+
+def _padded(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(1, 3, H, W) and (1, 1, H, W) float32: picture and mask of what is missing, in whole blocks of ``_PAD``."""
+    rows, columns = hole.shape
+    pad = ((0, -rows % _PAD), (0, -columns % _PAD))
+    missing = np.pad(hole | ~known, pad, mode="symmetric").astype(np.float32)
+    picture = np.pad(np.where(known[..., None], image, 0.0), (*pad, (0, 0)), mode="symmetric").astype(np.float32)
+    return np.ascontiguousarray(picture.transpose(2, 0, 1)[None]), missing[None, None]
+
+
+def _failed(path: Path, error: Exception, wanted: str) -> UserError:
+    return UserError(
+        f"{path}: the network failed on an image (1, 3, H, W) and a mask (1, 1, H, W) ({_last_line(error)});"
+        f" give {wanted}"
+    )
+
+
+def _last_line(error: Exception) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[-1] if lines else type(error).__name__
+
+
+def _answer(path: Path, values: np.ndarray, image: np.ndarray, hole: np.ndarray, padded: tuple[int, ...]) -> np.ndarray:
+    if values.shape != (1, 3, *padded) or not np.isfinite(values).all():
+        raise UserError(
+            f"{path}: the network returned shape {values.shape} or values that are not finite,"
+            f" expected {(1, 3, *padded)}; give LaMa's file"
+        )
+    rows, columns = hole.shape
+    filled = values[0].transpose(1, 2, 0)[:rows, :columns]
+    # Some exports of LaMa count to 255.
+    return _pasted(image, hole, filled / np.float32(255.0) if filled.max() > _BRIGHTEST else filled)
 
 
 def _pasted(image: np.ndarray, hole: np.ndarray, filled: np.ndarray) -> np.ndarray:

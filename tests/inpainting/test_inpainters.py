@@ -1,4 +1,4 @@
-"""OpenCV and TorchScript behind the same protocol, and their errors."""
+"""OpenCV, ONNX and TorchScript behind the same protocol, and their errors."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import torch
 from egs_warp.errors import UserError
 from egs_warp.inpainting.inpainters import OpenCvInpainter, OpenCvMethod, TorchScriptInpainter, inpainter_by_name
 from egs_warp.inpainting.patch_synthesis import PatchSynthesis
+from tests.support import onnx
 
 # LaMa is published as TorchScript, which torch calls deprecated.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -46,7 +47,7 @@ def save_traced(module: torch.nn.Module, inputs: tuple[torch.Tensor, ...], path:
 
 def test_torchscript_is_given_padded_pictures(tmp_path: Path) -> None:
     image, hole = holed()
-    inpainter = inpainter_by_name(str(traced(MeanOfTheKnown(), tmp_path / "mean.pt")))
+    inpainter = inpainter_by_name(str(traced(MeanOfTheKnown(), tmp_path / "mean.pt")), trust=True)
     filled = inpainter.fill(image, hole, ~hole)
     assert np.array_equal(filled[~hole], image[~hole])
     values = np.unique(filled[hole].round(5), axis=0)
@@ -68,10 +69,12 @@ def test_opencv_continues_flat_colour_exactly(method: OpenCvMethod) -> None:
 def test_names(tmp_path: Path) -> None:
     assert isinstance(inpainter_by_name("patch"), PatchSynthesis)
     assert inpainter_by_name("ns") == OpenCvInpainter(OpenCvMethod.NAVIER_STOKES)
-    with pytest.raises(UserError, match="inpainter lama: give patch, telea, ns or a TorchScript file"):
+    with pytest.raises(UserError, match="inpainter lama: give patch, telea, ns or an ONNX file"):
         inpainter_by_name("lama")
     with pytest.raises(UserError, match=r"gone\.pt: no such file; give the TorchScript file"):
-        inpainter_by_name(str(tmp_path / "gone.pt"))
+        inpainter_by_name(str(tmp_path / "gone.pt"), trust=True)
+    with pytest.raises(UserError, match=r"gone\.onnx: no such file"):
+        inpainter_by_name(str(tmp_path / "gone.onnx"))
 
 
 def test_bad_networks(tmp_path: Path) -> None:
@@ -96,3 +99,72 @@ def test_bad_networks(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"one\.pt: the network failed on an image") as caught:
         TorchScriptInpainter(tmp_path / "one.pt").fill(image, hole, ~hole)
     assert "\n" not in str(caught.value)
+
+
+def grey_paint(*, external: str | None = None, gain: float = 1.0) -> bytes:
+    """A network that paints the hole in 0.25, 0.5, 0.75 times ``gain``, its colour in a file of its own if asked."""
+    names = ("batch", "height", "width")
+    return onnx.model(
+        [
+            onnx.node("Sub", ["one", "mask"], ["keep"]),
+            onnx.node("Mul", ["image", "keep"], ["kept"]),
+            onnx.node("Mul", ["colour", "mask"], ["painted"]),
+            onnx.node("Add", ["kept", "painted"], ["sum"]),
+            onnx.node("Mul", ["sum", "gain"], ["output"]),
+        ],
+        [
+            onnx.tensor("one", [1, 1, 1, 1], [1.0]),
+            onnx.tensor("gain", [1, 1, 1, 1], [gain]),
+            onnx.tensor("colour", [1, 3, 1, 1], [0.25, 0.5, 0.75], external=external),
+        ],
+        [onnx.value("mask", [names[0], 1, *names[1:]]), onnx.value("image", [names[0], 3, *names[1:]])],
+        [onnx.value("output", [names[0], 3, *names[1:]])],
+    )
+
+
+@pytest.mark.parametrize("gain", [1.0, 255.0])
+def test_an_onnx_network_fills_the_hole(gain: float, tmp_path: Path) -> None:
+    (tmp_path / "grey.onnx").write_bytes(grey_paint(gain=gain))
+    image, hole = holed()
+    filled = inpainter_by_name(str(tmp_path / "grey.onnx")).fill(image, hole, ~hole)
+    assert np.array_equal(filled[~hole], image[~hole])
+    assert filled[hole] == pytest.approx(np.tile([0.25, 0.5, 0.75], (hole.sum(), 1)), abs=1e-6)
+
+
+def test_onnx_numbers_in_other_files_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenCV itself would open them, relative to the working folder."""
+    (tmp_path / "secret").write_bytes(np.array([9, 9, 9], np.float32).tobytes())
+    (tmp_path / "grey.onnx").write_bytes(grey_paint(external="secret"))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=r"grey\.onnx: some of its numbers lie in other files, which are not read"):
+        inpainter_by_name("grey.onnx")
+
+
+def test_bad_onnx_files(tmp_path: Path) -> None:
+    for data, said in (
+        (b"weights", "not an ONNX file"),
+        (b"", "not an ONNX file of a network with inputs"),
+        (onnx.model([], [], [onnx.value("image", [1, 3, 8, 8])], []), r"takes 1 inputs \(image\)"),
+        (grey_paint()[:-40], "not an ONNX file"),
+        (grey_paint().replace(b"Sub", b"Sob"), "OpenCV does not know this network"),
+    ):
+        (tmp_path / "bad.onnx").write_bytes(data)
+        with pytest.raises(UserError, match=rf"bad\.onnx: .*{said}") as caught:
+            inpainter_by_name(str(tmp_path / "bad.onnx"))
+        assert "\n" not in str(caught.value)
+
+
+def test_a_torchscript_file_is_not_loaded_unless_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded: list[object] = []
+    monkeypatch.setattr(torch.jit, "load", loaded.append)
+    path = traced(MeanOfTheKnown(), tmp_path / "mean.pt")
+    # Whatever its name: content that is no ONNX never reaches torch.
+    disguised = path.with_suffix(".net")
+    disguised.write_bytes(path.read_bytes())
+    with pytest.raises(
+        UserError, match=r"loading a TorchScript file runs the program in it; give an ONNX file, or say"
+    ):
+        inpainter_by_name(str(path))
+    with pytest.raises(UserError, match=r"mean\.net: not an ONNX file"):
+        inpainter_by_name(str(disguised))
+    assert loaded == []

@@ -43,7 +43,7 @@ def prepared() -> PreparedScene:
         (["--motion", "trajectory {tmp}/no.json"], "no.json: cannot be read"),
         (["--muscles", "{tmp}/no.json"], "no.json: cannot be read"),
         (["--terrain", "{tmp}/no.json"], "no.json: cannot be read"),
-        (["--inpainter", "lama"], "--inpainter lama: give patch, telea, ns or a TorchScript file"),
+        (["--inpainter", "lama"], "--inpainter lama: give patch, telea, ns or an ONNX file"),
         (["--inpainter", "ns", "--no-inpaint"], "--inpainter: --no-inpaint leaves the floor as captured"),
         (["--object", ""], "--object: nothing is given; give a mask.png"),
         (["--object", "0,0,0.5", "--up", ""], "--up : give one of x, y, z"),

@@ -1,0 +1,122 @@
+"""What an ONNX file is made of, as far as trusting it needs.
+
+Public description: https://onnx.ai/onnx/repo-docs/IR.html and ``onnx.proto``. An ONNX file holds numbers and a graph of
+known operations, no code; but its tensors may lie in other files that it names, which is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from egs_warp.errors import UserError
+from egs_warp.io.limits import read_bytes
+
+LARGEST_NETWORK = 2 << 30
+"""Bytes; protocol buffers hold no more."""
+_MOST_NESTED = 32
+"""Graphs in attributes of graphs."""
+# Fields of each message that hold messages which may hold tensors, by number.
+_MESSAGES = {
+    "Model": {7: "Graph", 20: "Training", 25: "Function"},
+    "Graph": {1: "Node", 5: "Tensor", 11: "Input", 15: "SparseTensor"},
+    "Training": {1: "Graph", 2: "Graph"},
+    "Function": {7: "Node", 11: "Attribute"},
+    "Node": {5: "Attribute"},
+    "Attribute": {5: "Tensor", 6: "Graph", 10: "Tensor", 11: "Graph", 22: "SparseTensor", 23: "SparseTensor"},
+    "SparseTensor": {1: "Tensor", 2: "Tensor"},
+}
+_EXTERNAL_DATA, _DATA_LOCATION = 13, 14
+"""Of a tensor: where its numbers lie, if not in the file."""
+
+
+@dataclass(frozen=True)
+class OnnxFile:
+    """A network that carries no code and needs no other file."""
+
+    data: bytes
+    inputs: tuple[str, ...]
+    """Names of what it is given, constants apart."""
+
+
+def read_onnx(path: Path) -> OnnxFile:
+    """Raises ``UserError`` for a file that is no ONNX, or whose numbers lie in other files."""
+    data = read_bytes(path, at_most=LARGEST_NETWORK)
+    walk = _Walk(path)
+    try:
+        walk.message(memoryview(data), "Model", 0)
+    except (IndexError, UnicodeDecodeError):
+        raise UserError(f"{path}: not an ONNX file; export the network as ONNX") from None
+    inputs = tuple(name for name in walk.inputs if name not in walk.constants)
+    if not inputs:
+        raise UserError(f"{path}: not an ONNX file of a network with inputs; export the network as ONNX")
+    return OnnxFile(data, inputs)
+
+
+class _Walk:
+    """Visits every tensor. Malformed data end in ``IndexError``."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.inputs: list[str] = []
+        self.constants: set[str] = set()
+
+    def message(self, data: memoryview, kind: str, depth: int) -> None:
+        if depth > _MOST_NESTED:
+            raise UserError(f"{self._path}: graphs within graphs, too deep to read; export the network again")
+        for number, value in _fields(data):
+            if kind == "Tensor":
+                if number == _EXTERNAL_DATA or (number == _DATA_LOCATION and value != 0):
+                    raise UserError(
+                        f"{self._path}: some of its numbers lie in other files, which are not read; "
+                        "export the network into one file"
+                    )
+                if number == 8 and depth == 2:
+                    self.constants.add(_text(value))
+            elif kind == "Input":
+                if number == 1 and depth == 2:
+                    self.inputs.append(_text(value))
+            elif number in _MESSAGES[kind]:
+                if isinstance(value, int):
+                    raise IndexError
+                self.message(value, _MESSAGES[kind][number], depth + 1)
+
+
+def _text(value: memoryview | int) -> str:
+    if isinstance(value, int):
+        raise IndexError
+    return bytes(value).decode()
+
+
+def _fields(data: memoryview) -> Iterator[tuple[int, memoryview | int]]:
+    """Number and value of each field of a protocol buffer; fixed-width values as bytes."""
+    place = 0
+    while place < len(data):
+        key, place = _varint(data, place)
+        number, wire = key >> 3, key & 7
+        if wire == 0:
+            value, place = _varint(data, place)
+            yield number, value
+            continue
+        if wire == 2:
+            size, place = _varint(data, place)
+        elif wire in (1, 5):
+            size = 8 if wire == 1 else 4
+        else:
+            raise IndexError
+        if place + size > len(data):
+            raise IndexError
+        yield number, data[place : place + size]
+        place += size
+
+
+def _varint(data: memoryview, place: int) -> tuple[int, int]:
+    value = 0
+    for shift in range(0, 70, 7):
+        byte = data[place]
+        place += 1
+        value |= (byte & 127) << shift
+        if byte < 128:
+            return value, place
+    raise IndexError
