@@ -12,6 +12,7 @@ from egs_warp.geometry.camera import Camera, camera_rays, shrunk
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.lens import Straightening
 from egs_warp.io.cameras import PosedImage
+from egs_warp.io.limits import check_pixels, picture_size, read_bytes
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.object_mask import Box, ObjectSpec
 from egs_warp.segmentation.votes import MaskedView
@@ -91,13 +92,15 @@ def _read_masks(path: Path, posed: Sequence[PosedImage] | None, view: str | None
     masks = []
     for file in files:
         one = _camera_of(file, posed, view if len(files) == 1 else None)
-        mask = read_mask(file)
         camera = one.camera
-        if mask.shape != (camera.height, camera.width):
+        size = mask_size(file)
+        # Before it is decoded: a small file may hold a very large picture.
+        if size != (camera.width, camera.height):
             raise UserError(
-                f"{file}: the mask is {mask.shape[1]} x {mask.shape[0]} pixels, the photo {one.name} "
+                f"{file}: the mask is {size[0]} x {size[1]} pixels, the photo {one.name} "
                 f"{camera.width} x {camera.height}; make it at the photo's size"
             )
+        mask = read_mask(file)
         if one.lens is not None:
             # Drawn on the photo as the lens bent it.
             mask = Straightening.of(camera, one.lens).mask(mask)
@@ -128,6 +131,15 @@ def _camera_of(file: Path, posed: Sequence[PosedImage], view: str | None) -> Pos
     )
 
 
+def mask_size(path: Path) -> tuple[int, int]:
+    """Width and height of a mask's file, not decoded. Raises ``UserError`` for what is no picture."""
+    size = picture_size(read_bytes(path), f"{path}: it")
+    if size is None:
+        raise UserError(f"{path}: not a readable picture; give a mask as PNG")
+    check_pixels(*size, f"{path}: it")
+    return size
+
+
 def read_mask(path: Path) -> np.ndarray:
     """(H, W) bool of a mask's file: its alpha where it has one, else the brighter half of its values.
 
@@ -135,13 +147,14 @@ def read_mask(path: Path) -> np.ndarray:
     """
     from PIL import Image
 
+    mask_size(path)
     try:
         with Image.open(path) as opened:
             picture = opened if opened.mode in ("P", "1", "L", "I", "I;16", "F") else opened.convert("RGBA")
-            values = np.array(picture, dtype=np.float64)
+            values = np.array(picture)
     # The decoder is handed a stranger's bytes, and its errors share no base class.
     except Exception as error:
         raise UserError(f"{path}: not a readable picture; give a mask as PNG") from error
     if values.ndim == 3:
-        values = values[..., 3] if np.ptp(values[..., 3]) > 0 else values[..., :3].mean(axis=2)
+        values = values[..., 3] if np.ptp(values[..., 3]) > 0 else values[..., :3].sum(axis=2, dtype=np.uint16)
     return values > 0.5 * values.max() if values.max() > 0 else np.zeros(values.shape, bool)

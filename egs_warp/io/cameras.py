@@ -6,7 +6,8 @@ import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,9 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.lens import Lens
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.colmap import SparsePoints, read_colmap_model, read_colmap_points
+from egs_warp.io.limits import FURTHEST, LARGEST_TEXT, check_pixels, picture_size, read_bytes
 from egs_warp.io.ply import read_point_ply
+from egs_warp.io.text import whole_number
 
 _IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".webp")
 _DISTORTIONS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
@@ -25,6 +28,10 @@ _LENSES = (
 )
 """Of ``camera_model`` in transforms.json."""
 _JSON_NAMES = ("cameras.json", "transforms.json", "transforms_train.json")
+_LONGEST_FOCAL = 1e3
+"""Sides of the photo; the shortest focal length is as small a part."""
+_FURTHEST_MIDDLE = 10.0
+"""Sides of the photo."""
 _COLMAP_FOLDERS = (".", "sparse/0", "sparse", "colmap/sparse/0")
 
 
@@ -50,14 +57,7 @@ def read_cameras(path: Path | str) -> list[PosedImage]:
     source = _pose_file(Path(path))
     if source.is_dir():
         return _from_colmap(source)
-    try:
-        tree = json.loads(source.read_bytes())
-    except FileNotFoundError as error:
-        raise UserError(f"{source}: no such file or folder; check the path") from error
-    except OSError as error:
-        raise UserError(f"{source}: cannot be read ({error.strerror}); check the path and its permissions") from error
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{source}: not readable JSON; give a cameras.json or a transforms.json") from error
+    tree = _tree(source)
     if isinstance(tree, list):
         posed = [_inria(source, number, entry) for number, entry in enumerate(tree)]
     elif isinstance(tree, dict) and isinstance(tree.get("frames"), list):
@@ -80,12 +80,46 @@ def read_points(path: Path | str) -> SparsePoints | None:
     source = _pose_file(Path(path))
     if source.is_dir():
         return read_colmap_points(source)
-    tree = json.loads(source.read_bytes())
+    tree = _tree(source)
     name = tree.get("ply_file_path") if isinstance(tree, dict) else "input.ply"
-    if not isinstance(name, str) or not os.path.isfile(source.parent / name):
+    if not isinstance(name, str) or not _below(name) or not os.path.isfile(source.parent / name):
         return None
     positions, colours = read_point_ply(source.parent / name)
     return SparsePoints(positions, colours) if len(positions) else None
+
+
+def _tree(source: Path) -> Any:
+    """What a .json of poses holds."""
+    data = read_bytes(source, at_most=LARGEST_TEXT)
+    try:
+        return json.loads(data, parse_int=whole_number)
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{source}: not readable JSON; give a cameras.json or a transforms.json") from error
+
+
+def _below(name: str) -> bool:
+    """Whether ``name`` stays in the folder that it is relative to."""
+    path = PurePath(name)
+    return "\0" not in name and not path.is_absolute() and not path.drive and ".." not in path.parts
+
+
+def _checked(camera: Camera, what: str) -> Camera:
+    """``camera``, if one can have taken a photo with it; ``what`` begins the message."""
+    check_pixels(camera.width, camera.height, what)
+    side = max(camera.width, camera.height)
+    focal = np.array([camera.fx, camera.fy]) / side
+    middle = np.array([camera.cx, camera.cy]) / side
+    if (
+        not ((focal > 1.0 / _LONGEST_FOCAL) & (focal < _LONGEST_FOCAL)).all()
+        or not (abs(middle) < _FURTHEST_MIDDLE).all()
+    ):
+        raise UserError(
+            f"{what}: focal lengths {camera.fx:g}, {camera.fy:g} and middle {camera.cx:g}, {camera.cy:g} fit no photo"
+            f" of {camera.width} x {camera.height} pixels; export the poses again"
+        )
+    if not (abs(camera.translation) < FURTHEST).all():
+        raise UserError(f"{what}: it lies further than {FURTHEST:g} units out; export the poses again")
+    return camera
 
 
 def _pose_file(source: Path) -> Path:
@@ -122,8 +156,10 @@ def _from_colmap(folder: Path) -> list[PosedImage]:
             rotation=rotation,
             translation=view.translation,
         )
+        _checked(camera, f"{folder}: the camera of image {view.name}")
         # COLMAP keeps the photos' folder to itself; these are the usual places around sparse/0.
         places = [parent / "images" for parent in (folder, folder.parent, folder.parent.parent)]
+        places = places if _below(view.name) else []
         image = next((place / view.name for place in places if os.path.isfile(place / view.name)), None)
         posed.append(PosedImage(view.name, camera, image, view.lens))
     return posed
@@ -145,7 +181,7 @@ def _inria(source: Path, number: int, entry: object) -> PosedImage:
         rotation=rotation,
         translation=-rotation @ record.numbers("position", (3,)),
     )
-    return PosedImage(name, camera, _find_image(source.parent / "images" / name))
+    return PosedImage(name, _checked(camera, f"{source}: {record.where}"), _find_image(source.parent / "images", name))
 
 
 def _transform(source: Path, number: int, shared: dict, entry: object) -> PosedImage:
@@ -153,7 +189,7 @@ def _transform(source: Path, number: int, shared: dict, entry: object) -> PosedI
     own = entry if isinstance(entry, dict) else {}
     record = _Record(source, f"frame {number}", {**shared, **own})
     name = record.text("file_path")
-    image = _find_image(source.parent / name)
+    image = _find_image(source.parent, name)
     lens = _lens(record)
     width, height = record.size("w"), record.size("h")
     if "fl_x" in record.fields:
@@ -178,7 +214,7 @@ def _transform(source: Path, number: int, shared: dict, entry: object) -> PosedI
         rotation=rotation,
         translation=-rotation @ matrix[:3, 3],
     )
-    return PosedImage(name, camera, image, lens)
+    return PosedImage(name, _checked(camera, f"{source}: {record.where}"), image, lens)
 
 
 def _lens(record: _Record) -> Lens | None:
@@ -192,29 +228,26 @@ def _lens(record: _Record) -> Lens | None:
     return Lens.named(model, given)
 
 
-def _find_image(path: Path) -> Path | None:
+def _find_image(folder: Path, name: str) -> Path | None:
+    """The photo ``name`` in ``folder``; None where it is not there: what lies elsewhere is not looked for."""
+    if not _below(name):
+        return None
+    path = folder / name
     # os.path answers False where Path.is_file raises: names too long or not of this world.
     return next((Path(f"{path}{suffix}") for suffix in _IMAGE_SUFFIXES if os.path.isfile(f"{path}{suffix}")), None)
 
 
 def _shared_size(source: Path, tree: dict) -> dict[str, int]:
     """``w`` and ``h`` of sets that leave them out: those of the first photo that can be read."""
-    from PIL import Image
-
     frames = [frame for frame in tree["frames"] if isinstance(frame, dict)]
     if "w" in tree or all("w" in frame for frame in frames):
         return {}
     for frame in frames:
         name = frame.get("file_path")
-        image = _find_image(source.parent / name) if isinstance(name, str) and "\0" not in name else None
-        if image is None:
-            continue
-        try:
-            with Image.open(image) as opened:
-                return {"w": opened.width, "h": opened.height}
-        # The decoder is handed a stranger's bytes, and its errors share no base class.
-        except Exception:
-            continue
+        image = _find_image(source.parent, name) if isinstance(name, str) else None
+        size = picture_size(image, f"{image}: it") if image is not None else None
+        if size is not None:
+            return {"w": size[0], "h": size[1]}
     raise UserError(f"{source}: it has no w and h, and none of its photos can be read; add either")
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.compressed_ply import decode_compressed_ply, is_compressed
+from egs_warp.io.limits import FREE_BYTES, INFLATION, LARGEST_TEXT, read_bytes
 from egs_warp.io.ply import decode_ply, read_header
 from egs_warp.io.raw import EXTREME_LOGIT, RawCapture, check_finite
 from egs_warp.io.sog import SogFiles, decode_sog
@@ -67,13 +68,14 @@ def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
 def _decode(source: Path) -> RawCapture:
     if source.is_dir():
         return _decode_folder(source)
-    data = _read_bytes(source)
+    data = read_bytes(source)
     if data[:4] in (b"ply\n", b"ply\r"):
         header = read_header(data, source)
         return (decode_compressed_ply if is_compressed(header) else decode_ply)(data, header, source)
     if data[:2] == b"\x1f\x8b" or data[:4] == b"NGSP":
         return decode_spz(data, source)
     if data[:2] == b"PK":
+        del data
         return _decode_zip(source)
     if data[:1] == b"{":
         return _decode_meta(source)
@@ -84,17 +86,6 @@ def _decode(source: Path) -> RawCapture:
     raise UserError(
         f"{source}: unknown format (starts with {data[:8]!r}); give a .ply, .spz, .splat, .sog or a SOG folder"
     )
-
-
-def _read_bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError as error:
-        raise UserError(f"{path}: no such file or folder; check the path") from error
-    # ValueError: a path with a null byte.
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        raise UserError(f"{path}: cannot be read ({reason}); check the path and its permissions") from error
 
 
 def _decode_folder(folder: Path) -> RawCapture:
@@ -109,30 +100,42 @@ def _decode_folder(folder: Path) -> RawCapture:
 
 def _decode_meta(meta: Path) -> RawCapture:
     def read(name: str) -> bytes:
-        return _read_bytes(meta.parent / _inside(name, meta))
+        return read_bytes(meta.parent / _inside(name, meta))
 
-    return _decode_sog_or_streamed(meta, _read_bytes(meta), read)
+    return _decode_sog_or_streamed(meta, read_bytes(meta, at_most=LARGEST_TEXT), read)
 
 
 def _decode_zip(source: Path) -> RawCapture:
     # zipfile raises errors of a dozen classes for corrupted archives; every one means the same to the user.
     try:
         with zipfile.ZipFile(source) as archive:
-            content = {name: archive.read(name) for name in archive.namelist() if not name.endswith("/")}
+            members = {info.filename: info for info in archive.infolist() if not info.is_dir()}
+            metas = [name for name in members if PurePosixPath(name).name in (_META, _STREAMED_META)]
+            metas.sort(key=lambda name: (name.count("/"), name))
+            if not metas:
+                raise UserError(
+                    f"{source}: a zip without meta.json; give a .sog, or unpack it if it holds another capture"
+                )
+
+            # Only what is named is inflated, and only to the size that its entry was checked by.
+            def read(name: str) -> bytes:
+                inside = str(PurePosixPath(metas[0]).parent / _inside(name, source))
+                if inside not in members:
+                    raise UserError(f"{source}: {inside} is missing from the zip; copy or export the file again")
+                member = members[inside]
+                text = PurePosixPath(inside).suffix == ".json"
+                if member.file_size > (LARGEST_TEXT if text else INFLATION * member.compress_size + FREE_BYTES):
+                    raise UserError(
+                        f"{source}: {inside} inflates from {member.compress_size} to {member.file_size} bytes, which is"
+                        " more than a capture needs; export it again"
+                    )
+                return archive.read(member)
+
+            return _decode_sog_or_streamed(source, read(PurePosixPath(metas[0]).name), read)
+    except (UserError, MemoryError):
+        raise
     except Exception as error:
         raise UserError(f"{source}: corrupted zip ({error}); copy or export the file again") from error
-    metas = [name for name in content if PurePosixPath(name).name in (_META, _STREAMED_META)]
-    metas.sort(key=lambda name: (name.count("/"), name))
-    if not metas:
-        raise UserError(f"{source}: a zip without meta.json; give a .sog, or unpack it if it holds another capture")
-
-    def read(name: str) -> bytes:
-        inside = str(PurePosixPath(metas[0]).parent / _inside(name, source))
-        if inside not in content:
-            raise UserError(f"{source}: {inside} is missing from the zip; copy or export the file again")
-        return content[inside]
-
-    return _decode_sog_or_streamed(source, content[metas[0]], read)
 
 
 def _decode_sog_or_streamed(source: Path, meta: bytes, read: Callable[[str], bytes]) -> RawCapture:

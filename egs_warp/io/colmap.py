@@ -5,7 +5,10 @@ Public description: https://colmap.github.io/format.html
 
 from __future__ import annotations
 
+import io
 import struct
+from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +16,7 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.lens import Lens
+from egs_warp.io.limits import read_bytes
 
 # Name and parameters of each camera model by its number in the binary format.
 _MODELS = {
@@ -119,10 +123,7 @@ def read_colmap_points(folder: Path) -> SparsePoints | None:
 
 
 def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); a COLMAP model needs it") from error
+    return read_bytes(path, missing="a COLMAP model needs it")
 
 
 def _intrinsics(
@@ -141,11 +142,13 @@ def _intrinsics(
     return _Intrinsics(width, height, fx, fy, values["cx"], values["cy"], Lens.named(model, values))
 
 
-def _text_lines(data: bytes, path: Path) -> list[str]:
+def _text_lines(data: bytes, path: Path) -> Iterator[str]:
+    """One at a time: a list of all would take far more memory than the file."""
     try:
-        return [line for line in data.decode().splitlines() if not line.startswith("#")]
+        text = data.decode()
     except UnicodeDecodeError as error:
         raise UserError(f"{path}: not a text file; export the model again") from error
+    return (line.rstrip("\r\n") for line in io.StringIO(text) if not line.startswith("#"))
 
 
 def _text_cameras(data: bytes, path: Path) -> dict[int, _Intrinsics]:
@@ -165,7 +168,7 @@ def _text_cameras(data: bytes, path: Path) -> dict[int, _Intrinsics]:
 
 def _text_poses(data: bytes, path: Path) -> list[_Pose]:
     poses = []
-    lines = iter(_text_lines(data, path))
+    lines = _text_lines(data, path)
     for line in lines:
         if not line.strip():
             continue
@@ -245,24 +248,25 @@ def _binary_points(data: bytes, path: Path) -> np.ndarray:
     """(n, 6) position and colour."""
     cursor = _Cursor(data, path)
     count = cursor.take("Q")[0]
-    points = []
+    points = array("d")
     for _ in range(count):
         _number, *values = cursor.take("Q3d3Bd")
-        points.append(values[:6])
+        points.extend(values[:6])
         cursor.skip(_TRACK_BYTES * cursor.take("Q")[0])
     return np.array(points, dtype=float).reshape(-1, 6)
 
 
 def _text_points(data: bytes, path: Path) -> np.ndarray:
-    points = []
+    points = array("d")
     for line in _text_lines(data, path):
         words = line.split()
         if not words:
             continue
         try:
-            points.append([float(word) for word in words[1:7]])
-            if len(points[-1]) != 6:
+            values = [float(word) for word in words[1:7]]
+            if len(values) != 6:
                 raise ValueError
+            points.extend(values)
         except ValueError as error:
             raise UserError(f"{path}: malformed point line {line[:60]!r}; export the model again") from error
     return np.array(points, dtype=float).reshape(-1, 6)

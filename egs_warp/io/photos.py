@@ -12,6 +12,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.lens import Straightening
 from egs_warp.io.cameras import PosedImage
+from egs_warp.io.limits import check_pixels, picture_size
 
 _ORIENTATION = 0x0112
 """The EXIF tag that says how a viewer must turn the picture."""
@@ -119,6 +120,9 @@ def decoded(image: Path) -> np.ndarray:
     """(H, W) or (H, W, C) as stored, BGR, not turned. Raises ``UserError`` for what is not a whole picture."""
     from PIL import Image
 
+    size = picture_size(image, f"{image}: it")
+    if size is not None:
+        check_pixels(*size, f"{image}: it")
     pixels = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise UserError(f"{image}: not a readable picture; export it again as PNG or JPEG")
@@ -164,6 +168,14 @@ def _mask_of(image: Path, name: str, shape: tuple[int, ...], turn: int) -> np.nd
     path = next((place for place in places if place.is_file()), None)
     if path is None:
         return None
+    size = picture_size(path, f"{path}: it")
+    if size is None:
+        raise UserError(f"{path}: not a readable picture; export the mask again")
+    if sorted(size) != sorted(shape):
+        raise UserError(
+            f"{path}: {size[0]} x {size[1]} pixels, but its photo has {shape[1]} x {shape[0]};"
+            " make the mask from the same photo"
+        )
     pixels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
         raise UserError(f"{path}: not a readable picture; export the mask again")

@@ -13,7 +13,11 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
+from egs_warp.io.limits import LARGEST_TEXT, read_bytes
 from egs_warp.io.text import whole_number
+
+_MOST_TEXELS = 1 << 13
+"""Rows or columns of a hole's window."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +48,14 @@ class HoleOutline:
         try:
             rows, columns = (int(count) for count in entry["texels"])
             outlines = tuple(np.array(outline, np.int32).reshape(-1, 2) for outline in entry["outlines"])
-            centre = np.array(entry["centre"], dtype=float).reshape(3)
-            return cls(centre, float(entry["texel"]), (rows, columns), outlines)
-        except (TypeError, KeyError, ValueError, OverflowError) as error:
+            centre, texel = np.array(entry["centre"], dtype=float).reshape(3), float(entry["texel"])
+            inside = all((outline >= 0).all() and (outline < [columns, rows]).all() for outline in outlines)
+            if not (1 <= rows <= _MOST_TEXELS and 1 <= columns <= _MOST_TEXELS and inside):
+                raise ValueError
+            if not (0.0 < texel < np.inf and np.isfinite(centre).all()):
+                raise ValueError
+            return cls(centre, texel, (rows, columns), outlines)
+        except (TypeError, KeyError, ValueError, OverflowError, AttributeError) as error:
             raise UserError(f"{path}: its hole is damaged; make it again with egs-warp segment") from error
 
 
@@ -92,15 +101,19 @@ class KnownPlane:
         try:
             normal = np.array(entry["normal"], dtype=float).reshape(3)
             offset = float(entry["offset"])
-        except (TypeError, KeyError, ValueError) as error:
+        except (TypeError, KeyError, ValueError, OverflowError) as error:
             raise UserError(f"{path}: plane {number} needs normal [x, y, z] and offset; make it again") from error
         nx, ny, nz = normal.tolist()
         plane = Plane.from_coefficients(nx, ny, nz, offset)
         try:
+            centre = np.array(entry["centre"], dtype=float).reshape(3) if "centre" in entry else None
+            numbers = {name: float(entry[name]) for name in _NUMBERS if name in entry}
+            if not np.isfinite([*numbers.values(), *(() if centre is None else centre)]).all():
+                raise ValueError
             return cls(
                 plane,
-                centre=np.array(entry["centre"], dtype=float).reshape(3) if "centre" in entry else None,
-                **{name: float(entry[name]) for name in _NUMBERS if name in entry},
+                centre=centre,
+                **numbers,
                 pixels=int(entry["pixels"]) if "pixels" in entry else None,
                 hole=HoleOutline.from_json(entry["hole"], path) if "hole" in entry else None,
                 others={name: value for name, value in entry.items() if name not in ("normal", "offset", *_FACTS)},
@@ -126,10 +139,11 @@ def read_planes(path: Path | str) -> list[KnownPlane]:
     """The planes of a ``plane.json``. Raises ``UserError`` for anything else."""
     path = Path(path)
     try:
-        tree = json.loads(path.read_bytes(), parse_int=whole_number)
-    except FileNotFoundError as error:
-        raise UserError(f"{path}: no such file; make it with egs-warp plane, or give nx,ny,nz,d") from error
-    except (OSError, ValueError, RecursionError) as error:
+        data = read_bytes(path, at_most=LARGEST_TEXT, missing="make it with egs-warp plane, or give nx,ny,nz,d")
+        tree = json.loads(data, parse_int=whole_number)
+    except UserError:
+        raise
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{path}: not readable JSON; make it with egs-warp plane") from error
     entries = tree.get("planes") if isinstance(tree, dict) else None
     if not isinstance(entries, list) or not entries:

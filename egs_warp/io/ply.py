@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import warnings
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.atomic import atomic_write
+from egs_warp.io.limits import read_bytes
 from egs_warp.io.raw import RawCapture, property_names
 
 _TYPES = {
@@ -82,6 +84,9 @@ def read_header(data: bytes, source: Path) -> PlyHeader:
             case _:
                 shown = line[:60].decode("latin-1").strip()
                 raise UserError(f"{source}: malformed .ply header, line {shown!r}; export the file again")
+    names = [name for name, _, _ in elements]
+    if len(set(names)) < len(names):
+        raise UserError(f"{source}: malformed .ply header, an element is there twice; export the file again")
     if byte_order == "":
         raise UserError(f"{source}: malformed .ply header, no format line; export the file again")
     return PlyHeader(byte_order, tuple(_element(source, byte_order, *element) for element in elements), end.end())
@@ -124,17 +129,21 @@ def read_elements(data: bytes, header: PlyHeader, wanted: list[str], source: Pat
 
 
 def _read_text(data: bytes, header: PlyHeader, wanted: list[str], source: Path) -> dict[str, np.ndarray]:
-    lines = [line for line in data[header.size :].splitlines() if line.strip()]
+    # One line at a time: a list of all would take far more memory than the file.
+    lines = re.finditer(rb"[^\r\n]*[^\s][^\r\n]*", memoryview(data)[header.size :])
     found: dict[str, np.ndarray] = {}
-    start = 0
+    end = 0
     for element in header.elements:
-        rows = lines[start : start + element.count]
-        start += element.count
+        if not set(wanted) - set(found):
+            break
+        count, start = 0, end
+        for line in islice(lines, element.count):
+            count, end = count + 1, line.end()
         if element.name not in wanted or element.dtype is None:
             continue
-        if len(rows) < element.count:
+        if count < element.count:
             raise UserError(
-                f"{source}: truncated: element {element.name} needs {element.count} lines, found {len(rows)}; "
+                f"{source}: truncated: element {element.name} needs {element.count} lines, found {count}; "
                 "copy or export it again"
             )
         columns = len(element.dtype.names or ())
@@ -142,18 +151,15 @@ def _read_text(data: bytes, header: PlyHeader, wanted: list[str], source: Path) 
             # numpy only warns of text that is not a number; newer ones raise ValueError.
             warnings.simplefilter("error", DeprecationWarning)
             try:
-                values = np.fromstring(b" ".join(rows), dtype=np.float64, sep=" ")  # pyright: ignore[reportCallIssue, reportArgumentType]
+                rows = bytes(memoryview(data)[header.size + start : header.size + end])
+                values = np.fromstring(rows, dtype=np.float64, sep=" ")  # pyright: ignore[reportCallIssue, reportArgumentType]
             except (DeprecationWarning, ValueError):
                 values = np.empty(0)
         if len(values) != element.count * columns:
             raise UserError(
                 f"{source}: element {element.name} is not {element.count} lines of {columns} numbers; export it again"
             )
-        table = values.reshape(element.count, columns)
-        structured = np.empty(element.count, [(name, "f8") for name in element.dtype.names or ()])
-        for i, name in enumerate(element.dtype.names or ()):
-            structured[name] = table[:, i]
-        found[element.name] = structured
+        found[element.name] = values.view([(name, "f8") for name in element.dtype.names or ()])
     return found
 
 
@@ -202,10 +208,7 @@ def read_point_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
     Raises ``UserError`` for one that is malformed or has no positions.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+    data = read_bytes(path)
     rows = read_elements(data, read_header(data, path), ["vertex"], path).get("vertex")
     names = () if rows is None else rows.dtype.names or ()
     if rows is None or not {"x", "y", "z"} <= set(names):

@@ -16,10 +16,14 @@ from pathlib import Path
 import numpy as np
 
 from egs_warp.errors import UserError
+from egs_warp.io.limits import check_count, check_pixels, picture_size
 from egs_warp.io.raw import RawCapture, largest_restored, logits_from_bytes
 
 _SH_COUNTS = (0, 3, 8, 15)
 LABELS_PER_ROW = 64
+_MOST_LABELS = 1 << 16
+_SPARE, _FREE_PIXELS = 2, 1 << 12
+"""A picture has at most so many pixels a value, and so many more."""
 FIRST_TAG = 252
 
 
@@ -32,16 +36,19 @@ class SogFiles:
     read: Callable[[str], bytes]
     """The bytes of a file by its name in meta.json; raises ``UserError`` where it is missing or corrupted."""
 
-    def image(self, name: str) -> np.ndarray:
-        """(pixels, 4) uint8 RGBA of an image, row by row from the top, and nothing lost."""
-        return self.image_rows(name).reshape(-1, 4)
+    def image(self, name: str, count: int) -> np.ndarray:
+        """(pixels, 4) uint8 RGBA of an image of ``count`` values, row by row from the top, and nothing lost."""
+        return self.image_rows(name, at_most=_SPARE * count + _FREE_PIXELS).reshape(-1, 4)
 
-    def image_rows(self, name: str) -> np.ndarray:
-        """(height, width, 4) uint8 RGBA of an image."""
+    def image_rows(self, name: str, *, at_most: int) -> np.ndarray:
+        """(height, width, 4) uint8 RGBA of an image of at most so many pixels."""
         # Imported here because only this format needs it.
         from PIL import Image
 
         data = self.read(name)
+        size = picture_size(data, f"{self.source}: {name}")
+        if size is not None:
+            check_pixels(*size, f"{self.source}: {name}", at_most=at_most)
         try:
             with Image.open(io.BytesIO(data)) as image:
                 return np.asarray(image.convert("RGBA"))
@@ -111,8 +118,10 @@ def decode_sog(meta_json: bytes, files: SogFiles) -> RawCapture:
         raise UserError(f"{files.source}: SOG version {version}, expected 1 or 2; export it as version 2 or as .ply")
     count = meta.integer("count") if version == 2 else max(0, int(meta.numbers("means", "shape", count=2)[0]))
 
+    check_count(count, sum(len(files.read(name)) for name in meta.files("means", 2)), files.source)
+
     def pixels(name: str) -> np.ndarray:
-        found = files.image(name)
+        found = files.image(name, count)
         if len(found) < count:
             raise UserError(
                 f"{files.source}: truncated: {count} Gaussians, but {name} has {len(found)} pixels; export it again"
@@ -168,7 +177,7 @@ def _decode_quaternions(pixels: np.ndarray) -> np.ndarray:
 def _decode_rest(meta: SogMeta, files: SogFiles, version: int, pixels: Callable[[str], np.ndarray]) -> np.ndarray:
     """(n, K-1, 3): a palette of coefficient sets, 64 to a row of the image, and each Gaussian's place in it."""
     centroids_name, labels_name = meta.files("shN", 2)
-    centroids = files.image_rows(centroids_name)[:, :, :3]
+    centroids = files.image_rows(centroids_name, at_most=_MOST_LABELS * max(_SH_COUNTS))[:, :, :3]
     height, width = centroids.shape[:2]
     coefficients = width // LABELS_PER_ROW
     if version == 2:

@@ -17,6 +17,7 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.atomic import atomic_write
+from egs_warp.io.limits import check_count
 from egs_warp.io.raw import (
     RawCapture,
     byte,
@@ -32,6 +33,7 @@ _COLOUR_SCALE = 0.15
 _FRACTIONAL_BITS = 12
 _ANTIALIASED, _HAS_EXTENSIONS = 1, 2
 _LONGEST_EXTENSION = 1 << 20
+_MOST_FRACTIONAL_BITS = 24
 _SH_COUNTS = (0, 3, 8, 15, 24)
 _KEPT_SH_COUNT = 15
 # Bits kept of each higher SH number, as the reference writer does: the rest would only cost gzip size.
@@ -64,9 +66,7 @@ def decode_spz(data: bytes, source: Path) -> RawCapture:
     header = _inflated(inflate, data, _HEADER.size, source) if gzipped else data[: _HEADER.size]
     layout = _layout(header, gzipped, source)
     if gzipped:
-        # A byte cannot deflate to less than 1/1032 of itself: refuse a count that this file cannot hold.
-        if layout.size > 1032 * len(data) + _HEADER.size:
-            raise _truncated(source, layout, f"{len(data)} compressed")
+        check_count(layout.count, len(data), source)
         body = header + _inflated(inflate, inflate.unconsumed_tail, layout.size - len(header), source)
         # zlib compares the checksum only where it comes to the end of the stream.
         _inflated(inflate, inflate.unconsumed_tail, _LONGEST_EXTENSION, source)
@@ -109,6 +109,10 @@ def _layout(header: bytes, gzipped: bool, source: Path) -> _Layout:
         raise UserError(f"{source}: .spz version {version}, expected 1, 2 or 3; export it as version 3 or as .ply")
     if degree >= len(_SH_COUNTS):
         raise UserError(f"{source}: .spz with SH degree {degree}, expected 0 to 4; export it again")
+    if version > 1 and fractional_bits > _MOST_FRACTIONAL_BITS:
+        raise UserError(
+            f"{source}: .spz with {fractional_bits} fractional bits of the 24 of a position; export it again"
+        )
     return _Layout(version, count, _SH_COUNTS[degree], fractional_bits, flags)
 
 

@@ -6,6 +6,7 @@ the finest; each leaf is read at the finest level it has.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import PurePosixPath
 
@@ -22,6 +23,8 @@ def decode_streamed_sog(meta_json: bytes, files: SogFiles) -> RawCapture:
     names, tree = meta.entry("filenames"), meta.entry("tree")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or not isinstance(tree, dict):
         raise UserError(f"{files.source}: lod-meta.json has no filenames and tree; export the capture again")
+    if len({PurePosixPath(name) for name in names}) < len(names):
+        raise UserError(f"{files.source}: lod-meta.json names a file twice; export the capture again")
     ranges: dict[int, list[tuple[int, int]]] = {}
     for file, start, count in _leaves(tree, files):
         if file >= len(names):
@@ -42,7 +45,7 @@ def _leaves(tree: dict, files: SogFiles) -> Iterator[tuple[int, int, int]]:
         if not isinstance(children, list) or not isinstance(levels, dict | None):
             raise UserError(f"{files.source}: malformed tree in lod-meta.json; export the capture again")
         stack.extend(reversed(children))
-        known = [level for level in levels or {} if level.isdecimal()]
+        known = [level for level in levels or {} if re.fullmatch(r"[0-9]{1,4}", level)]
         if known:
             leaf = (levels or {})[min(known, key=int)]
             values = [leaf.get(key) for key in ("file", "offset", "count")] if isinstance(leaf, dict) else []
@@ -59,6 +62,9 @@ def _part(files: SogFiles, name: str, ranges: list[tuple[int, int]]) -> RawCaptu
     part = decode_sog(files.read(name), SogFiles(files.source, lambda file: files.read(str(folder / file))))
     if max(end for _, end in ranges) > len(part.means):
         raise UserError(f"{files.source}: truncated: {name} has {len(part.means)} Gaussians; export the capture again")
+    # Before an index is made of each: leaves that overlap may be many.
+    if sum(end - start for start, end in ranges) > len(part.means):
+        raise UserError(f"{files.source}: leaves of {name} overlap in lod-meta.json; export the capture again")
     chosen = np.concatenate([np.arange(start, end) for start, end in ranges])
     return RawCapture(
         format=part.format,

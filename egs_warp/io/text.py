@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from egs_warp.errors import UserError
+from egs_warp.io.limits import LARGEST_TEXT, read_bytes
 
 _EXACT_DIGITS = 15
 """Whole numbers of so many digits are exact as floats, too."""
@@ -15,13 +16,9 @@ _EXACT_DIGITS = 15
 def read_text(path: Path | str) -> str:
     """The text of a file. Raises ``UserError`` where there is none."""
     try:
-        return Path(path).read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); check the path") from None
+        return read_bytes(path, at_most=LARGEST_TEXT).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise UserError(f"{path}: not a text file (UTF-8)") from None
-    except ValueError:
-        raise UserError(f"{path}: no file can have this name; check the path") from None
 
 
 def whole_number(digits: str) -> int | float:

@@ -86,7 +86,10 @@ def test_without_cameras_a_ring_is_used_and_written(folder: Path, tmp_path: Path
     ("flags", "message"),
     [
         ([], "segment: give --object"),
-        (["--object", "0,0,0.5", "--plane", "{tmp}/no.json"], "no.json: no such file; make it with egs-warp plane"),
+        (
+            ["--object", "0,0,0.5", "--plane", "{tmp}/no.json"],
+            "no.json: no such file or folder; make it with",
+        ),
         (["--object", "0,0,0.5", "--plane", "0,0,1,-5"], "nothing of it lies above the plane"),
         (["--object", "0,0,0.5", "--plane", "0,0,1,0.9"], "it touches no plane: its lowest part is"),
         (["--object", "0,0,0.5", "--cameras", "{folder}/away.json"], "no camera sees it around the object"),

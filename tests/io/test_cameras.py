@@ -322,7 +322,7 @@ def test_bad_colmap(tmp_path: Path) -> None:
     colmap_text(tmp_path, camera="3 PINHOLE wide")
     assert message(tmp_path) == "cameras.txt: malformed camera line '3 PINHOLE wide'; export the model again"
     (tmp_path / "cameras.txt").unlink()
-    assert message(tmp_path) == "cameras.txt: cannot be read (No such file or directory); a COLMAP model needs it"
+    assert message(tmp_path) == "cameras.txt: no such file or folder; a COLMAP model needs it"
     colmap_binary(tmp_path)
     data = (tmp_path / "images.bin").read_bytes()
     (tmp_path / "images.bin").write_bytes(data[:-30])

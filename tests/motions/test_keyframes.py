@@ -142,9 +142,9 @@ def test_malformed_csv(tmp_path: Path, content: str, message: str) -> None:
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"key frames are read from \.json or \.csv"):
         read_keyframes(tmp_path / "k.txt")
-    with pytest.raises(UserError, match=r"none.csv: cannot be read \(No such file or directory\)"):
+    with pytest.raises(UserError, match=r"none.csv: no such file or folder; check the path"):
         read_keyframes(tmp_path / "none.csv")
-    with pytest.raises(UserError, match=r"a\\x00.json: no file can have this name"):
+    with pytest.raises(UserError, match=r"a\\x00.json: cannot be read"):
         read_keyframes(Path("a\0.json"))
     (tmp_path / "k.json").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(UserError, match="not a text file"):

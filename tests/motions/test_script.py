@@ -56,7 +56,7 @@ def test_a_json_script_is_the_same_as_its_line(tmp_path: Path) -> None:
         ("jump x" + 5000 * "9", "repeat inf; give a whole number from 1 to 100"),
         ("jump distance=1 distance=2", "distance is given twice; give it once"),
         ("jump 1 distance=2", "distance is given twice; give it once"),
-        ("none.json", "none.json: cannot be read (No such file or directory); check the path"),
+        ("none.json", "none.json: no such file or folder; check the path"),
     ],
 )
 def test_mistakes_of_a_line(line: str, message: str) -> None:

@@ -120,7 +120,7 @@ def test_each_malformed_entry_is_refused_in_one_line(tmp_path: Path, content: An
 
 
 def test_unreadable_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"none\.json: cannot be read"):
+    with pytest.raises(UserError, match=r"none\.json: no such file or folder"):
         read_muscles(tmp_path / "none.json", MESH, body_weight=1.0)
     (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(UserError, match=r"binary\.json: not a text file"):

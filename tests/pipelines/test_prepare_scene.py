@@ -40,9 +40,9 @@ def prepared() -> PreparedScene:
     [
         (["--motion", "nothing"], "unknown motion 'nothing'"),
         (["--motion", "twist 180", "--distance", "nan"], "--distance nan"),
-        (["--motion", "trajectory {tmp}/no.json"], "no.json: cannot be read"),
-        (["--muscles", "{tmp}/no.json"], "no.json: cannot be read"),
-        (["--terrain", "{tmp}/no.json"], "no.json: cannot be read"),
+        (["--motion", "trajectory {tmp}/no.json"], "no.json: no such file or folder"),
+        (["--muscles", "{tmp}/no.json"], "no.json: no such file or folder"),
+        (["--terrain", "{tmp}/no.json"], "no.json: no such file or folder"),
         (["--inpainter", "lama"], "--inpainter lama: give patch, telea, ns or an ONNX file"),
         (["--inpainter", "ns", "--no-inpaint"], "--inpainter: --no-inpaint leaves the floor as captured"),
         (["--object", ""], "--object: nothing is given; give a mask.png"),
