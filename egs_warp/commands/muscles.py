@@ -39,6 +39,8 @@ def _muscles(chosen: argparse.Namespace) -> int:
     up = parse_up(chosen.up) if chosen.up else None
     plane = plane_of(chosen.plane) if chosen.plane else None
     capture = read_capture(chosen.capture)
+    for note in capture.notes:
+        say(note)
     if plane is None and up is None:
         up, note = guessed_up(capture)
         say(note)

@@ -13,6 +13,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.compressed_ply import decode_compressed_ply, is_compressed
 from egs_warp.io.limits import FREE_BYTES, INFLATION, LARGEST_TEXT, read_bytes
+from egs_warp.io.outliers import without_outliers
 from egs_warp.io.ply import decode_ply, read_header
 from egs_warp.io.raw import EXTREME_LOGIT, RawCapture, check_finite
 from egs_warp.io.sog import SogFiles, decode_sog
@@ -32,8 +33,8 @@ class Capture:
     format: str
     """For the user, such as ``.spz version 2``."""
     infinite_opacities: int
-    """Gaussians whose opacity logit is infinite in the file (opacity 0 or 1); read as -16 or +16. Formats that store
-    opacity in a byte have none: their 0 and 255 stand for ranges."""
+    """Gaussians whose opacity logit is infinite in the file (opacity 0 or 1), or beyond 500; read as -16 or +16.
+    Formats that store opacity in a byte have none: their 0 and 255 stand for ranges."""
     up: np.ndarray | None
     """(3,) float64 unit vector where the format defines which way is up, else None."""
     antialiased: bool
@@ -53,6 +54,7 @@ def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
     with np.errstate(over="ignore", invalid="ignore"):
         raw = _decode(source)
     check_finite(raw, source)
+    raw = without_outliers(raw, source)
     infinite = np.isinf(raw.opacity_logits)
     cloud = GaussianCloud.from_numpy(
         raw.means,

@@ -38,6 +38,8 @@ _SAME_FRAME = BodyFrame(np.eye(3), np.zeros(3), 1.0)
 _COMMON_KEYS = {"name", "kind", "strength", "stiffness", "group", "mirror"}
 _FILE_KEYS = {"fibres", "max_strain", "mirror_plane"}
 _DEFAULT_STRENGTH = 2.0
+_LARGEST = {"strength": 1e3, "stiffness": 1e9}
+"""Body weights and N/m: what is far stiffer than steel cables leaves the solver no digits."""
 _MAX_OUTSIDE_EDGES = 1.5
 
 
@@ -229,8 +231,10 @@ def _direction(where: str, entry: dict[str, Any], key: str) -> np.ndarray:
 
 def _positive(where: str, entry: dict[str, Any], key: str, default: float | None) -> float:
     value = entry.get(key, default)
-    if not _is_number(value) or value <= 0:
-        raise UserError(f'{where}: "{key}" is {json.dumps(value)}; give a number above 0')
+    most = _LARGEST.get(key, np.inf)
+    if not _is_number(value) or not 0 < value <= most:
+        upto = "" if most == np.inf else f", at most {most:g}"
+        raise UserError(f'{where}: "{key}" is {json.dumps(value)}; give a number above 0{upto}')
     return float(value)
 
 

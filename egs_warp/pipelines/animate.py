@@ -21,6 +21,7 @@ from egs_warp.pipelines import drawn
 from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.drawn import DrawnCreature
 from egs_warp.pipelines.film import Film, draw_film
+from egs_warp.pipelines.oddities import oddities
 from egs_warp.pipelines.performance import Performance, simulate
 from egs_warp.pipelines.report import (
     CageFacts,
@@ -128,6 +129,7 @@ def animate(
             settings=settings,
         )
         bar.update()
+    notes = (*notes, *oddities(creature.cloud, creature.cage.mesh, creature.body.height))
     with tqdm(total=options.frames or cut_off, desc="simulate", unit="frame", disable=quiet) as bar:
         performance = simulate(creature, asked, frames=options.frames, forward=forward, progress=lambda _: bar.update())
     film = draw_film(

@@ -1,0 +1,103 @@
+"""One bad Gaussian does not spoil a capture: it is left out, and told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.io import read_capture, write_ply
+from tests.support.captures import assert_same_bits, make_cloud, message
+
+GOOD = make_cloud(50, 1)
+_CHANGED = ("means", "log_scales", "opacity_logits", "rotations")
+
+
+def spoiled(path: Path, rows: slice | list[int], *, sh: float = 0.0, **values: float) -> Path:
+    """``GOOD`` on disk with values of some rows replaced."""
+    arrays = {
+        name: getattr(GOOD, name).numpy().copy() for name in ("means", "log_scales", "opacity_logits", "rotations")
+    }
+    for name, value in values.items():
+        arrays[name][rows] = value
+    coefficients = GOOD.sh.numpy().copy()
+    coefficients[rows, -1] += np.float32(sh)
+    write_ply(path, GaussianCloud.from_numpy(sh=coefficients, device="cpu", **arrays))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"means": 1e19}, "lie further than 10000 sizes of the capture out"),
+        ({"means": 3e38}, "lie further than 10000 sizes of the capture out"),
+        ({"means": 1e6}, "lie further than 10000 sizes of the capture out"),
+        ({"log_scales": 60.0}, "are larger than 100 sizes of the capture"),
+        ({"log_scales": 8.0}, "are larger than 100 sizes of the capture"),
+        ({"log_scales": 3e38}, "are larger than 100 sizes of the capture"),
+        ({"sh": 1e6}, "have a colour beyond 1000"),
+        (
+            {"means": 1e19, "log_scales": 60.0},
+            "lie further than 10000 sizes of the capture out or are larger than 100 sizes of the capture",
+        ),
+    ],
+)
+def test_outliers_are_left_out_and_told(values: dict[str, float], said: str, tmp_path: Path) -> None:
+    capture = read_capture(spoiled(tmp_path / "a.ply", [3, 7, 11, 20], **values), device="cpu")
+    rest = np.ones(50, bool)
+    rest[[3, 7, 11, 20]] = False
+    assert_same_bits(capture.cloud, GOOD.subset(rest))
+    assert capture.notes[0].startswith(
+        f"4 Gaussians left out that {said} (number 3, 7, 11, ...; the capture's size is "
+    )
+
+
+def test_a_capture_of_outliers_is_refused(tmp_path: Path) -> None:
+    path = spoiled(tmp_path / "a.ply", slice(0, 30), sh=1e6)
+    assert message(path) == "30 of 50 Gaussians have a colour beyond 1000; export it again"
+    path = spoiled(tmp_path / "a.ply", slice(0, 50), means=3e38)
+    assert message(path) == "it reaches 3e+38 units out, at most 1e+12 are read; export it again"
+    path = spoiled(tmp_path / "a.ply", slice(0, 50), log_scales=200.0)
+    assert message(path).startswith("it reaches 7.23e+86 units out")
+
+
+def test_values_that_single_precision_cannot_use_are_told(tmp_path: Path) -> None:
+    path = spoiled(tmp_path / "a.ply", [5, 6], log_scales=-3e38, opacity_logits=-1e30)
+    capture = read_capture(path, device="cpu")
+    assert capture.notes == ("2 Gaussians with a log scale below -100 read as that",)
+    assert capture.infinite_opacities == 2
+    assert (capture.cloud.log_scales.numpy()[[5, 6]] == -100.0).all()
+    assert (capture.cloud.opacity_logits.numpy()[[5, 6]] == -16.0).all()
+
+
+def test_a_wide_capture_keeps_its_sky(tmp_path: Path) -> None:
+    """Skies lie some hundred sizes out, and their Gaussians are as large as the scene."""
+    path = spoiled(tmp_path / "a.ply", [1, 2], means=800.0, log_scales=3.0)
+    capture = read_capture(path, device="cpu")
+    assert capture.cloud.count == 50 and capture.notes == ()
+
+
+def test_few_gaussians_and_flat_captures_have_no_outliers(tmp_path: Path) -> None:
+    for cloud in (make_cloud(1), make_cloud(2), make_cloud(3)):
+        write_ply(tmp_path / "a.ply", cloud)
+        assert_same_bits(read_capture(tmp_path / "a.ply", device="cpu").cloud, cloud)
+    one_place = spoiled(tmp_path / "a.ply", slice(0, 50), means=0.0)
+    assert read_capture(one_place, device="cpu").cloud.count == 50
+
+
+def test_bounds_do_not_hang_on_the_order_or_the_unit(tmp_path: Path) -> None:
+    cloud = read_capture(spoiled(tmp_path / "a.ply", [3], means=1e6), device="cpu").cloud
+    for factor in (1e-3, 1e3):
+        write_ply(tmp_path / "b.ply", read_all(spoiled(tmp_path / "a.ply", [3], means=1e6)).scaled(factor))
+        assert read_capture(tmp_path / "b.ply", device="cpu").cloud.count == cloud.count == 49
+
+
+def read_all(path: Path) -> GaussianCloud:
+    """Outliers among them."""
+    from egs_warp.io.ply import decode_ply, read_header
+
+    data = path.read_bytes()
+    raw = decode_ply(data, read_header(data, path), path)
+    return GaussianCloud.from_numpy(raw.means, raw.rotations, raw.log_scales, raw.opacity_logits, raw.sh, device="cpu")
