@@ -12,7 +12,7 @@ from egs_warp.version import __version__
 
 if TYPE_CHECKING:
     from egs_warp.assets.scene import BUILT_IN_SCENES, Scene, scene
-    from egs_warp.commands.flags import one_line_errors
+    from egs_warp.commands.endings import one_line_errors
     from egs_warp.deformation.deformer import Deformer
     from egs_warp.deformation.embedding import embed_gaussians
     from egs_warp.errors import ArgumentError, UserError
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 _HOMES: dict[str, tuple[str, ...]] = {
     "assets.scene": ("BUILT_IN_SCENES", "Scene", "scene"),
-    "commands.flags": ("one_line_errors",),
+    "commands.endings": ("one_line_errors",),
     "deformation.deformer": ("Deformer",),
     "deformation.embedding": ("embed_gaussians",),
     "errors": ("ArgumentError", "UserError"),

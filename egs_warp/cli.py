@@ -10,19 +10,20 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from egs_warp.commands import COMMANDS
-from egs_warp.commands.flags import flag_of
-from egs_warp.errors import UserError
+from egs_warp.commands.endings import Ended, one_line_errors
+from egs_warp.version import __version__
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; bad input prints one line and returns 2."""
-    parser = _parser()
-    chosen = parser.parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
+    """Run the command; whatever stops it prints one line (``commands.endings``) and is told by the status."""
     try:
-        return chosen.run(chosen)
-    except UserError as error:
-        print(f"egs-warp: {error.told(flag_of)}", file=sys.stderr)
-        return 2
+        with one_line_errors("egs-warp"):
+            given = sys.argv[1:] if arguments is None else arguments
+            chosen = _parser().parse_args(_joined(given))
+            return chosen.run(chosen)
+    except Ended as ended:
+        assert isinstance(ended.code, int)
+        return ended.code
 
 
 class _Parser(argparse.ArgumentParser):
@@ -46,6 +47,7 @@ def _joined(arguments: Sequence[str]) -> list[str]:
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="egs-warp", description="Still objects in 3DGS captures walk, jump and twist.")
+    parser.add_argument("--version", action="version", version=f"egs-warp {__version__}")
     subparsers = parser.add_subparsers(dest="command", required=True)
     for name in COMMANDS:
         importlib.import_module(f"egs_warp.commands.{name}").add_parser(subparsers)

@@ -9,23 +9,27 @@ from __future__ import annotations
 import math
 import os
 import sys
+import tempfile
 import threading
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, nullcontext
 from functools import cache
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 import warp as wp
 
-from egs_warp.errors import ArgumentError
+from egs_warp.errors import ArgumentError, UserError
 
 Shape: TypeAlias = int | tuple[int, ...]
 Device: TypeAlias = wp.Device | str | None
 """A device or its name; None is Warp's current one."""
 
+_NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 _MIN_ROWS_PER_CHUNK = 2048
 """Below this many light rows a launch's own cost (about 20 us) is no longer small against its work."""
 
@@ -42,11 +46,45 @@ def available_threads() -> int:
 
 
 def use_device(device: str) -> None:
-    """Called first by programs: raises ``UserError`` where Warp sees no such device, and leaves Warp only its
-    warnings."""
+    """Called first by programs: raises ``UserError`` where Warp sees no such device or has no place for its kernels,
+    and leaves Warp only its warnings."""
     wp.config.log_level = wp.LOG_WARNING
+    try:
+        with _without_driver_warning() if device == "cpu" else nullcontext():
+            wp.init()
+    except OSError as error:
+        place = error.filename or wp.config.kernel_cache_dir
+        raise UserError(
+            f"kernel cache {place}: cannot be made ({error.strerror}); set WARP_CACHE_PATH to a folder that can be"
+            " written"
+        ) from error
     if device not in (devices := [str(known) for known in wp.get_devices()]):
         raise ArgumentError("device", f"this machine has {', '.join(devices)}", value=device)
+
+
+@contextmanager
+def _without_driver_warning() -> Iterator[None]:
+    """Warp's native code warns those, too, who ask for no GPU that there is no driver, past Python's own streams."""
+    with ExitStack() as files:
+        try:
+            said = files.enter_context(tempfile.TemporaryFile())
+            kept = os.dup(2)
+        except OSError:
+            yield
+            return
+        files.callback(os.close, kept)
+        os.dup2(said.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            said.seek(0)
+            os.write(2, b"".join(line for line in said if _NO_DRIVER not in line))
+
+
+def kernels_are_compiled() -> bool:
+    """Whether some of this package's kernels lie in Warp's cache; call ``use_device`` before."""
+    return any(Path(wp.config.kernel_cache_dir or ".").glob("wp_egs_warp.*"))
 
 
 def launch_rows(

@@ -32,6 +32,7 @@ def main(arguments: list[str] | None = None) -> egs.Report:
         background=built_in.background,
         forward=np.array([1.0, 0.0, 0.0]),
         options=options,
+        overwrite=True,
         source="pawn",
     )
     print(report.summary())

@@ -24,6 +24,7 @@ def main(arguments: list[str] | None = None) -> egs.Report:
         chosen.out,
         plane=built_in.plane,
         options=options,
+        overwrite=True,
         source="pawn",
     )
     print(report.summary())

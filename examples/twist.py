@@ -26,6 +26,7 @@ def main(arguments: list[str] | None = None) -> egs.Report:
         motion="twist",
         plane=built_in.plane,
         options=options,
+        overwrite=True,
         source="pawn",
     )
     print(report.summary())

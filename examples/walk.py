@@ -27,6 +27,7 @@ def main(arguments: list[str] | None = None) -> egs.Report:
         motion=f"walk {chosen.steps} {chosen.step_length}",
         plane=built_in.plane,
         options=options,
+        overwrite=True,
         source="stool",
     )
     print(report.summary())

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from egs_warp.commands.flags import flag_of, one_line_errors
+from egs_warp.commands.endings import one_line_errors
+from egs_warp.commands.flags import flag_of
 from egs_warp.errors import ArgumentError, UserError
 
 PACKAGE = Path(__file__).parents[1] / "egs_warp"

@@ -11,14 +11,17 @@ from egs_warp.commands.flags import (
     add_inpainter_flags,
     chosen_inpainter,
     guessed_up,
+    named_path,
     parse_direction,
     parse_up,
 )
-from egs_warp.commands.scene_flags import SceneInput, add_object_flags, plane_of, read_scene, say
+from egs_warp.commands.scene_flags import add_object_flags, say, start
 from egs_warp.commands.segment import add_straddling_flag, clearing_of
 from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
+    from egs_warp.commands.scene_input import SceneInput
+    from egs_warp.io.run_folder import RunFolder
     from egs_warp.pipelines.prepare_scene import PreparedScene
     from egs_warp.pipelines.report import Report
 
@@ -32,7 +35,7 @@ def add_parser(commands: Commands) -> None:
         default="jump",
         help='jump (default), hop, twist, walk, several as "hop x3, twist 180", or a script.json',
     )
-    animate.add_argument("--out", required=True, type=Path, help="folder for video, sheet, report and trajectory")
+    animate.add_argument("--out", required=True, type=named_path, help="folder for video, sheet, report and trajectory")
     animate.add_argument("--up", help="axis that points up: x, y, z or with a minus, as --up=-y; else it is guessed")
     animate.add_argument(
         "--plane", help="nx,ny,nz,d of the ground n.x + d = 0 in the capture's units, or a plane.json; else it is found"
@@ -51,10 +54,12 @@ def add_parser(commands: Commands) -> None:
     animate.add_argument("--forward", help="x,y,z or an axis: the way of motions; else along the feet")
     animate.add_argument("--gravity-up", help="x,y,z or an axis: against gravity, if the ground is a slope")
     animate.add_argument(
-        "--terrain", type=Path, help="JSON with steps and walls: solids as lists of faces [nx,ny,nz,d]"
+        "--terrain", type=named_path, help="JSON with steps and walls: solids as lists of faces [nx,ny,nz,d]"
     )
     animate.add_argument(
-        "--muscles", type=Path, help="JSON with fibres (docs/motions/muscles.md); else they are made automatically"
+        "--muscles",
+        type=named_path,
+        help="JSON with fibres (docs/motions/muscles.md); else they are made automatically",
     )
     animate.add_argument("--distance", type=float, help="body heights: of a jump (0.5), hop (0.7) or twist (0)")
     animate.add_argument(
@@ -69,10 +74,16 @@ def add_parser(commands: Commands) -> None:
     animate.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
     animate.add_argument("--metres-per-unit", type=float, help="true scale; else the body is 1 m tall")
     animate.add_argument("--friction", type=float, help="Coulomb coefficient (0.8)")
+    animate.add_argument(
+        "--overwrite", action="store_true", help="move an earlier run in --out aside, into earlier-1, earlier-2, ..."
+    )
     animate.set_defaults(run=_animate)
 
 
 def _animate(chosen: argparse.Namespace) -> int:
+    from egs_warp.io.run_folder import check_run_folder
+
+    check_run_folder(chosen.out, overwrite=chosen.overwrite)
     report, more = _animate_scene(chosen) if chosen.object is not None else _animate_capture(chosen)
     print(report.summary())
     print(f"wrote the video, sheet.png, report.json, trajectory.npz{more} into {chosen.out}")
@@ -81,15 +92,17 @@ def _animate(chosen: argparse.Namespace) -> int:
 
 def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
     """A capture that is the object alone; returns the report, and what was written besides."""
+    from egs_warp.commands.scene_input import plane_of
     from egs_warp.io import read_capture
-    from egs_warp.launching import use_device
+    from egs_warp.io.video import ffmpeg_program
     from egs_warp.pipelines.animate import animate
 
     for name in ("cameras", "view", "straddling", "inpainter", "trust", "no_inpaint"):
         if getattr(chosen, name) not in (None, False):
             raise UserError(f"--{name.replace('_', '-')}: needs --object, which says what to take out of a scene")
     asked = _asked(chosen)
-    use_device(chosen.device)
+    ffmpeg_program()
+    start(chosen.device)
     up = parse_up(chosen.up) if chosen.up is not None else None
     plane = plane_of(chosen.plane) if chosen.plane is not None else None
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
@@ -110,6 +123,7 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
         background=background,
         view_from=view_from,
         notes=tuple(notes),
+        overwrite=chosen.overwrite,
         **asked,
     )
     return report, ""
@@ -117,8 +131,9 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
 
 def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
     """The object of a scene, cut out of it, over the rest of the scene."""
-    from egs_warp.io.atomic import writable_folder
-    from egs_warp.launching import use_device
+    from egs_warp.commands.scene_input import read_scene
+    from egs_warp.io.run_folder import run_folder
+    from egs_warp.io.video import ffmpeg_program
     from egs_warp.pipelines.animate import animate
     from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene, viewing_direction
     from egs_warp.training.photo_colours import photographs_in_colours_of
@@ -128,39 +143,43 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
     if chosen.inpainter is not None and chosen.no_inpaint:
         raise UserError("--inpainter: --no-inpaint leaves the floor as captured; leave one of them out")
     asked = _asked(chosen)
-    use_device(chosen.device)
+    ffmpeg_program()
+    start(chosen.device)
     inpainter = chosen_inpainter(chosen)
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
     given = read_scene(chosen)
-    folder = writable_folder(chosen.out)
-    scene = prepare_scene(
-        given.cloud,
-        given.object,
-        cameras=given.cameras,
-        photographs=photographs_in_colours_of(given.cloud, given.posed),
-        up=given.up,
-        plane=given.plane,
-        options=SceneOptions(clearing=clearing_of(chosen), inpaint=not chosen.no_inpaint, inpainter=inpainter),
-        progress=lambda stage: say(f"{stage} ..."),
-    )
-    # Whatever goes wrong later, the minutes that these took are not lost.
-    scene.write(folder)
-    pictures = _write_pictures(folder, given, scene)
-    for note in scene.notes:
-        say(note)
-    report = animate(
-        scene.object,
-        folder,
-        plane=scene.plane,
-        background=scene.background,
-        view_from=view_from if view_from is not None else viewing_direction(scene, given.cameras),
-        notes=(*given.notes, *scene.notes),
-        **asked,
-    )
+    with run_folder(chosen.out, overwrite=chosen.overwrite) as run:
+        scene = prepare_scene(
+            given.cloud,
+            given.object,
+            cameras=given.cameras,
+            photographs=photographs_in_colours_of(given.cloud, given.posed),
+            up=given.up,
+            plane=given.plane,
+            options=SceneOptions(clearing=clearing_of(chosen), inpaint=not chosen.no_inpaint, inpainter=inpainter),
+            progress=lambda stage: say(f"{stage} ..."),
+        )
+        # Whatever goes wrong later, the minutes that these took are not lost.
+        for name in ("object.ply", "background.ply", "plane.json"):
+            run.file(name)
+        scene.write(run.path)
+        pictures = _write_pictures(run, given, scene)
+        for note in scene.notes:
+            say(note)
+        report = animate(
+            scene.object,
+            run,
+            plane=scene.plane,
+            background=scene.background,
+            view_from=view_from if view_from is not None else viewing_direction(scene, given.cameras),
+            notes=(*given.notes, *scene.notes),
+            **asked,
+        )
+        run.finish()
     return report, ", ".join(["", "object.ply", "background.ply", "plane.json", *pictures])
 
 
-def _write_pictures(folder: Path, given: SceneInput, scene: PreparedScene) -> list[str]:
+def _write_pictures(run: RunFolder, given: SceneInput, scene: PreparedScene) -> list[str]:
     """Pictures that show whether each step has worked, as the steps' own commands write them; returns their names."""
     from egs_warp.inpainting.picture import before_and_after
     from egs_warp.io.video import write_png
@@ -175,7 +194,7 @@ def _write_pictures(folder: Path, given: SceneInput, scene: PreparedScene) -> li
     if scene.filled is not None:
         pictures["filled.png"] = before_and_after(scene.filled)
     for name, picture in pictures.items():
-        write_png(folder / name, picture)
+        write_png(run.file(name), picture)
     return list(pictures)
 
 

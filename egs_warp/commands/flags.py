@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
-
-import numpy as np
 
 from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from egs_warp.geometry.plane import Plane
     from egs_warp.inpainting.inpainters import Inpainter
     from egs_warp.io.capture import Capture
@@ -30,14 +29,11 @@ def flag_of(argument: str) -> str:
     return _FLAGS.get(argument, f"--{argument.replace('_', '-')}")
 
 
-@contextmanager
-def one_line_errors(program: str) -> Iterator[None]:
-    """Bad input within prints one line, which names flags, and ends the ``program`` with status 2."""
-    try:
-        yield
-    except UserError as error:
-        print(f"{program}: {error.told(flag_of)}", file=sys.stderr)
-        raise SystemExit(2) from None
+def named_path(text: str) -> Path:
+    """The path that a flag gives. An empty one, as of an unset variable, would be the working folder."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("nothing is given; give a name")
+    return Path(text)
 
 
 def add_inpainter_flags(parser: argparse.ArgumentParser, *, default: str | None) -> None:
@@ -60,6 +56,8 @@ def chosen_inpainter(chosen: argparse.Namespace, *, seed: int = 0) -> Inpainter:
 
 def parse_up(text: str) -> np.ndarray:
     """(3,) unit vector of an axis name such as ``-y``. Raises ``UserError`` otherwise."""
+    import numpy as np
+
     name = text.strip().lower().lstrip("+-")
     if name not in _AXES:
         raise UserError(f"--up {text}: give one of x, y, z, -x, -y, -z")
@@ -70,6 +68,8 @@ def parse_up(text: str) -> np.ndarray:
 
 def parse_direction(flag: str, text: str) -> np.ndarray:
     """(3,) unit vector from ``x,y,z``, or of an axis name such as ``-y``. Raises ``UserError`` otherwise."""
+    import numpy as np
+
     if text.strip().lower().lstrip("+-") in _AXES:
         return parse_up(text)
     try:
@@ -95,6 +95,8 @@ def parse_plane(text: str) -> Plane:
 
 def guessed_up(capture: Capture) -> tuple[np.ndarray, str]:
     """(3,) up of a ``Capture`` whose file cannot tell, and what to say about it."""
+    import numpy as np
+
     from egs_warp.segmentation.base_plane import guess_up
 
     up, reason = guess_up(capture.cloud, capture.up)

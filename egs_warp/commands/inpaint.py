@@ -6,9 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from egs_warp.commands.flags import Commands, add_inpainter_flags, chosen_inpainter, parse_plane
+from egs_warp.commands.flags import Commands, add_inpainter_flags, chosen_inpainter, named_path, parse_plane
+from egs_warp.commands.scene_flags import start
 from egs_warp.errors import UserError
 
 
@@ -24,8 +23,8 @@ def add_parser(commands: Commands) -> None:
     inpaint.add_argument("--cameras", help="cameras of the masks: cameras.json, transforms.json, a COLMAP model")
     inpaint.add_argument("--view", help="name or number of the camera of a single mask")
     inpaint.add_argument("--hole", help="x,y,z,radius of a round hole, scene units")
-    inpaint.add_argument("--out", required=True, type=Path, help="filled capture to write, .ply")
-    inpaint.add_argument("--picture", type=Path, help="before, after and depth as PNG (--out with .png)")
+    inpaint.add_argument("--out", required=True, type=named_path, help="filled capture to write, .ply")
+    inpaint.add_argument("--picture", type=named_path, help="before, after and depth as PNG (--out with .png)")
     add_inpainter_flags(inpaint, default="patch")
     inpaint.add_argument("--steps", type=int, help="of training against the inpainted picture (100); 0: no PyTorch")
     inpaint.add_argument("--margin", type=float, help="by how much the hole is made larger, of its side (0.01)")
@@ -39,7 +38,6 @@ def _inpaint(chosen: argparse.Namespace) -> int:
     from egs_warp.inpainting.picture import before_and_after
     from egs_warp.io import read_capture, write_ply
     from egs_warp.io.video import write_png
-    from egs_warp.launching import use_device
 
     given = {"steps": chosen.steps, "margin": chosen.margin, "seed": chosen.seed}
     options = InpaintOptions(**{name: value for name, value in given.items() if value is not None})
@@ -58,7 +56,7 @@ def _inpaint(chosen: argparse.Namespace) -> int:
             "inpaint: say where the hole is by one of --object, --mask with --cameras, or --hole,"
             " or give the plane.json that segment wrote by --plane"
         )
-    use_device(chosen.device)
+    start(chosen.device)
     inpainter = chosen_inpainter(chosen, seed=chosen.seed)
     background = read_capture(chosen.background, device=chosen.device)
     hole = _hole(chosen, plane, recorded, background.cloud)
@@ -83,6 +81,8 @@ def _plane(text: str) -> tuple[Any, Any]:
 
 
 def _hole(chosen: argparse.Namespace, plane: Any, recorded: Any, background: Any) -> Any:
+    import numpy as np
+
     from egs_warp.commands.object_flag import read_object
     from egs_warp.inpainting.holes import disc, footprint, unseen
     from egs_warp.io import read_cameras, read_capture

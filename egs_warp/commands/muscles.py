@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-from egs_warp.commands.flags import Commands, guessed_up, parse_up
-from egs_warp.commands.scene_flags import plane_of, say
+from egs_warp.commands.flags import Commands, guessed_up, named_path, parse_up
+from egs_warp.commands.scene_flags import say, start
 
 
 def add_parser(commands: Commands) -> None:
@@ -14,10 +13,12 @@ def add_parser(commands: Commands) -> None:
     muscles = commands.add_parser("muscles", help="draw the muscles of a capture's body, automatic ones or your own")
     muscles.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog or an unbundled SOG folder")
     muscles.add_argument(
-        "--plot", required=True, type=Path, help="picture (.png, .jpg, ...) with the body from three sides"
+        "--plot", required=True, type=named_path, help="picture (.png, .jpg, ...) with the body from three sides"
     )
     muscles.add_argument(
-        "--muscles", type=Path, help="JSON with fibres (docs/motions/muscles.md); else they are made automatically"
+        "--muscles",
+        type=named_path,
+        help="JSON with fibres (docs/motions/muscles.md); else they are made automatically",
     )
     muscles.add_argument("--up", help="axis that points up: x, y, z or with a minus, as --up=-y; else it is guessed")
     muscles.add_argument(
@@ -27,14 +28,14 @@ def add_parser(commands: Commands) -> None:
 
 
 def _muscles(chosen: argparse.Namespace) -> int:
+    from egs_warp.commands.scene_input import plane_of
     from egs_warp.fem.body import make_body
     from egs_warp.geometry.body_frame import GROUND
     from egs_warp.io import read_capture
-    from egs_warp.launching import use_device
     from egs_warp.muscles.plot import check_picture_name, plot_muscles
     from egs_warp.pipelines.creature import body_muscles, stand
 
-    use_device("cpu")
+    start("cpu")
     check_picture_name(chosen.plot)
     up = parse_up(chosen.up) if chosen.up else None
     plane = plane_of(chosen.plane) if chosen.plane else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from egs_warp.commands.flags import Commands
-from egs_warp.commands.scene_flags import add_scene_flags, read_scene, say
+from egs_warp.commands.scene_flags import add_scene_flags, say
 
 
 def add_parser(commands: Commands) -> None:
@@ -20,9 +20,11 @@ def add_parser(commands: Commands) -> None:
 
 
 def _plane(chosen: argparse.Namespace) -> int:
+    from egs_warp.commands.scene_input import read_scene
     from egs_warp.commands.scene_planes import planes_of_scene, write_ring
     from egs_warp.errors import UserError
     from egs_warp.io.atomic import writable_folder
+    from egs_warp.io.run_folder import check_out
     from egs_warp.io.video import write_png
     from egs_warp.pipelines.pictures import picture_cameras, plane_picture
 
@@ -30,6 +32,7 @@ def _plane(chosen: argparse.Namespace) -> int:
         raise UserError("plane: give --object, or --plane-mask with --cameras")
     if chosen.count < 1:
         raise UserError(f"--count {chosen.count}: give a whole number of at least 1")
+    check_out(chosen.out)
     given = read_scene(chosen)
     folder = writable_folder(chosen.out)
     found = planes_of_scene(given, plane_mask=chosen.plane_mask, view=chosen.view, count=chosen.count)

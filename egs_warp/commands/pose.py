@@ -5,9 +5,8 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from pathlib import Path
 
-from egs_warp.commands.flags import Commands
+from egs_warp.commands.flags import Commands, named_path
 from egs_warp.errors import UserError
 
 _NAMED = 5
@@ -18,7 +17,9 @@ def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     pose = commands.add_parser("pose", help="find where photos were taken from")
     pose.add_argument("photos", help="folder of photos, or a video")
-    pose.add_argument("--out", required=True, type=Path, help="new folder for images and sparse/0, which train reads")
+    pose.add_argument(
+        "--out", required=True, type=named_path, help="new folder for images and sparse/0, which train reads"
+    )
     pose.add_argument("--frames", type=int, default=150, help="of a video, the sharpest evenly in time (150)")
     pose.add_argument("--max-side", type=int, default=1600, help="pixels at which features are found (1600)")
     pose.add_argument("--seed", type=int, default=0, help="of the reconstruction (0)")
@@ -26,11 +27,13 @@ def add_parser(commands: Commands) -> None:
 
 
 def _pose(chosen: argparse.Namespace) -> int:
+    from egs_warp.io.run_folder import check_out
     from egs_warp.pipelines.pose_photos import pose_photos
 
     for flag, value, least in (("--frames", chosen.frames, 3), ("--max-side", chosen.max_side, 64)):
         if value < least:
             raise UserError(f"{flag} {value}: give a whole number of at least {least}")
+    check_out(chosen.out)
     shown = _Progress()
     result = pose_photos(
         chosen.photos,

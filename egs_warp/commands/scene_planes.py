@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from egs_warp.commands.object_flag import read_object
-from egs_warp.commands.scene_flags import SceneInput
+from egs_warp.commands.scene_input import SceneInput
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import camera_rays
 from egs_warp.geometry.camera_ring import ring_cameras

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egs_warp.commands.flags import Commands
-from egs_warp.commands.scene_flags import add_scene_flags, read_scene, say
+from egs_warp.commands.scene_flags import add_scene_flags, say
 
 if TYPE_CHECKING:
     from egs_warp.segmentation.clearance import Clearing
@@ -40,9 +40,11 @@ def clearing_of(chosen: argparse.Namespace) -> Clearing | None:
 
 
 def _segment(chosen: argparse.Namespace) -> int:
+    from egs_warp.commands.scene_input import read_scene
     from egs_warp.errors import UserError
     from egs_warp.io.atomic import writable_folder
     from egs_warp.io.planes import read_planes
+    from egs_warp.io.run_folder import check_out
     from egs_warp.io.video import write_png
     from egs_warp.pipelines.pictures import picture_cameras, segmentation_picture
     from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene
@@ -50,6 +52,7 @@ def _segment(chosen: argparse.Namespace) -> int:
 
     if not chosen.object:
         raise UserError("segment: give --object: a mask, a point, a box or a pixel")
+    check_out(chosen.out)
     given = read_scene(chosen)
     known = read_planes(chosen.plane) if chosen.plane and Path(chosen.plane).is_file() else []
     folder = writable_folder(chosen.out)

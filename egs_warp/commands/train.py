@@ -10,9 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from egs_warp.commands.flags import Commands
+from egs_warp.commands.flags import Commands, named_path
 from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
@@ -28,7 +26,9 @@ def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     train = commands.add_parser("train", help="make a capture from posed photos")
     train.add_argument("posed", help="COLMAP model, transforms.json or cameras.json, or a folder that holds one")
-    train.add_argument("--out", required=True, type=Path, help="capture to write: .ply, .compressed.ply, .spz or .sog")
+    train.add_argument(
+        "--out", required=True, type=named_path, help="capture to write: .ply, .compressed.ply, .spz or .sog"
+    )
     train.add_argument("--iterations", type=int, help="optimiser steps, one photo each (cpu 2000, cuda 7000)")
     train.add_argument(
         "--gaussians", type=int, help="at most this many (cpu 20000, cuda as many as the photos gain by)"
@@ -55,6 +55,9 @@ def _train(chosen: argparse.Namespace) -> int:
     if not 0 <= chosen.sh_degree <= 3:
         raise UserError(f"--sh-degree {chosen.sh_degree}: give 0, 1, 2 or 3")
     write = _writer(chosen.out)
+    from egs_warp.io.run_folder import check_out
+
+    check_out(chosen.out.parent if chosen.out.parent != Path(".") else Path.cwd())
     import warp as wp
 
     from egs_warp.launching import use_device
@@ -162,6 +165,8 @@ def _writer(out: Path) -> Callable[[Path, GaussianCloud], None]:
 
 
 def _report(chosen: argparse.Namespace, result: TrainResult, progress: _Progress, seconds: float) -> dict:
+    import numpy as np
+
     from egs_warp.pipelines.report import versions
 
     photo = result.views[0].camera
@@ -193,6 +198,8 @@ def _report(chosen: argparse.Namespace, result: TrainResult, progress: _Progress
 
 def _write_sheet(path: Path, result: TrainResult) -> None:
     """Photo beside render, of photos held out where there are any."""
+    import numpy as np
+
     from egs_warp.io.video import contact_sheet, write_png
     from egs_warp.render import render_gaussians
 

@@ -12,6 +12,8 @@ import numpy as np
 from egs_warp.errors import UserError
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp")
+_BOXES = (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide", b"pnot")
+_MARKS = (b"\x1a\x45\xdf\xa3", b"RIFF")
 _JUDGED_SIDE = 480
 """Pixels: a frame's sharpness is judged at this size, where noise counts less than edges."""
 
@@ -33,6 +35,7 @@ def sharp_frames(video: Path, count: int) -> Iterator[Frame]:
 
     Raises ``UserError`` for a file that is no video.
     """
+    _check(video)
     length = _length(video)
     parts = min(count, length)
     best: Frame | None = None
@@ -47,6 +50,18 @@ def sharp_frames(video: Path, count: int) -> Iterator[Frame]:
             best = Frame(number, pixels, sharpness)
     if best is not None:
         yield best
+
+
+def _check(video: Path) -> None:
+    """Refuse what is no video by its first bytes: a playlist would have other files and addresses opened."""
+    try:
+        with open(video, "rb") as file:
+            start = file.read(12)
+    except OSError as error:
+        raise UserError(f"{video}: cannot be read ({error.strerror}); check the path") from error
+    # QuickTime and MPEG-4 begin with a size and a name, Matroska and RIFF with a mark, transport streams with a G.
+    if not (start[4:8] in _BOXES or start[:4] in _MARKS or start[:1] == b"G" or start[4:5] == b"G"):
+        raise UserError(f"{video}: no video that can be read; give an .mp4 or .mov, or a folder of photos")
 
 
 def _frames(video: Path) -> Iterator[np.ndarray]:

@@ -70,6 +70,20 @@ def _in_the_middle(frame: np.ndarray, height: int, width: int) -> np.ndarray:
     return cell
 
 
+def ffmpeg_program() -> str:
+    """Path of the ffmpeg that draws videos. Raises ``UserError`` where none runs, before any long work."""
+    import imageio_ffmpeg
+
+    cure = "pip install imageio-ffmpeg, or set IMAGEIO_FFMPEG_EXE to an ffmpeg program"
+    try:
+        program = imageio_ffmpeg.get_ffmpeg_exe()
+        subprocess.run([program, "-version"], stdin=subprocess.DEVNULL, capture_output=True, check=True, timeout=60)
+    except (RuntimeError, OSError, subprocess.SubprocessError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UserError(f"no ffmpeg, so no video could be written ({reason}); {cure}") from error
+    return program
+
+
 class _AbandonedError(Exception):
     """Ends the writing of a video that failed."""
 
@@ -88,31 +102,40 @@ class VideoWriter:
         self._path = Path(path)
         self._size = (height, width)
         self._command_tail = [
-            *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width + width % 2}x{height + height % 2}"),
-            *("-r", f"{frames_per_second:g}", "-i", "-", "-an"),
+            # Nothing but a pipe and a file: names may look like addresses or playlists.
+            *(
+                "-protocol_whitelist",
+                "file,pipe",
+                "-f",
+                "rawvideo",
+                "-pix_fmt",
+                "rgb24",
+                "-s",
+                f"{width + width % 2}x{height + height % 2}",
+            ),
+            *("-r", f"{frames_per_second:g}", "-i", "pipe:0", "-an"),
             *("-vf", "scale=out_color_matrix=bt709:out_range=tv", "-c:v", "libx264", "-pix_fmt", "yuv420p"),
             *("-crf", str(quality), "-preset", "medium", "-movflags", "+faststart"),
             *("-color_range", "tv", "-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709"),
         ]
 
     def __enter__(self) -> VideoWriter:
-        import imageio_ffmpeg
-
+        program = ffmpeg_program()
         with contextlib.ExitStack() as files:
             temporary = files.enter_context(atomic_write(self._path))
-            # A place that cannot be written is told now, not after the last frame.
-            temporary.write_bytes(b"")
             self._log = files.enter_context(tempfile.TemporaryFile())
             self._files = files.pop_all()
         self._process = subprocess.Popen(
             [
-                *(imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"),
+                *(program, "-y", "-loglevel", "error"),
                 *self._command_tail,
                 *("-f", "mp4", str(temporary)),
             ],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=self._log,
+            # Ctrl-C reaches the writer, who ends it.
+            start_new_session=True,
         )
         return self
 

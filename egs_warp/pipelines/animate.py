@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -12,7 +13,8 @@ from egs_warp.contact.terrain import Solid
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
-from egs_warp.io.atomic import writable_folder
+from egs_warp.io.run_folder import RunFolder, run_folder
+from egs_warp.io.video import ffmpeg_program
 from egs_warp.locomotion.stepper import LocomotionSettings
 from egs_warp.locomotion.trajectory import audit, measure
 from egs_warp.motions.request import LARGEST_TARGET, LARGEST_TURN
@@ -85,9 +87,30 @@ class AnimateOptions:
         return {"distance": self.distance, "height": self.height, "heading_degrees": self.heading_degrees}
 
 
+@dataclass(frozen=True)
+class Asked:
+    """Everything that was asked of a run, besides the capture and the motion; frame and units of the capture."""
+
+    options: AnimateOptions
+    up: tuple[float, ...]
+    plane: tuple[float, ...] | None
+    """nx, ny, nz, d."""
+    view_from: tuple[float, ...]
+    gravity_up: tuple[float, ...]
+    forward: tuple[float, ...]
+    muscles: str | None
+    """Name of the file."""
+    solids: int
+
+    def to_json(self) -> dict[str, Any]:
+        """``asked`` of the report; what was left to the program is null."""
+        given = {name: value or None for name, value in vars(self).items() if name not in ("options", "solids")}
+        return {**asdict(self.options), **given, "solids": self.solids}
+
+
 def animate(
     cloud: GaussianCloud,
-    out: Path | str,
+    out: Path | str | RunFolder,
     *,
     motion: str = "jump",
     up: np.ndarray | None = None,
@@ -102,6 +125,7 @@ def animate(
     options: AnimateOptions | None = None,
     source: str = "capture",
     notes: tuple[str, ...] = (),
+    overwrite: bool = False,
     quiet: bool = False,
 ) -> Report:
     """Bring ``cloud`` (scene units) to life and write video, contact sheet, report and trajectory into ``out``.
@@ -109,50 +133,70 @@ def animate(
     ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.motions.script``).
     ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
     the object to the camera. ``muscles_file``, ``solids``, ``gravity_up`` and ``settings``: see ``make_creature``;
-    ``forward`` (3,): see ``first_place``. Returns what it wrote as ``report.json`` (docs/guide/report.md). Raises
-    ``UserError`` for bad input, before any file of an earlier run is touched.
+    ``forward`` (3,): see ``first_place``. Returns what it wrote as ``report.json`` (docs/guide/report.md). A folder
+    belongs to one run (``egs_warp.io.run_folder``): one with an earlier run is refused, or that run moved aside
+    (``overwrite``). Raises ``UserError`` for bad input, before any file of an earlier run is touched.
     """
     options = options or AnimateOptions()
     asked = script(motion, **options.targets())
     cut_off = asked.frames()
-    folder = writable_folder(out)
-    with tqdm(total=1, desc="prepare", unit="capture", disable=quiet) as bar:
-        creature = make_creature(
-            cloud,
-            up=up,
-            plane=plane,
-            metres_per_unit=options.metres_per_unit,
-            friction=options.friction,
-            muscles_file=muscles_file,
-            solids=solids,
-            gravity_up=gravity_up,
-            settings=settings,
+    ffmpeg_program()
+    with run_folder(out, overwrite=overwrite) as run:
+        with tqdm(desc="prepare", bar_format="{desc}, {elapsed}", disable=quiet) as bar:
+            creature = make_creature(
+                cloud,
+                up=up,
+                plane=plane,
+                metres_per_unit=options.metres_per_unit,
+                friction=options.friction,
+                muscles_file=muscles_file,
+                solids=solids,
+                gravity_up=gravity_up,
+                settings=settings,
+                progress=lambda stage: bar.set_description_str(f"prepare: {stage}"),
+            )
+            bar.set_description_str("prepare: done")
+        notes = (*notes, *oddities(creature.cloud, creature.cage.mesh, creature.body.height))
+        with tqdm(total=options.frames or cut_off, desc="simulate", unit="frame", disable=quiet) as bar:
+            performance = simulate(
+                creature, asked, frames=options.frames, forward=forward, progress=lambda _: bar.update()
+            )
+        # Whatever becomes of the film, the simulation is not lost.
+        performance.trajectory.placed(creature.frame).save(run.file("trajectory.npz"))
+        creature.cage.mesh.write_vtu(run.file("cage.vtu"))
+        film = draw_film(
+            performance,
+            run,
+            name=asked.name,
+            size=options.size,
+            background=background,
+            view_from=view_from,
+            shadow=options.shadow,
+            quiet=quiet,
         )
-        bar.update()
-    notes = (*notes, *oddities(creature.cloud, creature.cage.mesh, creature.body.height))
-    with tqdm(total=options.frames or cut_off, desc="simulate", unit="frame", disable=quiet) as bar:
-        performance = simulate(creature, asked, frames=options.frames, forward=forward, progress=lambda _: bar.update())
-    film = draw_film(
-        performance,
-        folder,
-        name=asked.name,
-        size=options.size,
-        background=background,
-        view_from=view_from,
-        shadow=options.shadow,
-        quiet=quiet,
-    )
-    report = _report(
-        performance, film, source=source, notes=(*notes, *performance.sequence.cut_short()), seed=options.seed
-    )
-    performance.trajectory.placed(creature.frame).save(folder / "trajectory.npz")
-    DrawnCreature.of(film.splats, film.camera, creature.muscles).save(folder / drawn.FILE)
-    creature.cage.mesh.write_vtu(folder / "cage.vtu")
-    report.write(folder / "report.json")
+        DrawnCreature.of(film.splats, film.camera, creature.muscles).save(run.file(drawn.FILE))
+        asked_for = Asked(
+            options,
+            up=_numbers(up),
+            plane=None if plane is None else (*_numbers(plane.normal), plane.offset),
+            view_from=_numbers(view_from),
+            gravity_up=_numbers(gravity_up),
+            forward=_numbers(forward),
+            muscles=None if muscles_file is None else Path(muscles_file).name,
+            solids=len(solids),
+        )
+        report = _report(performance, film, asked_for, source=source, notes=(*notes, *performance.sequence.cut_short()))
+        report.write(run.file("report.json"))
+        if not isinstance(out, RunFolder):
+            run.finish()
     return report
 
 
-def _report(performance: Performance, film: Film, *, source: str, notes: tuple[str, ...], seed: int) -> Report:
+def _numbers(vector: np.ndarray | None) -> tuple[float, ...]:
+    return () if vector is None else tuple(float(x) for x in vector)
+
+
+def _report(performance: Performance, film: Film, asked: Asked, *, source: str, notes: tuple[str, ...]) -> Report:
     creature, sequence, simulation = performance.creature, performance.sequence, performance.simulation
     trajectory, reports = simulation.trajectory, simulation.reports
     mesh, spans = creature.cage.mesh, sequence.spans(trajectory.time)
@@ -182,5 +226,6 @@ def _report(performance: Performance, film: Film, *, source: str, notes: tuple[s
         ),
         notes=notes,
         device=str(creature.cloud.device),
-        seed=seed,
+        seed=asked.options.seed,
+        asked=asked.to_json(),
     )

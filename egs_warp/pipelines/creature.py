@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -85,6 +86,7 @@ def make_creature(
     solids: tuple[Solid, ...] = (),
     gravity_up: np.ndarray | None = None,
     settings: LocomotionSettings | None = None,
+    progress: Callable[[str], object] = lambda stage: None,
 ) -> Creature:
     """Give a capture (scene units) a body that stands on ``plane``, or on its own base, square to ``up`` (3,).
 
@@ -92,7 +94,7 @@ def make_creature(
     file lies. ``muscles_file``: see ``body_muscles``. ``solids`` are steps and walls beside the ground; ``gravity_up``
     (3,) is against gravity if the ground is a slope. ``settings`` of its stepper choose the strategy for the contact
     states and the QP solver. The body is as stiff as makes it sag by ``sag`` of its height; one that its weight would
-    bend out of shape is made stiffer.
+    bend out of shape is made stiffer. ``progress`` is told the name of each stage.
     """
     normal = plane.normal if plane is not None else up
     if normal is None:
@@ -100,7 +102,9 @@ def make_creature(
         raise ArgumentError("plane", advice, check=("plane", "up"))
     if gravity_up is not None:
         _check_slope(normal / np.linalg.norm(normal), gravity_up)
+    progress("cage")
     standing = stand(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit)
+    progress("contact")
     device, frame, cage = str(cloud.device), standing.frame, standing.cage
     solids = tuple(Solid(tuple(frame.plane(face) for face in solid.faces)) for solid in solids)
     geometry = contact_geometry(
@@ -108,9 +112,11 @@ def make_creature(
     )
     against_gravity = None if gravity_up is None else frame.axes @ gravity_up
     while True:
+        progress("body and muscles")
         body = make_body(cage.mesh, GROUND, up=against_gravity, sag=sag, device=device)
         muscles = body_muscles(body, muscles_file, frame)
         stepper = LocomotionStepper(body, muscles, geometry, settings=settings, device=device)
+        progress("stand")
         start = settle(stepper)
         if sag < SMALLEST_SAG or _stands(stepper, start):
             everything = (Solid((GROUND,)), *solids)

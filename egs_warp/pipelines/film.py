@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -16,6 +15,7 @@ from egs_warp.deformation.splitting import split_for_motion
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.io.run_folder import RunFolder
 from egs_warp.io.video import VideoWriter, contact_sheet, write_png
 from egs_warp.locomotion.rollout import Simulation
 from egs_warp.pipelines.creature import Creature
@@ -40,7 +40,7 @@ class Film:
 
 def draw_film(
     performance: Performance,
-    folder: Path,
+    run: RunFolder,
     *,
     name: str,
     size: int,
@@ -49,7 +49,7 @@ def draw_film(
     shadow: bool = True,
     quiet: bool = False,
 ) -> Film:
-    """Write ``name``.mp4 and sheet.png, ``size`` pixels both ways, into ``folder``.
+    """Write ``name``.mp4 and sheet.png, ``size`` pixels both ways, into the folder of ``run``.
 
     ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
     the object to the camera, both in the capture's frame.
@@ -69,7 +69,7 @@ def draw_film(
     kept: list[np.ndarray] = []
     wanted = np.unique(np.linspace(0, len(frames) - 1, SHEET_FRAMES).round().astype(int))
     with (
-        VideoWriter(folder / f"{name}.mp4", size, size) as video,
+        VideoWriter(run.file(f"{name}.mp4"), size, size) as video,
         tqdm(total=len(frames), desc="render", unit="frame", disable=quiet) as bar,
     ):
         for index, step in enumerate(frames):
@@ -88,7 +88,7 @@ def draw_film(
                 milliseconds[stage].append(1e3 * float(spent))
             bar.update()
     labels = [f"{trajectory.time[frames[i]]:.2f} s" for i in wanted]
-    write_png(folder / "sheet.png", contact_sheet(kept, 4, labels))
+    write_png(run.file("sheet.png"), contact_sheet(kept, 4, labels))
     milliseconds["split"] = [splitting / len(frames)]
     return Film(split.cloud, camera, milliseconds)
 

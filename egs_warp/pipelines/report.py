@@ -177,6 +177,8 @@ class Report:
     """For the user."""
     device: str
     seed: int
+    asked: Mapping[str, Any] = field(default_factory=dict)
+    """Everything else that was asked."""
     versions: Mapping[str, str] = field(default_factory=versions)
 
     def to_json(self) -> dict[str, Any]:
@@ -184,6 +186,7 @@ class Report:
         return {
             "schema": SCHEMA_VERSION,
             "source": self.source,
+            "asked": dict(self.asked),
             "motion": [motion.to_json() for motion in self.motion],
             "audit": asdict(self.audit),
             "qp": asdict(self.qp),
@@ -204,8 +207,31 @@ class Report:
     def summary(self) -> str:
         """A few lines for the terminal."""
         lines = [line for motion in self.motion for line in motion.summary()]
-        lines.append("audit: " + ", ".join(f"{name} {value:.2g}" for name, value in asdict(self.audit).items()))
+        lines.append(verdict(self.audit))
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
+
+
+AUDIT_LIMITS = {
+    "momentum_residual": 1e-5,
+    "angular_momentum_residual": 1e-4,
+    "cone_violation": 1e-4,
+    "penetration": 1e-2,
+    "complementarity_gap": 1e-4,
+    "inverted_elements": 0,
+    "newton_unconverged": 0,
+}
+"""Beyond these a run is not what the equations say (docs/guide/report.md)."""
+
+
+def verdict(audit: Audit) -> str:
+    """One line: whether the run obeys its equations, and by how much not."""
+    values = asdict(audit)
+    # Not "value > limit": NaN is beyond, too.
+    beyond = {name: value for name, value in values.items() if not value <= AUDIT_LIMITS[name]}
+    if beyond:
+        said = ", ".join(f"{name} {value:.2g} (at most {AUDIT_LIMITS[name]:g})" for name, value in beyond.items())
+        return f"audit: FAILED: {said}"
+    return "audit: passed (" + ", ".join(f"{name} {value:.2g}" for name, value in values.items()) + ")"
 
 
 def write_report(path: Path, report: Mapping[str, Any]) -> None:

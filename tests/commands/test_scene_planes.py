@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from egs_warp.assets import scene
-from egs_warp.commands.scene_flags import SceneInput
+from egs_warp.commands.scene_input import SceneInput
 from egs_warp.commands.scene_planes import planes_of_scene
 from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.pipelines.pictures import picture_cameras, plane_picture

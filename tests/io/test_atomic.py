@@ -87,3 +87,35 @@ def test_writable_folder_is_made_and_left_empty(tmp_path: Path) -> None:
     assert writable_folder(str(tmp_path / "a" / "b")) == tmp_path / "a" / "b"
     assert writable_folder(tmp_path / "a" / "b").is_dir()
     assert os.listdir(tmp_path / "a" / "b") == []
+
+
+def old(path: Path) -> Path:
+    path.write_text("half")
+    os.utime(path, (1.0, 1.0))
+    return path
+
+
+def test_what_a_killed_process_leaves_is_swept(tmp_path: Path) -> None:
+    """Only names of our own, and none that a living process is writing."""
+    left = old(tmp_path / ".egs-0123456789abcdef.ply")
+    other, young = old(tmp_path / ".egs-notes"), tmp_path / ".egs-0123456789abcdee.ply"
+    young.write_text("just begun")
+    with atomic_write(tmp_path / "a.json") as living:
+        os.utime(living, (1.0, 1.0))
+        writable_folder(tmp_path)
+        assert living.exists() and young.exists() and other.exists() and not left.exists()
+        living.write_text("{}")
+    assert (tmp_path / "a.json").read_text() == "{}"
+
+
+def test_a_temporary_file_is_opened_exclusively(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A link that somebody has put under the very name is not followed."""
+    (tmp_path / "victim").write_text("precious")
+    (tmp_path / ".egs-guessed.json").symlink_to(tmp_path / "victim")
+    monkeypatch.setattr("egs_warp.io.atomic._temporary_name", lambda folder, suffix: folder / f".egs-guessed{suffix}")
+    with (
+        pytest.raises(UserError, match=r"a\.json: cannot be written \(File exists\)"),
+        atomic_write(tmp_path / "a.json"),
+    ):
+        raise AssertionError("must not come here")
+    assert (tmp_path / "victim").read_text() == "precious"

@@ -33,3 +33,19 @@ def test_no_video_is_one_line(tmp_path: Path) -> None:
         UserError, match=r"v.mp4: no video that can be read; give an .mp4 or .mov, or a folder of photos"
     ):
         list(sharp_frames(tmp_path / "v.mp4", 5))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "#EXTM3U\n#EXTINF:1,\nsecret.mp4\n",
+        "ffconcat version 1.0\nfile secret.mp4\n",
+        "v=0\nc=IN IP4 127.0.0.1\n",
+        "<MPD/>",
+        "",
+    ],
+)
+def test_playlists_are_no_videos(text: str, tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").write_text(text)
+    with pytest.raises(UserError, match=r"a\.mp4: no video that can be read; give an \.mp4 or \.mov"):
+        next(sharp_frames(tmp_path / "a.mp4", 3))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from egs_warp.errors import UserError
-from egs_warp.io.video import VideoWriter, contact_sheet, write_png
+from egs_warp.io.video import VideoWriter, contact_sheet, ffmpeg_program, write_png
 
 
 def smooth_frames(count: int, height: int, width: int) -> list[np.ndarray]:
@@ -86,3 +86,20 @@ def test_a_sheet_holds_frames_of_different_sizes() -> None:
     assert sheet.shape == (60, 80, 3)
     assert (sheet[20:40, :40] == 7).all() and (sheet[:20, :40] == 255).all() and (sheet[40:, :40] == 255).all()
     assert (sheet[:, 45:75] == 9).all() and (sheet[:, 40:45] == 255).all()
+
+
+@pytest.mark.parametrize("name", ["2026-11-21T12:30", "-dash", "pipe:1", "concat:a|b", "%03d"])
+def test_a_folder_may_have_any_name(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """ffmpeg would read some of them as an address, an option or a pattern."""
+    monkeypatch.chdir(tmp_path)
+    Path(name).mkdir()
+    with VideoWriter(Path(name) / "v.mp4", 16, 16) as video:
+        video.write(np.zeros((16, 16, 3), np.uint8))
+    assert os.listdir(name) == ["v.mp4"] and (Path(name) / "v.mp4").stat().st_size > 0
+
+
+def test_a_missing_ffmpeg_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for program in (tmp_path / "none", Path("/bin/false")):
+        monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(program))
+        with pytest.raises(UserError, match=r"no ffmpeg, so no video could be written .*set IMAGEIO_FFMPEG_EXE"):
+            ffmpeg_program()

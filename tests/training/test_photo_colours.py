@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from egs_warp.commands.scene_flags import SceneInput
+from egs_warp.commands.scene_input import SceneInput
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.cameras import write_cameras

@@ -1,0 +1,145 @@
+"""How a program ends: whatever stops it, it says one line, leaves no half-written file and has a status of its own.
+
+0 done, 1 the machine refused (memory, disk), 2 bad input, 130 stopped by Ctrl-C, 143 asked to end (SIGTERM).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, NoReturn, TextIO
+
+from egs_warp.commands.flags import flag_of
+from egs_warp.errors import UserError
+
+_MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENOMEM)
+"""Errors of the machine; others are ours, and keep their traceback."""
+
+
+_AGAIN = 0.05
+"""Seconds after which a signal that was lost comes again."""
+
+
+class Ended(SystemExit):
+    """The program has told why it ends."""
+
+
+class _TerminatedError(BaseException):
+    """SIGTERM."""
+
+
+@contextmanager
+def one_line_errors(program: str) -> Iterator[None]:
+    """Whatever stops the ``program`` within prints one line and ends it with a status (``docs/reliability.md``).
+
+    Bad input names flags and ends it with 2. Ctrl-C and SIGTERM unwind once: a second Ctrl-C ends it at once. A pipe
+    that is closed at its other end only silences the program.
+    """
+
+    def end(status: int, line: str) -> NoReturn:
+        with contextlib.suppress(OSError):
+            print(f"{program}: {line}", file=sys.stderr)
+        raise Ended(status) from None
+
+    with _signals(), _deaf_streams():
+        try:
+            yield
+        except UserError as error:
+            end(2, error.told(flag_of))
+        except KeyboardInterrupt:
+            end(130, "stopped; finished files are whole, unfinished ones are gone")
+        except _TerminatedError:
+            end(143, "asked to end; finished files are whole, unfinished ones are gone")
+        except MemoryError:
+            end(1, "not enough memory; give a smaller capture, picture or number of Gaussians")
+        except OSError as error:
+            if error.errno not in _MACHINE:
+                raise
+            place = f"{error.filename}: " if error.filename else ""
+            end(1, f"{place}{error.strerror}; free some space, or choose another place")
+
+
+@contextmanager
+def _signals() -> Iterator[None]:
+    """Ctrl-C and SIGTERM raise within, once."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    begun = False
+
+    def stop(number: int, _: object) -> None:
+        nonlocal begun
+        if begun:
+            # What is left over, the next run sweeps.
+            os._exit(128 + number)
+        begun = True
+        raise KeyboardInterrupt if number == signal.SIGINT else _TerminatedError
+
+    def unraisable(lost: Any) -> None:
+        nonlocal begun
+        # Raised inside a destructor or a callback, where Python drops it: it is raised again from a better place.
+        if lost.exc_type in (KeyboardInterrupt, _TerminatedError):
+            begun = False
+            number = signal.SIGINT if lost.exc_type is KeyboardInterrupt else signal.SIGTERM
+            threading.Timer(_AGAIN, os.kill, (os.getpid(), number)).start()
+        else:
+            before_hook(lost)
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    before_hook, sys.unraisablehook = sys.unraisablehook, unraisable
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before_hook
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _deaf_streams() -> Iterator[None]:
+    """Output within goes on in silence where nobody reads it any more."""
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = _Stream(before[0]), _Stream(before[1])
+    try:
+        yield
+        sys.stdout.flush()
+    finally:
+        sys.stdout, sys.stderr = before
+
+
+class _Stream:
+    """A text stream whose reader may go away."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """As that of the stream."""
+        try:
+            return self._stream.write(text)
+        except BrokenPipeError:
+            self._silence()
+            return len(text)
+
+    def flush(self) -> None:
+        """As that of the stream."""
+        try:
+            self._stream.flush()
+        except BrokenPipeError:
+            self._silence()
+
+    def _silence(self) -> None:
+        # What is still buffered goes nowhere, now and when Python ends.
+        with contextlib.suppress(OSError, ValueError):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self._stream.fileno())
+            os.close(nowhere)

@@ -1,0 +1,151 @@
+"""A folder of results belongs to one run: locked while it is written, described by a manifest that comes last.
+
+``manifest.json`` holds ``schema``, ``version``, ``finished`` and ``files``: size and SHA-256 of each file by its name,
+null for those of a run that has not finished.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import Any
+
+from egs_warp.errors import ArgumentError, UserError
+from egs_warp.io.atomic import atomic_write, lock, sweep, writable_folder
+from egs_warp.io.limits import LARGEST_TEXT, read_bytes
+from egs_warp.version import __version__
+
+MANIFEST = "manifest.json"
+_LOCK = ".egs-run.lock"
+_SCHEMA = 1
+
+
+class RunFolder:
+    """What one run writes; made by ``run_folder``."""
+
+    def __init__(self, path: Path, overwrite: bool) -> None:
+        self.path = path
+        self._overwrite = overwrite
+        self._names: list[str] = []
+
+    def file(self, name: str) -> Path:
+        """Where the run's file ``name`` goes. Before the first one, an earlier run is moved aside, if that was allowed.
+
+        Raises ``UserError`` for a file of this name that is no run's, unless files may be overwritten.
+        """
+        if not self._names:
+            self._move_aside(_known(self.path))
+        if name not in self._names:
+            self._names.append(name)
+            if (self.path / name).exists():
+                if not self._overwrite:
+                    raise _occupied(self.path, f"it has {name}")
+                self._move_aside([name])
+            self._write_manifest(dict.fromkeys(self._names), finished=False)
+        return self.path / name
+
+    def finish(self) -> None:
+        """Describe all files; the manifest says from now on that the run has finished."""
+        facts = {name: _facts(self.path / name) for name in self._names if (self.path / name).is_file()}
+        self._write_manifest(facts, finished=True)
+
+    def _write_manifest(self, files: dict[str, Any], *, finished: bool) -> None:
+        content = {"schema": _SCHEMA, "version": __version__, "finished": finished, "files": files}
+        with atomic_write(self.path / MANIFEST) as temporary:
+            temporary.write_text(json.dumps(content, indent=1) + "\n")
+
+    def _move_aside(self, names: Sequence[str]) -> None:
+        there = [name for name in names if (self.path / name).exists()]
+        if not there:
+            return
+        number = 1
+        while (self.path / f"earlier-{number}").exists():
+            number += 1
+        aside = self.path / f"earlier-{number}"
+        try:
+            aside.mkdir()
+            # The manifest goes last: until then it names what is still to be moved.
+            for name in there:
+                os.replace(self.path / name, aside / name)
+        except OSError as error:
+            raise UserError(f"{self.path}: the earlier run cannot be moved aside ({error.strerror})") from error
+
+
+@contextmanager
+def run_folder(out: Path | str | RunFolder, *, overwrite: bool = False) -> Iterator[RunFolder]:
+    """The folder ``out``, made where it is missing and locked, for one run; a ``RunFolder`` is handed on as it is.
+
+    Raises ``UserError`` where another run is writing, or where an earlier run lies and may not be moved aside
+    (``overwrite``).
+    """
+    if isinstance(out, RunFolder):
+        with nullcontext():
+            yield out
+        return
+    check_run_folder(out, overwrite=overwrite)
+    folder = writable_folder(out)
+    with lock(folder / _LOCK) as free:
+        if not free:
+            raise UserError(f"{out}: another run is writing into this folder; wait for it, or choose another folder")
+        # What came between the check and the lock.
+        check_run_folder(out, overwrite=overwrite)
+        sweep(folder)
+        yield RunFolder(folder, overwrite)
+
+
+def check_run_folder(out: Path | str, *, overwrite: bool = False) -> None:
+    """Raise the ``UserError`` of ``run_folder`` as far as it can be known, and make nothing: before any long work."""
+    check_out(out)
+    if not overwrite and (Path(out) / MANIFEST).is_file():
+        raise _occupied(out, "it has an earlier run")
+
+
+def check_out(out: Path | str) -> None:
+    """Raise ``UserError`` for a folder that cannot be made or written, and make nothing."""
+    if not str(out).strip():
+        raise ArgumentError("out", "give the name of a folder", value=repr(str(out)))
+    folder = Path(out)
+    there = next(parent for parent in (folder, *folder.absolute().parents) if _exists(parent))
+    if not there.is_dir():
+        raise UserError(f"{out}: cannot write into this folder ({there} is a file); choose another one")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise UserError(f"{out}: cannot write into this folder (Permission denied); choose another one")
+
+
+def _exists(path: Path) -> bool:
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    # Names too long, or with null bytes.
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        raise UserError(f"{path}: cannot be made ({reason}); choose another place") from error
+    return True
+
+
+def _occupied(out: Path | str, what: str) -> UserError:
+    problem = f"{what}, which would be mixed with this one; choose another folder, or have it moved aside"
+    return ArgumentError("out", problem, value=out, check=("overwrite",))
+
+
+def _known(folder: Path) -> list[str]:
+    """Files of the earlier run in ``folder`` by its manifest, which comes last."""
+    path = folder / MANIFEST
+    if not path.is_file():
+        return []
+    try:
+        files = json.loads(read_bytes(path, at_most=LARGEST_TEXT))["files"]
+        names = [name for name in files if isinstance(name, str) and Path(name).name == name]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        names = []
+    return [*(name for name in names if name != MANIFEST), MANIFEST]
+
+
+def _facts(path: Path) -> dict[str, Any]:
+    with open(path, "rb") as file:
+        return {"bytes": path.stat().st_size, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}

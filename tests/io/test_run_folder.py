@@ -1,0 +1,139 @@
+"""A folder belongs to one run: nothing is mixed, nothing of an earlier run is lost."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+from pathlib import Path
+
+import pytest
+
+from egs_warp.errors import UserError
+from egs_warp.io.run_folder import MANIFEST, check_run_folder, run_folder
+
+
+def finished(folder: Path, **files: str) -> None:
+    with run_folder(folder, overwrite=True) as run:
+        for name, text in files.items():
+            run.file(f"{name}.txt").write_text(text)
+        run.finish()
+
+
+def manifest(folder: Path) -> dict:
+    return json.loads((folder / MANIFEST).read_text())
+
+
+def test_the_manifest_comes_last_and_holds_checksums(tmp_path: Path) -> None:
+    with run_folder(tmp_path / "out") as run:
+        run.file("a.txt").write_text("one")
+        assert manifest(run.path)["finished"] is False and manifest(run.path)["files"] == {"a.txt": None}
+        run.file("b.txt").write_text("three")
+        run.finish()
+    content = manifest(tmp_path / "out")
+    assert content["finished"] is True
+    assert content["files"]["b.txt"] == {"bytes": 5, "sha256": hashlib.sha256(b"three").hexdigest()}
+    assert sorted(os.listdir(tmp_path / "out")) == ["a.txt", "b.txt", MANIFEST]
+
+
+def test_an_earlier_run_is_refused_or_moved_aside_whole(tmp_path: Path) -> None:
+    finished(tmp_path, hop="1", report="1")
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(UserError, match=r"out .*: it has an earlier run, .*; check overwrite"), run_folder(tmp_path):
+        raise AssertionError("must not come here")
+    finished(tmp_path, jump="2", report="2")
+    assert sorted(os.listdir(tmp_path)) == ["earlier-1", "jump.txt", MANIFEST, "mine.txt", "report.txt"]
+    assert (
+        (tmp_path / "earlier-1" / "hop.txt").read_text() == (tmp_path / "earlier-1" / "report.txt").read_text() == "1"
+    )
+    assert set(manifest(tmp_path / "earlier-1")["files"]) == {"hop.txt", "report.txt"}
+    finished(tmp_path, jump="3")
+    assert (tmp_path / "earlier-2" / "jump.txt").read_text() == "2"
+
+
+def test_a_run_that_writes_nothing_leaves_the_earlier_one(tmp_path: Path) -> None:
+    """Bad input shows after the folder is locked, before the first file."""
+    finished(tmp_path, a="1")
+    with pytest.raises(UserError, match="flat"), run_folder(tmp_path, overwrite=True):
+        raise UserError("object: it is flat")
+    assert sorted(os.listdir(tmp_path)) == ["a.txt", MANIFEST] and (tmp_path / "a.txt").read_text() == "1"
+
+
+def test_an_unfinished_run_says_so_and_is_moved_aside_too(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt), run_folder(tmp_path) as run:
+        run.file("trajectory.txt").write_text("hours")
+        run.file("film.txt")
+        raise KeyboardInterrupt
+    assert manifest(tmp_path)["finished"] is False
+    with pytest.raises(UserError, match="it has an earlier run"):
+        check_run_folder(tmp_path)
+    finished(tmp_path, film="2")
+    assert (tmp_path / "earlier-1" / "trajectory.txt").read_text() == "hours"
+    assert not (tmp_path / "trajectory.txt").exists()
+
+
+def test_files_of_nobody_are_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("precious")
+    with (
+        pytest.raises(UserError, match=r"it has a\.txt, which would be mixed with this one"),
+        run_folder(tmp_path) as run,
+    ):
+        run.file("a.txt")
+    assert os.listdir(tmp_path) == ["a.txt"]
+    finished(tmp_path, a="new")
+    assert (tmp_path / "earlier-1" / "a.txt").read_text() == "precious"
+
+
+def _try(folder: Path, said: multiprocessing.Queue) -> None:
+    try:
+        with run_folder(folder):
+            said.put("free")
+    except UserError as error:
+        said.put(str(error))
+
+
+def test_two_runs_at_once(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("spawn")
+    said = context.Queue()
+    with run_folder(tmp_path):
+        other = context.Process(target=_try, args=(tmp_path, said))
+        other.start()
+        other.join(60)
+        assert said.get(timeout=5) == (
+            f"{tmp_path}: another run is writing into this folder; wait for it, or choose another folder"
+        )
+    with run_folder(tmp_path):
+        pass
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_broken_manifest_stands_for_a_run(tmp_path: Path) -> None:
+    """Names that lead out of the folder are not followed."""
+    outside = tmp_path / "secret.txt"
+    outside.write_text("secret")
+    folder = tmp_path / "out"
+    folder.mkdir()
+    for text in ("nonsense", json.dumps({"files": {"../secret.txt": None}}), json.dumps({"files": 3})):
+        (folder / MANIFEST).write_text(text)
+        with pytest.raises(UserError, match="it has an earlier run"):
+            check_run_folder(folder)
+        finished(folder, a="1")
+        assert outside.read_text() == "secret"
+        (folder / MANIFEST).unlink()
+        (folder / "a.txt").unlink()
+
+
+def test_places_are_checked_before_the_work_and_not_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for out, said in (
+        ("", "out '': give the name of a folder"),
+        (tmp_path / "file", r"cannot write into this folder \(.*file is a file\)"),
+        (tmp_path / "file" / "deeper", r"cannot write into this folder \(.*file is a file\)"),
+        (tmp_path / ("x" * 300), "cannot be made"),
+        (f"{tmp_path}/a\0b", "cannot be made"),
+    ):
+        with pytest.raises(UserError, match=said):
+            check_run_folder(out)
+    check_run_folder(tmp_path / "new" / "deeper")
+    assert os.listdir(tmp_path) == ["file"]

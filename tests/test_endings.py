@@ -1,0 +1,161 @@
+"""However a program is stopped, it says one line, has a status of its own and leaves nothing half-written."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+
+from egs_warp.commands.endings import Ended, one_line_errors
+from egs_warp.errors import UserError
+
+
+def program(body: str) -> list[str]:
+    code = "import os, signal, sys, threading, time\nfrom egs_warp.commands.endings import one_line_errors\n"
+    code += "with one_line_errors('prog'):\n" + textwrap.indent(textwrap.dedent(body), "    ")
+    return [sys.executable, "-c", code]
+
+
+def ended(body: str) -> tuple[int, str]:
+    done = subprocess.run(program(body), capture_output=True, text=True, timeout=60)
+    return done.returncode, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "line"),
+    [
+        (UserError("bad"), 2, "prog: bad\n"),
+        (KeyboardInterrupt(), 130, "prog: stopped; finished files are whole, unfinished ones are gone\n"),
+        (MemoryError(), 1, "prog: not enough memory; give a smaller capture, picture or number of Gaussians\n"),
+        (
+            OSError(errno.ENOSPC, "No space left on device", "out/a.ply"),
+            1,
+            "prog: out/a.ply: No space left on device; free some space, or choose another place\n",
+        ),
+    ],
+)
+def test_each_end_is_one_line(error: BaseException, status: int, line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(Ended) as end, one_line_errors("prog"):
+        raise error
+    assert end.value.code == status and capsys.readouterr().err == line
+
+
+def test_errors_of_our_own_keep_their_traceback() -> None:
+    for error in (ZeroDivisionError(), FileNotFoundError(errno.ENOENT, "gone", "x")):
+        with pytest.raises(type(error)), one_line_errors("prog"):
+            raise error
+
+
+@pytest.mark.parametrize(
+    ("number", "status", "line"), [(signal.SIGINT, 130, "stopped"), (signal.SIGTERM, 143, "asked to")]
+)
+def test_signals_unwind(number: signal.Signals, status: int, line: str, tmp_path: Path) -> None:
+    body = f"""
+        from egs_warp.io.atomic import atomic_write
+        with atomic_write({str(tmp_path / "a.json")!r}) as temporary:
+            temporary.write_text("half")
+            os.kill(os.getpid(), {int(number)})
+            time.sleep(10)
+    """
+    code, said = ended(body)
+    assert code == status and said.startswith(f"prog: {line}") and said.count("\n") == 1
+    assert os.listdir(tmp_path) == []
+
+
+def test_an_interrupt_that_a_destructor_swallows_comes_again() -> None:
+    body = """
+        class Thing:
+            def __del__(self):
+                raise KeyboardInterrupt
+        thing = Thing()
+        del thing
+        time.sleep(10)
+    """
+    code, said = ended(body)
+    assert code == 130 and said == "prog: stopped; finished files are whole, unfinished ones are gone\n"
+
+
+def test_a_second_interrupt_ends_at_once() -> None:
+    body = """
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(10)
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(10)
+    """
+    assert ended(body) == (130, "")
+
+
+def test_a_closed_pipe_only_silences() -> None:
+    body = """
+        for _ in range(20000):
+            print("x" * 50)
+            print("y" * 50, file=sys.stderr)
+        open(sys.argv[1], "w").write("done") if len(sys.argv) > 1 else None
+    """
+    run = subprocess.Popen(program(body), stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert run.stdout is not None and run.stderr is not None
+    run.stdout.read(10)
+    run.stdout.close()
+    run.stderr.close()
+    assert run.wait(60) == 0
+
+
+def test_the_command_is_quick_to_refuse() -> None:
+    """No heavy package is imported for a wrong flag or the version."""
+    code = "import sys\nfrom egs_warp.cli import main\ntry:\n main(sys.argv[1:])\nexcept SystemExit as end:\n"
+    code += " print(end.code, *sorted({'warp', 'numpy', 'scipy', 'torch', 'cv2'} & set(sys.modules)))"
+    for flags, said in (
+        (["--version"], "egs-warp 0.1.0\n0\n"),
+        (["animate", "--wrong"], "2\n"),
+        (["train", "--help"], "0\n"),
+    ):
+        done = subprocess.run([sys.executable, "-c", code, *flags], capture_output=True, text=True, check=True)
+        assert done.stdout.endswith(said)
+
+
+def test_an_unwritable_kernel_cache_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    run = [sys.executable, "-m", "egs_warp.cli", "animate", "none.ply", "--out", str(tmp_path / "out")]
+    environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "file" / "cache")}
+    done = subprocess.run(run, capture_output=True, text=True, env=environment)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert "cache: cannot be made (Not a directory); set WARP_CACHE_PATH to a folder that can be written" in done.stderr
+
+
+def test_a_machine_without_a_gpu_is_not_warned() -> None:
+    run = [sys.executable, "-m", "egs_warp.cli", "animate", "none.ply", "--out", "never"]
+    done = subprocess.run(run, capture_output=True, text=True)
+    assert done.stderr == "egs-warp: none.ply: no such file or folder; check the path\n"
+
+
+@pytest.mark.parametrize("after", [0.05, 0.3, 0.8, 1.5, 2.5, 4.0])
+def test_ctrl_c_in_any_phase_is_one_line(after: float, tmp_path: Path) -> None:
+    """Imports, preparation, simulation and film of a short run: none leaves a traceback or a half-written file."""
+    code = """
+        import numpy as np
+        import egs_warp as egs
+        pawn = egs.scene("pawn", device="cpu")
+        options = egs.AnimateOptions(frames=60, size=64)
+        egs.animate(pawn.object, sys.argv[1], plane=pawn.plane, options=options, quiet=True)
+    """
+    out = tmp_path / "out"
+    run = subprocess.Popen([*program(code), str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # Python itself takes a moment until anything of ours runs.
+    time.sleep(0.5 + after)
+    run.send_signal(signal.SIGINT)
+    said = run.communicate(timeout=60)[1]
+    if run.returncode != 0:
+        assert run.returncode == 130
+        lines = [line for line in said.splitlines() if not line.startswith("Warp")]
+        assert lines == ["prog: stopped; finished files are whole, unfinished ones are gone"]
+    if out.exists():
+        assert not [name for name in os.listdir(out) if name.startswith(".egs-")]
