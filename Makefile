@@ -3,10 +3,12 @@ PYTHON ?= python3
 VENV := .venv
 # Frames of each example; as many as its motion takes where this is empty.
 FRAMES ?=
+# Of make fuzz, for all readers together.
+MINUTES ?= 10
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-rest test-all setup lint types docs pictures build web examples clean
+.PHONY: demo test test-rest test-all fuzz setup lint types docs pictures build web examples clean
 
 demo: $(VENV)/demo.stamp
 	$(BIN)/python examples/jump.py --out out/jump $(FRAMES:%=--frames %)
@@ -28,6 +30,11 @@ test-rest: setup
 	$(PYTEST) -m "slow or data or example"
 
 test-all: test test-rest
+
+# Damaged files for every reader; Atheris drives them where it installs. What breaks a reader is kept in tests/corpus.
+fuzz: setup
+	-$(PIP) -e ".[fuzz]"
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz --minutes $(MINUTES)
 
 setup: $(VENV)/setup.stamp
 

@@ -28,7 +28,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         # The first run compiles the kernels.
         animate(scene.cloud, folder, plane=scene.plane, options=AnimateOptions(frames=1), quiet=True)
         asked = AnimateOptions(frames=frames, seed=options.seed)
-        told, milliseconds = timed(animate, scene.cloud, folder, plane=scene.plane, options=asked, quiet=True)
+        told, milliseconds = timed(
+            animate, scene.cloud, folder, plane=scene.plane, options=asked, quiet=True, overwrite=True
+        )
     seconds = 1e-3 * milliseconds
     rows = [{"stage": stage, **asdict(time)} for stage, time in told.timing.items()]
     gibibytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20

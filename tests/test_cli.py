@@ -61,11 +61,15 @@ def test_bad_input_is_one_line(
         (["--up", "-w"], "argument --up: expected one argument"),
         (["--frames", "many"], "argument --frames: invalid int value: 'many'; see egs-warp animate --help"),
         (["--nonsense"], "unrecognized arguments: --nonsense"),
+        (["--out", ""], "argument --out: nothing is given; give a name"),
+        (["--out", "{tmp}/file/out"], "file is a file); choose another one"),
     ],
 )
 def test_values_may_begin_with_a_minus_and_wrong_flags_take_one_line(
     flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    (tmp_path / "file").write_text("")
+    flags = [flag.format(tmp=tmp_path) for flag in flags]
     try:
         status = main(["animate", str(tmp_path / "nothing.ply"), "--out", str(tmp_path / "out"), *flags])
     except SystemExit as stop:

@@ -54,6 +54,8 @@ def sharp_frames(video: Path, count: int) -> Iterator[Frame]:
 
 def _check(video: Path) -> None:
     """Refuse what is no video by its first bytes: a playlist would have other files and addresses opened."""
+    if not video.is_file():
+        raise UserError(f"{video}: no such file; give a video or a folder of photos")
     try:
         with open(video, "rb") as file:
             start = file.read(12)

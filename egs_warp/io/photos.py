@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,10 +13,15 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.lens import Straightening
 from egs_warp.io.cameras import PosedImage
-from egs_warp.io.limits import check_pixels, picture_size
+from egs_warp.io.limits import MOST_PIXELS, check_pixels, picture_size
 
 _ORIENTATION = 0x0112
 """The EXIF tag that says how a viewer must turn the picture."""
+_PNG = b"\x89PNG\r\n\x1a\n"
+_CHUNK = 12
+"""Bytes of a chunk of a PNG around what it holds."""
+_LARGER_SIDES = 16
+"""A photo has at most so many times the side of its camera."""
 _SAME_ASPECT = 0.01
 """Relative difference up to which a photo is its camera's at another size."""
 
@@ -43,6 +49,12 @@ def read_photo(posed: PosedImage, *, max_side: int | None = None) -> Photo:
     """
     if posed.image is None:
         raise UserError(f"{posed.name}: the photo is not beside the poses; put it there")
+    size = picture_size(posed.image, f"{posed.image}: it")
+    if size is not None:
+        # Before it is decoded: a small file may hold a very large picture.
+        most = _LARGER_SIDES**2 * posed.camera.width * posed.camera.height
+        check_pixels(*size, f"{posed.image}: it", at_most=min(most, MOST_PIXELS))
+        _turn_to_fit(posed, size[::-1])
     pixels = decoded(posed.image)
     turn = _turn_to_fit(posed, pixels.shape[:2])
     shape = pixels.shape[:2]
@@ -123,7 +135,7 @@ def decoded(image: Path) -> np.ndarray:
     size = picture_size(image, f"{image}: it")
     if size is not None:
         check_pixels(*size, f"{image}: it")
-    pixels = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)
+    pixels = _pixels(image, cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise UserError(f"{image}: not a readable picture; export it again as PNG or JPEG")
     if image.suffix.lower() in (".jpg", ".jpeg"):
@@ -134,6 +146,23 @@ def decoded(image: Path) -> np.ndarray:
         except Exception as error:
             raise UserError(f"{image}: the picture is cut short; copy it again") from error
     return pixels
+
+
+def _pixels(image: Path, how: int) -> np.ndarray | None:
+    """What OpenCV makes of a file, None if nothing.
+
+    It allocates what a chunk of a PNG claims to hold, so that is checked before.
+    """
+    with open(image, "rb") as file:
+        left = os.fstat(file.fileno()).st_size - len(_PNG)
+        if file.read(len(_PNG)) == _PNG:
+            while (start := file.read(8)) and len(start) == 8 and start[4:] != b"IEND":
+                length = int.from_bytes(start[:4], "big")
+                left -= _CHUNK + length
+                if left < 0:
+                    raise UserError(f"{image}: the picture is cut short; copy it again")
+                file.seek(length + 4, os.SEEK_CUR)
+    return cv2.imread(str(image), how)
 
 
 def _turn_to_fit(posed: PosedImage, shape: tuple[int, ...]) -> int:
@@ -176,7 +205,7 @@ def _mask_of(image: Path, name: str, shape: tuple[int, ...], turn: int) -> np.nd
             f"{path}: {size[0]} x {size[1]} pixels, but its photo has {shape[1]} x {shape[0]};"
             " make the mask from the same photo"
         )
-    pixels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    pixels = _pixels(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if pixels is None:
         raise UserError(f"{path}: not a readable picture; export the mask again")
     if pixels.shape == shape:

@@ -13,6 +13,7 @@ from egs_warp.contact.terrain import Solid
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
+from egs_warp.io.atomic import atomic_write
 from egs_warp.io.run_folder import RunFolder, run_folder
 from egs_warp.io.video import ffmpeg_program
 from egs_warp.locomotion.stepper import LocomotionSettings
@@ -163,7 +164,8 @@ def animate(
             )
         # Whatever becomes of the film, the simulation is not lost.
         performance.trajectory.placed(creature.frame).save(run.file("trajectory.npz"))
-        creature.cage.mesh.write_vtu(run.file("cage.vtu"))
+        with atomic_write(run.file("cage.vtu")) as temporary:
+            creature.cage.mesh.write_vtu(temporary)
         film = draw_film(
             performance,
             run,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import cv2
@@ -48,4 +49,10 @@ def test_no_video_is_one_line(tmp_path: Path) -> None:
 def test_playlists_are_no_videos(text: str, tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_text(text)
     with pytest.raises(UserError, match=r"a\.mp4: no video that can be read; give an \.mp4 or \.mov"):
+        next(sharp_frames(tmp_path / "a.mp4", 3))
+
+
+def test_a_pipe_is_no_video(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.mp4")
+    with pytest.raises(UserError, match=r"a\.mp4: no such file; give a video or a folder of photos"):
         next(sharp_frames(tmp_path / "a.mp4", 3))

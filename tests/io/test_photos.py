@@ -13,7 +13,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.lens import Lens
 from egs_warp.io.cameras import PosedImage
-from egs_warp.io.photos import orientation, read_photo, turned
+from egs_warp.io.photos import decoded, orientation, read_photo, turned
 
 # No two corners alike, smooth enough for JPEG.
 ROWS, COLUMNS = np.mgrid[:40, :60]
@@ -93,3 +93,13 @@ def test_what_the_lens_did_not_see_stays_unknown_when_reduced(tmp_path: Path) ->
         assert photo.known is not None
         assert 0.3 < photo.known.mean() < 1.0
         np.testing.assert_allclose(photo.colour[photo.known], 1.0, atol=1e-3)
+
+
+def test_a_png_that_claims_more_than_it_holds(tmp_path: Path) -> None:
+    """Found by Atheris: OpenCV took 1.8 GiB for a file of 135 bytes."""
+    data = bytearray(cv2.imencode(".png", np.zeros((16, 24, 3), np.uint8))[1].tobytes())
+    place = data.index(b"IDAT") - 4
+    data[place : place + 4] = b"nanN"
+    (tmp_path / "a.png").write_bytes(data)
+    with pytest.raises(UserError, match=r"a\.png: the picture is cut short; copy it again"):
+        decoded(tmp_path / "a.png")

@@ -1,0 +1,120 @@
+"""What happens to a run when the machine fails it: the simulation stays, nothing is half-written or mixed."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import replace as replaced
+from itertools import count
+from pathlib import Path
+
+import pytest
+
+from egs_warp.assets import pawn
+from egs_warp.errors import UserError
+from egs_warp.io.run_folder import MANIFEST
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.script import motion
+from egs_warp.pipelines.animate import AnimateOptions, animate
+from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.performance import Performance, simulate
+from egs_warp.pipelines.report import Report, verdict
+
+FILES = ["cage.vtu", "jump.mp4", MANIFEST, "report.json", "sheet.png", "trajectory.npz"]
+OPTIONS = AnimateOptions(frames=1, size=32, friction=0.6)
+
+
+@pytest.fixture(scope="module")
+def performance() -> Performance:
+    thing = pawn(device="cpu")
+    creature = make_creature(thing.cloud, plane=thing.plane, friction=0.6)
+    return simulate(creature, motion("jump"), frames=1)
+
+
+@pytest.fixture
+def run(performance: Performance, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Report]:
+    """``animate`` without the seconds before its first file."""
+    monkeypatch.setattr("egs_warp.pipelines.animate.make_creature", lambda *_, **__: performance.creature)
+    monkeypatch.setattr("egs_warp.pipelines.animate.simulate", lambda *_, **__: performance)
+    thing = pawn(device="cpu")
+
+    def animated(out: Path, *, overwrite: bool = False) -> Report:
+        return animate(thing.cloud, out, plane=thing.plane, options=OPTIONS, quiet=True, overwrite=overwrite)
+
+    return animated
+
+
+def finished(folder: Path) -> bool:
+    return json.loads((folder / MANIFEST).read_text())["finished"]
+
+
+def test_a_run_holds_what_was_asked_and_its_manifest(run: Callable[..., Report], tmp_path: Path) -> None:
+    report = run(tmp_path)
+    assert sorted(os.listdir(tmp_path)) == FILES and finished(tmp_path)
+    asked = json.loads((tmp_path / "report.json").read_text())["asked"]
+    assert asked["friction"] == 0.6 and asked["size"] == 32 and asked["frames"] == 1 and asked["up"] is None
+    assert asked["plane"] == pytest.approx([*pawn(device="cpu").plane.normal, pawn(device="cpu").plane.offset])
+    assert verdict(report.audit).startswith("audit: passed (momentum_residual ")
+
+
+def test_a_film_that_fails_leaves_the_simulation(
+    run: Callable[..., Report], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_: object, **__: object) -> None:
+        raise UserError("film: cannot")
+
+    monkeypatch.setattr("egs_warp.pipelines.animate.draw_film", failing)
+    with pytest.raises(UserError, match="film: cannot"):
+        run(tmp_path)
+    assert len(Trajectory.load(tmp_path / "trajectory.npz").time) >= 2
+    assert not finished(tmp_path)
+
+
+def test_no_ffmpeg_is_told_before_anything_is_done(
+    run: Callable[..., Report], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/nowhere/ffmpeg")
+    with pytest.raises(UserError, match="no ffmpeg"):
+        run(tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_disk_that_is_full_at_any_file(
+    run: Callable[..., Report], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each renaming fails once in turn: one line, no temporary file, and what is there is not called finished.
+
+    The next run moves it aside.
+    """
+    replace, failures = os.replace, 0
+    for number in range(100):
+        folder, calls = tmp_path / str(number), count()
+
+        def failing(source: Path, target: Path, *, number: int = number, calls: Iterator[int] = calls) -> None:
+            if next(calls) == number:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            replace(source, target)
+
+        monkeypatch.setattr(os, "replace", failing)
+        try:
+            run(folder)
+            break
+        except UserError as error:
+            assert "cannot be written (No space left on device)" in str(error)
+            failures += 1
+        monkeypatch.setattr(os, "replace", replace)
+        names = os.listdir(folder)
+        assert not [name for name in names if name.startswith(".egs-")]
+        assert MANIFEST not in names or not finished(folder)
+        run(folder, overwrite=True)
+        assert finished(folder) and set(FILES) <= set(os.listdir(folder))
+    # Five files, the manifest before each of them and at the end.
+    assert failures == 11
+
+
+def test_a_verdict_names_what_is_beyond(run: Callable[..., Report], tmp_path: Path) -> None:
+    audit = run(tmp_path).audit
+    said = verdict(replaced(audit, penetration=0.02, momentum_residual=float("nan")))
+    assert said == "audit: FAILED: momentum_residual nan (at most 1e-05), penetration 0.02 (at most 0.01)"

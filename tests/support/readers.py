@@ -1,0 +1,303 @@
+"""Every reader of the package, with good files to begin from and what a file that is read must fulfil.
+
+``tests/support/damage.py`` makes inputs of them.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import struct
+import time
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from egs_warp.commands.object_flag import read_mask
+from egs_warp.contact.terrain import read_terrain
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.io import read_cameras, read_capture
+from egs_warp.io.cameras import PosedImage, read_points
+from egs_warp.io.limits import FURTHEST, LONGEST_SIDE
+from egs_warp.io.onnx import read_onnx
+from egs_warp.io.photos import read_photo
+from egs_warp.io.planes import read_planes
+from egs_warp.io.ply import read_point_ply
+from egs_warp.motions.keyframes import read_keyframes
+from egs_warp.motions.script import motion
+from egs_warp.muscles.files import read_muscles
+from tests.support import onnx
+from tests.support.captures import ARRAYS, good_bytes, small_cloud
+from tests.support.meshes import block_mesh
+
+LONGEST = 2.0
+"""Seconds that reading a small file may take."""
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One kind of file."""
+
+    name: str
+    file: str
+    """Name that the input gets."""
+    good: Callable[[], bytes]
+    read: Callable[[Path], Any]
+    """Reads the file and asserts what it must fulfil."""
+    beside: Callable[[], dict[str, bytes]] = dict
+    """Other files of the folder, by their names."""
+    wrap: Callable[[bytes], bytes] = bytes
+    """From an input to the file's bytes: damage behind a checksum."""
+    json: bool = False
+    """Inputs are trees."""
+
+
+class BrokenPromiseError(AssertionError):
+    """Neither a valid object nor one line, or too slow."""
+
+
+def outcome(reader: Reader, folder: Path, data: bytes) -> str:
+    """``valid`` or ``refused``; anything else raises ``BrokenPromiseError``."""
+    path = folder / reader.file
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(reader.wrap(data))
+    began = time.perf_counter()
+    try:
+        with np.errstate(all="ignore"):
+            reader.read(path)
+        said = "valid"
+    except UserError as error:
+        if "\n" in str(error):
+            raise BrokenPromiseError(f"{reader.name}: more than one line: {error}") from error
+        said = "refused"
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt | SystemExit):
+            raise
+        raise BrokenPromiseError(f"{reader.name}: {type(error).__name__}: {error}") from error
+    if time.perf_counter() - began > LONGEST:
+        raise BrokenPromiseError(f"{reader.name}: {time.perf_counter() - began:.1f} s")
+    return said
+
+
+def prepare(reader: Reader, folder: Path) -> None:
+    """Put what lies beside the input into ``folder``."""
+    for name, data in reader.beside().items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)
+
+
+# What is read must be usable --------------------------------------------------------------------------------------
+
+
+def _capture(path: Path) -> None:
+    cloud = read_capture(path, device="cpu").cloud
+    values = {name: getattr(cloud, name).numpy() for name in ARRAYS}
+    assert all(np.isfinite(array).all() for array in values.values())
+    assert (np.abs(values["means"]) <= 2e4 * FURTHEST).all() and (np.abs(values["sh"]) <= 1e3).all()
+    assert values["log_scales"].min() >= -100.0 and values["log_scales"].max() < 40.0
+    assert np.allclose(np.linalg.norm(values["rotations"], axis=1), 1.0, atol=1e-5)
+
+
+def _cameras(path: Path) -> None:
+    for one in read_cameras(path):
+        camera = one.camera
+        assert 1 <= camera.width <= LONGEST_SIDE and 1 <= camera.height <= LONGEST_SIDE
+        numbers = [camera.fx, camera.fy, camera.cx, camera.cy, *camera.translation, *camera.rotation.ravel()]
+        assert np.isfinite(numbers).all() and min(camera.fx, camera.fy) > 0
+
+
+def _colmap(path: Path) -> None:
+    _cameras(path.parent)
+    points = read_points(path.parent)
+    assert points is None or np.isfinite([points.positions, points.colours]).all()
+
+
+def _points(path: Path) -> None:
+    positions, colours = read_point_ply(path)
+    assert np.isfinite(positions).all() and np.isfinite(colours).all()
+
+
+def _planes(path: Path) -> None:
+    for known in read_planes(path):
+        assert np.isclose(np.linalg.norm(known.plane.normal), 1.0) and np.isfinite(known.plane.offset)
+        assert known.hole is None or (np.isfinite(known.hole.centre).all() and max(known.hole.texels) <= 8192)
+
+
+def _terrain(path: Path) -> None:
+    for solid in read_terrain(path):
+        assert all(np.isfinite([*face.normal, face.offset]).all() for face in solid.faces)
+
+
+def _muscles(path: Path) -> None:
+    muscles = read_muscles(path, block_mesh(), body_weight=10.0)
+    assert np.isfinite(muscles.stiffness).all() and muscles.segment_count <= 400
+
+
+def _script(path: Path) -> None:
+    assert 1 <= motion(str(path)).frames() < 10**6
+
+
+def _line(path: Path) -> None:
+    assert 1 <= motion(path.read_bytes().decode("latin-1")).frames() < 10**6
+
+
+def _keys(path: Path) -> None:
+    for key in read_keyframes(path):
+        assert np.isfinite([key.time, *key.value, key.weight]).all()
+
+
+def _photo(path: Path) -> None:
+    photo = read_photo(
+        PosedImage("a", Camera(24, 16, 30.0, 30.0, 12.0, 8.0, np.eye(3), np.zeros(3)), path), max_side=20
+    )
+    assert photo.colour.shape == (photo.camera.height, photo.camera.width, 3)
+
+
+# Good files -------------------------------------------------------------------------------------------------------
+
+
+def _text_ply() -> bytes:
+    data = good_bytes("a.ply")
+    end = data.index(b"end_header\n") + 11
+    rows = np.frombuffer(data[end:], "<f4").reshape(small_cloud().count, -1)
+    header = data[:end].replace(b"binary_little_endian", b"ascii")
+    return header + "\n".join(" ".join(f"{value:.6g}" for value in row) for row in rows).encode() + b"\n"
+
+
+def _point_ply() -> bytes:
+    header = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\n"
+    header += b"property float x\nproperty float y\nproperty float z\n"
+    header += b"property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+    return header + struct.pack("<3f3B", 1, 2, 3, 255, 0, 128) * 2
+
+
+@cache
+def _sog() -> dict[str, bytes]:
+    with zipfile.ZipFile(io.BytesIO(good_bytes("a.sog"))) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def _picture(kind: str, mode: str) -> bytes:
+    data = io.BytesIO()
+    pixels = np.arange(16 * 24 * len(mode), dtype=np.uint8).reshape(16, 24, -1)
+    Image.fromarray(pixels.squeeze(), mode).save(data, kind)
+    return data.getvalue()
+
+
+def _lod_meta() -> bytes:
+    leaves = [{"bound": {"min": [0, 0, 0]}, "lods": {"0": {"file": 0, "offset": k, "count": 1}}} for k in range(3)]
+    return _json({"lodLevels": 2, "filenames": ["0_0/meta.json"], "tree": {"children": leaves}})
+
+
+def _json(tree: Any) -> bytes:
+    return json.dumps(tree).encode()
+
+
+_POSE = {"position": [0.0, 1.0, 2.0], "rotation": np.eye(3).tolist()}
+_INRIA = [{"id": 0, "img_name": "a", "width": 24, "height": 16, "fx": 30.0, "fy": 30.0, **_POSE}]
+_TRANSFORMS = {
+    **{"w": 24, "h": 16, "fl_x": 30.0, "cx": 12.0, "k1": 0.1, "p1": 0.0, "camera_model": "OPENCV"},
+    "frames": [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}],
+}
+_PLANES = {
+    "planes": [
+        {
+            **{"normal": [0, 0, 1], "offset": 0.5, "centre": [0, 0, 0], "size": 1.0, "pixels": 300, "mine": "text"},
+            "hole": {"centre": [0, 0, 0], "texel": 0.1, "texels": [20, 20], "outlines": [[[1, 1], [5, 1], [5, 5]]]},
+        }
+    ]
+}
+_MUSCLES = {
+    "max_strain": 0.2,
+    "mirror_plane": {"point": [0, 0, 0], "normal": [1, 0, 0]},
+    "fibres": [
+        {
+            "name": "a",
+            "kind": "longitudinal",
+            "from": [0.1, 0, 0.1],
+            "to": [0.1, 0, 0.8],
+            "segments": 3,
+            "mirror": True,
+        },
+        {"name": "b", "kind": "circular", "centre": [0, 0, 0.5], "axis": [0, 0, 1], "radius": 0.1, "strength": 1.0},
+        {"name": "c", "kind": "radial", "centre": [0, 0, 0.4], "axis": [0, 0, 1], "radius": 0.1, "stiffness": 5.0},
+        {"name": "d", "kind": "polyline", "points": [[0, 0, 0.2], [0, 0.1, 0.4], [0, 0, 0.6]], "group": "g"},
+    ],
+}
+_SCRIPT = [{"motion": "hop", "repeat": 2, "distance": 0.5}, {"motion": "twist", "heading_degrees": 90}]
+_KEYS = [{"time": 0.5, "part": "head", "quantity": "position", "value": [0, 0, -0.1], "weight": 2.0}]
+_CSV = b"time,part,quantity,x,y,z,weight\n0.5,head,position,0,0,-0.1,1\n1.0,head,position,0,0,0.1,\n"
+_COLMAP = {
+    "cameras.txt": b"# cameras\n1 OPENCV 24 16 30 30 12 8 0.1 0 0 0\n",
+    "images.txt": b"# images\n1 1 0 0 0 0 0 2 1 a.png\n1.0 2.0 -1 3.0 4.0 1\n",
+    "points3D.txt": b"1 0.5 0.5 2 255 128 0 0.3 1 0\n2 1 1 3 0 0 0 0.1 1 1\n",
+}
+_SEEN = struct.pack("<Q2dq", 1, 3.0, 4.0, 1)
+_COLMAP_BIN = {
+    "cameras.bin": struct.pack("<QiiQQ4d", 1, 1, 1, 24, 16, 30.0, 30.0, 12.0, 8.0),
+    "images.bin": struct.pack("<Qi7di", 1, 1, 1, 0, 0, 0, 0, 0, 2, 1)
+    + b"a.png\0"
+    + struct.pack("<Q2dq", 1, 3.0, 4.0, 1),
+    "points3D.bin": struct.pack("<QQ3d3Bd", 1, 1, 0.5, 0.5, 2.0, 255, 128, 0, 0.3) + struct.pack("<Q2i", 1, 1, 0),
+}
+
+
+def _network() -> bytes:
+    names = ["batch", "height", "width"]
+    value = onnx.value("image", [names[0], 3, *names[1:]])
+    constant = onnx.tensor("c", [1], [1.0])
+    return onnx.model(
+        [onnx.node("Mul", ["image", "mask"], ["out"])], [constant], [value, onnx.value("mask", [1])], [value]
+    )
+
+
+def _zip_with_meta(meta: bytes) -> bytes:
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w") as archive:
+        for name, content in (_sog() | {"meta.json": meta}).items():
+            archive.writestr(name, content)
+    return data.getvalue()
+
+
+READERS: tuple[Reader, ...] = (
+    Reader("ply", "a.ply", lambda: good_bytes("a.ply"), _capture),
+    Reader("text ply", "a.ply", _text_ply, _capture),
+    Reader("compressed ply", "a.ply", lambda: good_bytes("b.ply"), _capture),
+    Reader("spz", "a.spz", lambda: good_bytes("a.spz"), _capture),
+    Reader("spz inside gzip", "a.spz", lambda: gzip.decompress(good_bytes("a.spz")), _capture, wrap=gzip.compress),
+    Reader("splat", "a.splat", lambda: good_bytes("a.splat"), _capture),
+    Reader("sog", "a.sog", lambda: good_bytes("a.sog"), _capture),
+    Reader("sog meta", "a.sog", lambda: _sog()["meta.json"], _capture, wrap=_zip_with_meta, json=True),
+    Reader("sog picture", "means_u.webp", lambda: _sog()["means_u.webp"], lambda p: _capture(p.parent), beside=_sog),
+    Reader(
+        **{"name": "lod-meta", "file": "lod-meta.json", "good": _lod_meta, "read": _capture, "json": True},
+        beside=lambda: {f"0_0/{name}": data for name, data in _sog().items()},
+    ),
+    Reader("cameras.json", "cameras.json", lambda: _json(_INRIA), _cameras, json=True),
+    Reader("transforms.json", "transforms.json", lambda: _json(_TRANSFORMS), _cameras, json=True),
+    *(Reader(f"colmap {name}", name, lambda name=name: _COLMAP[name], _colmap, lambda: _COLMAP) for name in _COLMAP),
+    *(
+        Reader(f"colmap {name}", name, lambda name=name: _COLMAP_BIN[name], _colmap, lambda: _COLMAP_BIN)
+        for name in _COLMAP_BIN
+    ),
+    Reader("point ply", "input.ply", _point_ply, _points),
+    Reader("plane.json", "plane.json", lambda: _json(_PLANES), _planes, json=True),
+    Reader("terrain", "terrain.json", lambda: _json([[[0, 0, 1, -0.1], [-1, 0, 0, 0.5]]]), _terrain, json=True),
+    Reader("muscles", "muscles.json", lambda: _json(_MUSCLES), _muscles, json=True),
+    Reader("script", "script.json", lambda: _json(_SCRIPT), _script, json=True),
+    Reader("motion line", "line.txt", lambda: b"hop x3, twist 180, walk 2, jump 0.5 height=0.3", _line),
+    Reader("key frames", "keys.json", lambda: _json(_KEYS), _keys, json=True),
+    Reader("key frames csv", "keys.csv", lambda: _CSV, _keys),
+    Reader("mask", "mask.png", lambda: _picture("PNG", "L"), read_mask),
+    Reader("photo png", "a.png", lambda: _picture("PNG", "RGB"), _photo),
+    Reader("photo jpeg", "a.jpg", lambda: _picture("JPEG", "RGB"), _photo),
+    Reader("onnx", "a.onnx", _network, read_onnx),
+)

@@ -1,0 +1,44 @@
+"""Whatever the bytes, a reader gives a valid object or one line: the short form of ``make fuzz``."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.support.damage import damaged
+from tests.support.readers import READERS, Reader, outcome, prepare
+
+CORPUS = Path(__file__).parent / "corpus"
+NAMES = [reader.name for reader in READERS]
+
+
+@pytest.mark.parametrize("reader", READERS, ids=NAMES)
+def test_the_good_file_is_valid(reader: Reader, tmp_path: Path) -> None:
+    prepare(reader, tmp_path)
+    assert outcome(reader, tmp_path, reader.good()) == "valid"
+
+
+@settings(
+    max_examples=60,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much],
+)
+@given(st.data())
+@pytest.mark.parametrize("reader", READERS, ids=NAMES)
+def test_damaged_files(reader: Reader, data: st.DataObject) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        prepare(reader, Path(folder))
+        assert outcome(reader, Path(folder), data.draw(damaged(reader))) in ("valid", "refused")
+
+
+@pytest.mark.parametrize("found", sorted(CORPUS.glob("*/*")), ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_cases_that_were_found(found: Path, tmp_path: Path) -> None:
+    """Each broke a reader once; ``make fuzz`` put them here."""
+    (reader,) = [reader for reader in READERS if reader.name.replace(" ", "_") == found.parent.name]
+    prepare(reader, tmp_path)
+    assert outcome(reader, tmp_path, found.read_bytes()) in ("valid", "refused")
