@@ -22,7 +22,7 @@ from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.performance import Performance, simulate
 from egs_warp.pipelines.report import Report, verdict
 
-FILES = ["cage.vtu", "jump.mp4", MANIFEST, "report.json", "sheet.png", "trajectory.npz"]
+FILES = ["cage.vtu", "creature.npz", "jump.mp4", MANIFEST, "report.json", "sheet.png", "trajectory.npz"]
 OPTIONS = AnimateOptions(frames=1, size=32, friction=0.6)
 
 
@@ -110,8 +110,8 @@ def test_a_disk_that_is_full_at_any_file(
         assert MANIFEST not in names or not finished(folder)
         run(folder, overwrite=True)
         assert finished(folder) and set(FILES) <= set(os.listdir(folder))
-    # Five files, the manifest before each of them and at the end.
-    assert failures == 11
+    # Six files, the manifest before each of them and at the end.
+    assert failures == 13
 
 
 def test_a_verdict_names_what_is_beyond(run: Callable[..., Report], tmp_path: Path) -> None:
