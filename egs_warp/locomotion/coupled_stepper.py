@@ -5,6 +5,7 @@ It replaces ``stepper`` once a whole run shows it no worse; until then nothing b
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -18,11 +19,10 @@ from egs_warp.contact.points import ContactPoints
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.locomotion.complementarity import SEPARATE, ContactLayout, states_from_prediction
-from egs_warp.locomotion.objectives import Objective, SpinObjective, lifted_contacts
-from egs_warp.locomotion.program import CostScales, LinearResponse, program_of
+from egs_warp.locomotion.contact_pieces import ContactModes, ContactPieces, search_pieces
+from egs_warp.locomotion.objectives import Objective, SpinObjective
 from egs_warp.locomotion.stepper import LocomotionSettings, StepMemory, StepReport
-from egs_warp.locomotion.strategies import SearchResult, find_states
+from egs_warp.locomotion.strategies import SearchResult
 from egs_warp.locomotion.synergies import find_synergies
 from egs_warp.muscles.muscle_set import MuscleColumns, MuscleSet
 from egs_warp.muscles.tension import MuscleTension
@@ -72,6 +72,14 @@ class CoupledStepper:
     def initial_memory(self) -> StepMemory:
         """No contacts, muscles at rest."""
         return StepMemory(np.zeros(0, int), np.zeros((0, 3)), np.zeros(self.muscles.segment_count))
+
+    def passive_step(self, state: BodyState, memory: StepMemory, dt: float) -> CoupledResult:
+        """A step of ``dt`` s without muscles."""
+        problem = StepProblem(self.body, state, dt)
+        contacts = self._detect(problem, memory)
+        response = ContactResponse.of(problem.tangent(self._factors, state.velocities, None), contacts)
+        forces = self.points.matched(contacts.points, memory.points, memory.forces)
+        return self.solver.solve(response, None, velocities=state.velocities, forces=forces)
 
     def advance(
         self,
@@ -148,93 +156,124 @@ class CoupledStepper:
         clock: _Clock,
     ) -> _Plan:
         problem, settings, members = response.tangent.problem, self.settings, self.synergies.members
-        regions = self._regions(response.contacts, forces)
-        count = regions.get_shape()[1]
-        layout = ContactLayout(self.synergies.count, count, settings.directions)
-        spread = sparse.kron(regions, np.eye(3)).tocsr()
-        frame = (spread.T @ response.contacts.frame).tocsr()
+        contacts, weight = response.contacts, self.body.weight
         each = self._columns.sparse(problem.end_positions(foreseen)).toarray() * self.muscles.bounds
         actuation = (members.T @ each.T).T
+        m = self.synergies.count
         # Without muscles and contact, in their stiffness at last step's tension.
         free = problem.residual(foreseen, None).ravel()
         solved = response.tangent.solve(np.column_stack([problem.dt * actuation, free]))
-        table = tangent_directions(settings.directions)
-
-        def by_unknown(columns: np.ndarray) -> np.ndarray:
-            """(rows, variables) from those of the muscles (rows, M) and of the normals and tangents (rows, n, 3)."""
-            forces = self.body.weight * (columns @ spread).reshape(len(columns), count, 3)
-            tangent = np.einsum("vnt,dt->vnd", forces[:, :, 1:], table).reshape(len(columns), count * len(table))
-            return np.hstack([forces[:, :, 0], tangent, np.zeros((len(columns), count))])
-
-        # How the foreseen forces differ from those that regions can make stays as it is.
-        totals = np.asarray(regions.astype(bool).astype(float).T @ forces)
-        uneven = (forces - regions @ totals).ravel()
-        linear = LinearResponse(
-            foreseen.ravel() - solved[:, -1] + response.columns @ uneven,
-            np.hstack([solved[:, :-1], by_unknown(response.columns)]),
+        base = foreseen.ravel() - solved[:, -1]
+        to_velocity = np.hstack([solved[:, :-1], weight * response.columns])
+        torques = np.hstack(
+            [np.zeros((3, m)), problem.dt * weight * (problem.turns.T @ contacts.frame.T.toarray())]
         )
-        torques = problem.dt * (problem.turns.T @ response.contacts.frame.T)
-        moments = np.hstack([np.zeros((3, layout.activations)), by_unknown(torques)])
-        shift = self.solver.shift(response.contacts, problem.dt)
+        shift = self.solver.shift(contacts, problem.dt)
         clock.lap("linearise")
         share = problem.dt * _STEPS_A_UNIT / np.sqrt(self.body.height / np.linalg.norm(self.body.gravity))
-        strength = self.muscles.max_forces / (_ORDINARY_STRENGTH * self.body.weight)
+        strength = self.muscles.max_forces / (_ORDINARY_STRENGTH * weight)
         previous = self.synergies.mean(memory.activations / self.muscles.bounds)
-        program = program_of(
-            problem,
-            linear,
-            frame,
-            regions.T @ shift,
-            moments,
-            layout,
-            objectives,
-            previous,
-            friction=self.geometry.friction,
-            scales=CostScales(
-                self.speed_scale,
-                settings.activation_weight * share**2 * (members.T @ strength),
-                settings.activation_change_weight * share * (members.T @ strength**2),
-            ),
-        )
-        slip = (frame @ foreseen.ravel()).reshape(-1, 3)[:, 1:]
-        states = states_from_prediction(totals[:, 0], totals[:, 1:], slip, self.geometry.friction, settings.directions)
-        states[regions.T @ lifted_contacts(response.contacts, objectives) > 0.5] = SEPARATE
+        effort = settings.activation_weight * share**2 * (members.T @ strength)
+        change = settings.activation_change_weight * share * (members.T @ strength**2)
+        P, q, constant = self._cost(problem, base, to_velocity, torques, objectives, foreseen)
+        k = np.arange(m)
+        P[k, k] += 2.0 * (effort + change) + 1e-7
+        q[:m] -= 2.0 * change * previous
+        constant += float(change @ previous**2)
+        rows = np.hstack([contacts.frame @ solved[:, :-1], weight * response.delassus]) / self.speed_scale
+        offset = contacts.frame @ base / self.speed_scale
+        offset[::3] += shift / self.speed_scale
         reach = _FASTEST * problem.dt / np.sqrt(self.body.height / np.linalg.norm(self.body.gravity))
-        program = replace(program, reachable=(np.maximum(previous - reach, -1.0), np.minimum(previous + reach, 1.0)))
-        found = find_states(
-            program, settings.strategy, states, previous, qp_limit=settings.qp_limit, solver=settings.qp_solver
+        program = ContactPieces(
+            P,
+            q,
+            constant,
+            rows,
+            offset,
+            self.geometry.friction,
+            np.maximum(previous - reach, -1.0),
+            np.minimum(previous + reach, 1.0),
         )
+        start = np.concatenate([previous, forces.ravel() / weight])
+        modes = ContactModes.of(forces, (contacts.frame @ foreseen.ravel()).reshape(-1, 3), self.geometry.friction)
+        clock.lap("program")
+        found = search_pieces(program, start, modes, qp_limit=settings.qp_limit, solver=settings.qp_solver)
         clock.lap("qp")
-        if found.y is None:
-            return _Plan(memory.activations, foreseen, forces, found)
-        activations = (members @ np.clip(found.y[: layout.activations], -1.0, 1.0)) * self.muscles.bounds
-        moved = linear.base + linear.response[:, : layout.activations] @ found.y[: layout.activations]
-        forces = response.forces(moved, shift, self.geometry.friction, forces)
+        search = SearchResult(found.x, False, modes.kind, found.objective, found.qp_count, found.infeasible)
+        if found.x is None:
+            return _Plan(memory.activations, foreseen, forces, search)
+        activations = (members @ np.clip(found.x[:m], -1.0, 1.0)) * self.muscles.bounds
+        moved = base + solved[:, :-1] @ found.x[:m]
+        planned = weight * found.x[m:].reshape(-1, 3)
+        forces = response.forces(moved, shift, self.geometry.friction, planned)
+        if os.environ.get("DBG"):
+            vq = base + to_velocity @ found.x
+            parts = []
+            for o in objectives:
+                if isinstance(o, SpinObjective):
+                    gy = np.sqrt(0.5 * np.trace(self.body.inertia(problem.state.positions)) / self.body.mass)
+                    un = self.body.mass * gy * self.speed_scale
+                    e = (torques @ found.x + self.body.angular_momentum(problem.state.positions, problem.state.velocities) - o.target) / un
+                else:
+                    e = (o.rows @ vq - o.target) / self.speed_scale
+                parts.append("%s %.3f (%s)" % (getattr(o, "name", "spin"), o.weight * (e @ e), " ".join("%.3f" % z for z in e[:3])))
+            print("     ", "; ".join(parts))
+            self.dbg = dict(foreseen=start[m::3].sum(), planned=planned[:, 0].sum() / weight, vq=self.body.centre_of_mass(vq.reshape(-1,3))[2]/self.speed_scale, obj=found.objective, relaxed=found.infeasible, n=found.qp_count, act=np.abs(found.x[:m]).max(), sat=int((np.abs(found.x[:m]-previous)>reach-1e-4).sum()))
         velocities = (moved + response.columns @ forces.ravel()).reshape(foreseen.shape)
         if not problem.feasible(velocities):
             velocities = foreseen
-        return _Plan(activations, velocities, forces, found)
+        clock.lap("contact")
+        return _Plan(activations, velocities, forces, search)
 
-    def _regions(self, contacts: ContactSet, forces: np.ndarray) -> sparse.csr_matrix:
-        """(n, regions) share of each contact in the force of the region of the sole that stands for it in the program:
-        as the foreseen normal ``forces`` (n, 3) are shared, or alike where there are none.
-        """
-        _, region = np.unique(
-            np.column_stack([self.points.region_from_point[contacts.points], np.round(contacts.axes[:, 0], 6)]),
-            axis=0,
-            return_inverse=True,
-        )
-        region = region.ravel()
-        totals = np.bincount(region, forces[:, 0])
-        loaded = totals > _LOADED * self.body.weight
-        shares = np.where(loaded[region], forces[:, 0], 1.0)
-        shares = shares / np.bincount(region, shares)[region]
-        shape = (contacts.count, len(totals))
-        return sparse.csr_matrix((shares, (np.arange(contacts.count), region)), shape=shape)
+    def _cost(
+        self,
+        problem: StepProblem,
+        base: np.ndarray,
+        to_velocity: np.ndarray,
+        torques: np.ndarray,
+        objectives: Sequence[Objective | SpinObjective],
+        foreseen: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, float]:
+        """P, q and constant of the objectives over activations and forces."""
+        body, state = self.body, problem.state
+        count = to_velocity.shape[1]
+        P, q, constant = np.zeros((count, count)), np.zeros(count), 0.0
+        for objective in objectives:
+            if isinstance(objective, SpinObjective):
+                gyration = np.sqrt(0.5 * np.trace(body.inertia(state.positions)) / body.mass)
+                unit = body.mass * gyration * self.speed_scale
+                rows = torques / unit
+                gap = (body.angular_momentum(state.positions, state.velocities) - objective.target) / unit
+            else:
+                rows = (objective.rows @ to_velocity) / self.speed_scale
+                gap = (objective.rows @ base - objective.target) / self.speed_scale
+            P += 2.0 * objective.weight * rows.T @ rows
+            q += 2.0 * objective.weight * rows.T @ gap
+            constant += objective.weight * float(gap @ gap)
+        we = float(os.environ.get("WE", "0.1"))
+        if we > 0:
+            assembly, end = body.assembly, problem.end_positions(foreseen)
+            damping = problem.damping if os.environ.get('DMP', '1') == '1' else None
+            K = assembly.matrix(assembly.matrix_entries(end, damping, projected=True))
+            K = (K + sparse.triu(K, 1).T).tocsr()
+            tau = max(float(os.environ.get("TAU", "0")) * np.sqrt(body.height / 9.81), problem.dt)
+            moved = np.column_stack([tau * to_velocity, tau * base - problem.dt * foreseen.ravel()])
+            stiff = K @ moved
+            force = assembly.gradient(end, damping).ravel()
+            unit = we / (body.weight * body.height)
+            quadratic = moved.T @ stiff
+            P += unit * quadratic[:-1, :-1]
+            q += unit * (force @ moved[:, :-1] + quadratic[:-1, -1])
+            constant += unit * (assembly.energy(end, damping) + force @ moved[:, -1] + 0.5 * quadratic[-1, -1])
+        return P, q, constant
 
     def _finish(
         self, problem: StepProblem, plan: _Plan, result: CoupledResult, clock: _Clock
     ) -> tuple[BodyState, StepMemory, StepReport]:
+        if os.environ.get("DBG"):
+            w = self.body.weight; d = self.dbg
+            lin = plan.forces[:, 0].sum()/w
+            print("   fore %.2f planned %.2f lin %.2f got %.2f | com planned %.4f got %.4f before %.4f | obj %.2e relaxed %d n %d act %.2f sat %d newt %d tang %d" % (d["foreseen"], d["planned"], lin, result.forces[:,0].sum()/w, d["vq"], self.body.centre_of_mass(result.velocities)[2]/self.speed_scale, self.body.centre_of_mass(problem.state.velocities)[2]/self.speed_scale, d["obj"], d["relaxed"], d["n"], d["act"], d["sat"], result.iterations, result.tangents))
         end = problem.end_positions(result.velocities)
         gaps, _ = self.detector.gaps(end)
         after = BodyState(end, result.velocities, problem.state.time + problem.dt)

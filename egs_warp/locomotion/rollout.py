@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
-from egs_warp.contact.corrector import contact_step
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.fem.factorisation import Factorisation
-from egs_warp.fem.implicit_step import ImplicitStep
+from egs_warp.locomotion.coupled_stepper import CoupledStepper
 from egs_warp.locomotion.objectives import Objective, SpinObjective
-from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
+from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory, record
 
 FRAME_RATE = 60
@@ -47,7 +45,7 @@ def steps_per_frame(body: SoftBody) -> int:
     return int(np.ceil(1.0 / (FRAME_RATE * longest) - 1e-3))
 
 
-def settle(stepper: LocomotionStepper) -> BodyState:
+def settle(stepper: CoupledStepper) -> BodyState:
     """The body at rest on its ground: contact steps from rest, long ones, each begun without velocity.
 
     One that gives way is not followed to the ground: it is returned once a node has gone 0.2 H in one step, or its
@@ -56,25 +54,12 @@ def settle(stepper: LocomotionStepper) -> BodyState:
     body = stepper.body
     state = BodyState(body.mesh.nodes.copy(), np.zeros_like(body.mesh.nodes))
     dt = 0.25 * np.sqrt(body.height / np.linalg.norm(body.gravity))
-    force = body.node_mass[:, None] * body.gravity
-    factorisation = Factorisation(body)
     memory = stepper.initial_memory()
     for _ in range(12):
-        step = ImplicitStep(body, state, dt, factorisation)
-        points = stepper.choose_contacts(step, memory)
-        result = contact_step(
-            step,
-            stepper.detector,
-            points,
-            force,
-            start_velocities=np.zeros_like(state.positions),
-            start_forces=stepper.matched_forces(memory, points),
-            push_out_cap=0.0,
-            penetration_tolerance=stepper.settings.penetration_tolerance * body.height,
-        )
+        result = stepper.passive_step(state, memory, dt)
         moved = dt * float(np.abs(result.velocities).max())
-        state = BodyState(step.end_positions(result.velocities), np.zeros_like(state.positions))
-        memory = stepper.remember(result, memory.activations)
+        state = BodyState(state.positions + dt * result.velocities, np.zeros_like(state.positions))
+        memory = replace(memory, points=result.contacts.points, forces=result.forces)
         gone = body.centre_of_mass(state.positions) - body.centre_of_mass(body.mesh.nodes)
         gives_way = moved > 0.2 * body.height or np.linalg.norm(gone) > 0.1 * body.height
         if gives_way or moved < 2e-4 * body.height:
@@ -83,7 +68,7 @@ def settle(stepper: LocomotionStepper) -> BodyState:
 
 
 def simulate(
-    stepper: LocomotionStepper,
+    stepper: CoupledStepper,
     geometry: ContactGeometry,
     start: BodyState,
     motion: Motion,

@@ -11,7 +11,8 @@ from scipy.spatial.distance import squareform
 
 from egs_warp.muscles.muscle_set import MuscleSet
 
-MOST_SYNERGIES = 32
+import os
+MOST_SYNERGIES = int(os.environ.get("SYN", "32"))
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,9 @@ CALM_TIME = 0.3
 class Weights:
     """Weights of a motion's objectives; speeds are compared in sqrt(g H)."""
 
-    com: float = 2.0
-    spin: float = 5.0
-    pose: float = 0.02
+    com: float = float(__import__("os").environ.get("WC", "2.0"))
+    spin: float = float(__import__("os").environ.get("WS", "5.0"))
+    pose: float = float(__import__("os").environ.get("WP", "0.02"))
 
 
 @dataclass(frozen=True)
@@ -213,10 +213,22 @@ class PoseFamily:
         pose_velocity = velocity + self._arms @ pose_rate.T + follow * (wanted - arms)
         momentum = body.inertia(state.positions) @ spin
         return [
-            centre_of_mass_velocity(body, velocity, weights.com),
+            *self._com(body, velocity, weights.com),
             SpinObjective(momentum, weights.spin),
             straining_velocities(body, state.positions, pose_velocity, weights.pose),
         ]
+
+    def _com(self, body, velocity, weight):
+        import os
+        from dataclasses import replace as rep
+        o = centre_of_mass_velocity(body, velocity, weight)
+        wv = float(os.environ.get("WV", "0"))
+        if wv == 0:
+            return [o]
+        ax = self.ground.axes
+        level, up = ax[:2], ax[2:]
+        from scipy import sparse
+        return [rep(o, rows=sparse.csr_matrix(level @ o.rows.toarray()), target=level @ o.target), rep(o, rows=sparse.csr_matrix(up @ o.rows.toarray()), target=up @ o.target, weight=wv)]
 
     def turn_towards(self, state: BodyState, pose: np.ndarray) -> np.ndarray:
         """(3,) rotation vector, world axes, from the measured best-fit rotation to that of ``pose``."""
