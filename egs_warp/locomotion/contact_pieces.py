@@ -24,6 +24,9 @@ _ACTIVE = 1e-3
 _GAIN = 5e-3
 """Share of the objective by which a further piece has to lower it."""
 
+_BROKEN = 0.02
+"""By which a start may break a row that its piece does not quite hold."""
+
 FREE, STICK, SLIDE = 0, 1, 2
 
 
@@ -122,7 +125,10 @@ def search_pieces(
         solution = solve_piece(program, start, modes, solver)
         if solution is None:
             infeasible += 1
-            break
+            if best is not None or (modes.kind != SLIDE).all():
+                break
+            modes = ContactModes(np.where(modes.kind == SLIDE, STICK, modes.kind), modes.slip)
+            continue
         if best is not None and solution.objective >= best.objective:
             break
         enough = best is not None and best.objective - solution.objective < _GAIN * abs(best.objective)
@@ -147,7 +153,7 @@ def solve_piece(
     P = whole.T @ PZ
     q = whole.T @ program.q + PZ.T @ fixed
     A, b, contact, onward = _bounds(program, modes, offset, slope)
-    lower = np.minimum(-b, A @ start[:m]) if len(A) else np.zeros(0)
+    lower = np.minimum(-b, np.maximum(A @ start[:m], -b - _BROKEN)) if len(A) else np.zeros(0)
     qp = quadratic_program(0.5 * (P + P.T), q, np.vstack([np.eye(m), A]), solver=solver)
     found = qp.solve(
         np.concatenate([program.lower, lower]), np.concatenate([program.upper, np.full(len(lower), np.inf)])

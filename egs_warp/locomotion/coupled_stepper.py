@@ -29,7 +29,7 @@ from egs_warp.muscles.tension import MuscleTension
 
 _ORDINARY_STRENGTH = 4.0
 _STEPS_A_UNIT = 19.0
-_FASTEST = 5.0
+_FASTEST = float(os.environ.get("FAST", "5.0"))
 """Bounds of activations, in their bounds a sqrt(H / g): how fast a muscle is switched on and off."""
 _LOADED = 1e-3
 """Body weights on a region, from which its foreseen forces tell how it presses."""

@@ -16,7 +16,7 @@ from egs_warp.locomotion.objectives import Objective, SpinObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.facing import Facing, Straight
-from egs_warp.motions.jump_plan import FURTHEST_LEAN, LEAN, JumpPlan, JumpTarget, plan_jump
+from egs_warp.motions.jump_plan import FURTHEST_LEAN, LEAN, JumpPlan, JumpTarget, plan_jump, stopping_time
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.stance import Calm, Ground, Measurement, PoseFamily, Weights
 
@@ -239,7 +239,7 @@ class Jump:
     def _fly(self, state: BodyState, seen: Measurement, dt: float) -> list[Objective | SpinObjective]:
         touch_down, left = self._touch_down(seen, dt)
         heading = self.facing.turned - self.facing.turn
-        pose = self.pose.over_base(touch_down, self._foothold(state, seen, touch_down), heading)
+        pose = self.pose.over_base(touch_down, self._foothold(state, seen, touch_down, left), heading)
         # Nothing turns a body in the air; a foot that lags on the ground must not push any more.
         momentum = self.body.angular_momentum(state.positions, state.velocities)
         spin = np.linalg.solve(self.body.inertia(state.positions), momentum)
@@ -259,7 +259,9 @@ class Jump:
         velocity = self._balanced(seen, seen.velocity + dt * acceleration, dt)
         heading = self.facing.landed_heading(self.pose, state.positions)
         pose = self.pose.over_base(seen.com + dt * velocity, seen.base, heading)
-        return self._write(state, seen, velocity, pose, self._upright(state, pose), dt)
+        share = min((state.time + dt - self._entered) / (float(os.environ.get("LB", "0.5")) * self._time_unit), 1.0)
+        share = share * share * (3.0 - 2.0 * share)
+        return self._write(state, seen, velocity, pose, share * self._upright(state, pose), dt)
 
     def _following(self, seen: Measurement, position: np.ndarray, velocity: np.ndarray, dt: float) -> np.ndarray:
         """(3,) m/s that follows a reference ``position`` (3,) with its ``velocity`` (3,) as well as the feet can."""
@@ -300,12 +302,13 @@ class Jump:
         left = min(max((speed + np.sqrt(speed**2 + 2.0 * self.gravity * gap)) / self.gravity, dt), latest)
         return np.array([*(seen.com[:2] + seen.velocity[:2] * left), self._start_com[2]]), left
 
-    def _foothold(self, state: BodyState, seen: Measurement, touch_down: np.ndarray) -> np.ndarray:
+    def _foothold(self, state: BodyState, seen: Measurement, touch_down: np.ndarray, left: float) -> np.ndarray:
         """(2,) where to put the feet: the target, if the body that comes in so can stop over it."""
         if seen.velocity[2] > 0.0 and self.ground.local(state.positions)[:, 2].min() < CLEARANCE * self.target.rise:
             # Feet that swing ahead before they are higher than the step would strike it.
             return touch_down[:2] + seen.base - seen.com[:2]
-        capture_time = np.sqrt(self.pose.standing_height / self.gravity)
+        falling = max(left * self.gravity - seen.velocity[2], 0.0)
+        capture_time = stopping_time(self.pose.standing_height, falling, self.gravity)
         capture = touch_down[:2] + seen.velocity[:2] * capture_time + self.pose.base_offset
         low, high = self.pose.support_low, self.pose.support_high
         goal = self._start_base - RUN_ON * self._time_unit * seen.velocity[:2]
@@ -343,6 +346,11 @@ class Jump:
             rate = np.zeros((3, 3))
         self._last_pose = pose
         follow, weights = 6.0 / self._time_unit, self.weights
+        if self.phase is JumpPhase.LAND and os.environ.get("LW"):
+            t = min((state.time + dt - self._entered) / (float(os.environ.get("LT", "0.5")) * self._time_unit), 1.0)
+            least = float(os.environ["LW"])
+            gain = least + (1.0 - least) * t * t
+            weights = replace(weights, com=gain * weights.com, spin=gain * weights.spin)
         if left is not None:
             follow, weights = min(IN_TIME / left, follow), replace(weights, pose=self._airborne_weight)
         return self.pose.objectives(

@@ -95,6 +95,18 @@ def ramped(share: float) -> tuple[float, float]:
     return speed / whole, way / whole
 
 
+def stopping_time(com_height: float, fall_speed: float, gravity: float) -> float:
+    """Seconds t such that a body that lands at speed v ahead, with its feet v t ahead of its centre of mass, comes to
+    rest over them.
+
+    Landing without spin, the ground's push goes through the centre of mass at ``com_height`` h above feet d ahead: to
+    stop ``fall_speed`` w it takes w d / h off the speed ahead, and what is left is stopped by the capture point,
+    (v - w d / h) sqrt(h / g) = d.
+    """
+    pendulum = np.sqrt(com_height / gravity)
+    return float(pendulum / (1.0 + fall_speed * pendulum / com_height))
+
+
 def plan_jump(
     target: JumpTarget,
     *,
@@ -121,9 +133,8 @@ def plan_jump(
     # Every step goes its whole way at the speed of its end: half a step's way more than the thrust itself.
     stroke += 0.5 * speed_up * step
     flight_time = np.sqrt(2.0 * rise / gravity) + np.sqrt(2.0 * max(rise - target.rise, 0.0) / gravity)
-    # A body that comes in with speed v stops over its base if that is ahead by v sqrt(h/g) (the capture point); the
-    # front of the footprint helps.
-    capture_time = np.sqrt(com_height / (1.3 * gravity))
+    # The front of the footprint helps a body that comes in to stop over its base.
+    capture_time = stopping_time(com_height, np.sqrt(2.0 * gravity * max(rise - target.rise, 0.0)), gravity)
     footprint_help = min(0.3 * support_ahead, 0.5 * target.distance * capture_time / flight_time)
     speed_forward = (target.distance - lean + footprint_help) / (flight_time + capture_time + 0.5 * thrust_time)
     crouch_depth = min(stroke - extension, DEEPEST_CROUCH * com_height)
