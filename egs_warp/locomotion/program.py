@@ -153,13 +153,12 @@ def program_of(
     *,
     friction: float,
     scales: CostScales,
-    turning: np.ndarray | None = None,
 ) -> ContactProgram:
     """The problem of one step for contacts whose velocities are ``frame`` (3n, 3N) v and whose normal measure has the
     constant ``shift`` (n,) m/s; ``moments`` (3, variables) is the change of angular momentum that each unknown
     makes.
     """
-    P, q, constant = _quadratic_cost(step, linear, moments, objectives, layout, previous, scales, turning)
+    P, q, constant = _quadratic_cost(step, linear, moments, objectives, layout, previous, scales)
     A, offset = contact_rows(linear, frame, shift, layout, friction, scales.speed)
     return ContactProgram(layout, friction, P, q, constant, A, offset)
 
@@ -185,7 +184,6 @@ def _quadratic_cost(
     layout: ContactLayout,
     previous: np.ndarray,
     scales: CostScales,
-    turning: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, float]:
     body, state = step.body, step.state
     P = 1e-7 * np.eye(layout.variables)
@@ -197,8 +195,6 @@ def _quadratic_cost(
             unit = body.mass * gyration * scales.speed
             rows = moments / unit
             gap = (body.angular_momentum(state.positions, state.velocities) - objective.target) / unit
-            if turning is not None:
-                gap = gap + turning / unit
         else:
             rows = (objective.rows @ linear.response) / scales.speed
             gap = (objective.rows @ linear.base - objective.target) / scales.speed

@@ -44,14 +44,14 @@ class LocomotionSettings:
     """A point takes part if the step may bring it this near to a plane."""
     penetration_tolerance: float = 5e-3
     push_out_cap: float = 0.05
-    qp_limit: int = int(__import__("os").environ.get("QL", "3"))
+    qp_limit: int = 3
     """QPs a step at most; ``strategies.PATIENCE`` times as many where the contact states are in doubt."""
     qp_solver: QpSolver | str = QpSolver.OSQP
     strategy: Strategy | str = Strategy.TWO_STAGE
-    activation_weight: float = float(__import__("os").environ.get("WA", "2e-4"))
+    activation_weight: float = 2e-4
     """For a step of sqrt(H / g) / 19 and a muscle of 4 body weights. Shorter steps change speeds by less, so they weigh
     activations less: by the square of their share. Stronger muscles weigh more, as their force."""
-    activation_change_weight: float = float(__import__("os").environ.get("WD", "3e-4"))
+    activation_change_weight: float = 3e-4
     """Likewise, by the step's share, and by the square of the force: the strong muscles of a stiff body would else play
     full strokes against each other from step to step, further than the linearised program knows the way."""
     drag: float = 0.0

@@ -11,8 +11,7 @@ from scipy.spatial.distance import squareform
 
 from egs_warp.muscles.muscle_set import MuscleSet
 
-import os
-MOST_SYNERGIES = int(os.environ.get("SYN", "32"))
+MOST_SYNERGIES = 72
 
 
 @dataclass(frozen=True)

@@ -34,11 +34,6 @@ RUN_ON = 0.08
 on the pawn)."""
 CLEARANCE = 0.15
 """Of the height of a step: how far above it the feet are before they swing ahead."""
-import os
-AIRBORNE_POSE = float(os.environ.get("AIR", "0.08"))
-"""Weight of the pose in the air, where nothing else can be steered and the feet have to get to their place. Much more
-crumples the body, and one so slender that it was made stiffer to stand (``SoftBody.stiffening``) buckles under less, by
-the square."""
 IN_TIME = 2.5
 """Over the time left in the air: the rate at which the pose of the landing is approached, gently at first."""
 TOUCH_DOWN = 0.06
@@ -46,7 +41,8 @@ TOUCH_DOWN = 0.06
 foot."""
 LONGEST_LANDING = 9.0
 """Of sqrt(H / g): a body that is not calm by then counts as at rest."""
-SHORT = float(os.environ.get('SHORT', '0.02'))
+TOUCHING_DOWN = 0.5
+"""Of sqrt(H / g): the time from touch-down until balance and upright are asked for in full."""
 BLEND = 0.3
 """Of sqrt(H / g): the time in which a phase's pose takes over from the last one's."""
 
@@ -102,10 +98,9 @@ class Jump:
         self._start_com = body.centre_of_mass(local)
         self._start_base = self._start_com[:2] + self.pose.base_offset
         self._time_unit = float(np.sqrt(body.height / self.gravity))
-        self._airborne_weight = max(AIRBORNE_POSE / body.stiffening**2, self.weights.pose)
+        self._airborne_weight = max(self.weights.airborne / body.stiffening**2, self.weights.pose)
         self._last_pose = self._pose_before = np.eye(3)
         self._asked: np.ndarray | None = None
-        self._told: np.ndarray | None = None
         self._flew = False
         self._calm = Calm(body)
         self._overran: list[JumpPhase] = []
@@ -205,7 +200,7 @@ class Jump:
             position, velocity = self.plan.crouch(self._start_com, elapsed)
         velocity = self._following(seen, position, velocity, dt)
         pose = self.pose.over_base(position, self._start_base)
-        return self._write(state, seen, velocity, pose, self._upright(state, pose), dt)
+        return self._write(state, velocity, pose, self._upright(state, pose), dt)
 
     def _thrust(
         self, state: BodyState, seen: Measurement, elapsed: float, dt: float
@@ -234,7 +229,7 @@ class Jump:
         standing = self.pose.over_base(position, self._start_base, self.facing.turned)
         tilt = tilt + (1.0 - share) * self._upright(state, standing)
         spin = self.facing.thrust_spin(tilt, state, self.ground.axes[2], plan.flight_time)
-        return self._write(state, seen, velocity, standing, spin, dt)
+        return self._write(state, velocity, standing, spin, dt)
 
     def _fly(self, state: BodyState, seen: Measurement, dt: float) -> list[Objective | SpinObjective]:
         touch_down, left = self._touch_down(seen, dt)
@@ -245,7 +240,7 @@ class Jump:
         spin = np.linalg.solve(self.body.inertia(state.positions), momentum)
         pose = self.facing.airborne_pose(pose, momentum, self.ground.axes[2], left)
         velocity = seen.velocity - np.array([0.0, 0.0, self.gravity * dt])
-        return self._write(state, seen, velocity, pose, spin, dt, left=left)
+        return self._write(state, velocity, pose, spin, dt, left=left)
 
     def _land(self, state: BodyState, seen: Measurement, dt: float) -> list[Objective | SpinObjective]:
         rate = self.plan.landing_rate
@@ -259,9 +254,12 @@ class Jump:
         velocity = self._balanced(seen, seen.velocity + dt * acceleration, dt)
         heading = self.facing.landed_heading(self.pose, state.positions)
         pose = self.pose.over_base(seen.com + dt * velocity, seen.base, heading)
-        share = min((state.time + dt - self._entered) / (float(os.environ.get("LB", "0.5")) * self._time_unit), 1.0)
-        share = share * share * (3.0 - 2.0 * share)
-        return self._write(state, seen, velocity, pose, share * self._upright(state, pose), dt)
+        return self._write(state, velocity, pose, self._landed_share(state.time + dt) * self._upright(state, pose), dt)
+
+    def _landed_share(self, time: float) -> float:
+        """How much is asked for at ``time`` s of what a standing body is asked for."""
+        share = min((time - self._entered) / (TOUCHING_DOWN * self._time_unit), 1.0)
+        return share * share * (3.0 - 2.0 * share)
 
     def _following(self, seen: Measurement, position: np.ndarray, velocity: np.ndarray, dt: float) -> np.ndarray:
         """(3,) m/s that follows a reference ``position`` (3,) with its ``velocity`` (3,) as well as the feet can."""
@@ -303,7 +301,7 @@ class Jump:
         return np.array([*(seen.com[:2] + seen.velocity[:2] * left), self._start_com[2]]), left
 
     def _foothold(self, state: BodyState, seen: Measurement, touch_down: np.ndarray, left: float) -> np.ndarray:
-        """(2,) where to put the feet: the target, if the body that comes in so can stop over it."""
+        """(2,) where to put the feet in ``left`` s: the target, if the body that comes in so can stop over it."""
         if seen.velocity[2] > 0.0 and self.ground.local(state.positions)[:, 2].min() < CLEARANCE * self.target.rise:
             # Feet that swing ahead before they are higher than the step would strike it.
             return touch_down[:2] + seen.base - seen.com[:2]
@@ -317,7 +315,6 @@ class Jump:
     def _write(
         self,
         state: BodyState,
-        seen: Measurement,
         com_velocity: np.ndarray,
         pose: np.ndarray,
         spin: np.ndarray,
@@ -326,18 +323,6 @@ class Jump:
         left: float | None = None,
     ) -> list[Objective | SpinObjective]:
         """``left``: seconds before the landing, of a body in the air."""
-        mode = os.environ.get("INT", "2")
-        on = self.phase in (JumpPhase.SETTLE, JumpPhase.CROUCH) or (
-            mode == "2" and self.phase in (JumpPhase.LAND, JumpPhase.REST) and seen.load < 1.5
-        )
-        if on and mode != "0":
-            short = self._told - seen.velocity[:2] if self._told is not None else np.zeros(2)
-            most = SHORT * float(np.sqrt(self.gravity * self.body.height))
-            short *= min(1.0, most / max(float(np.linalg.norm(short)), 1e-12))
-            com_velocity = np.array([*(com_velocity[:2] + short), com_velocity[2]])
-            self._told = com_velocity[:2]
-        else:
-            self._told = None
         # Where a phase begins with another pose than the last ended with, the way between them is gone in some steps.
         share = min((state.time + dt - self._entered) / (BLEND * self._time_unit), 1.0)
         pose = self._pose_before + share * share * (3.0 - 2.0 * share) * (pose - self._pose_before)
@@ -346,11 +331,9 @@ class Jump:
             rate = np.zeros((3, 3))
         self._last_pose = pose
         follow, weights = 6.0 / self._time_unit, self.weights
-        if self.phase is JumpPhase.LAND and os.environ.get("LW"):
-            t = min((state.time + dt - self._entered) / (float(os.environ.get("LT", "0.5")) * self._time_unit), 1.0)
-            least = float(os.environ["LW"])
-            gain = least + (1.0 - least) * t * t
-            weights = replace(weights, com=gain * weights.com, spin=gain * weights.spin)
+        if self.phase is JumpPhase.LAND:
+            share = weights.landing + (1.0 - weights.landing) * self._landed_share(state.time + dt)
+            weights = replace(weights, com=share * weights.com, up=share * weights.up, spin=share * weights.spin)
         if left is not None:
             follow, weights = min(IN_TIME / left, follow), replace(weights, pose=self._airborne_weight)
         return self.pose.objectives(

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.sparse as sparse
 from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.body import BodyState, SoftBody
@@ -25,9 +26,23 @@ CALM_TIME = 0.3
 class Weights:
     """Weights of a motion's objectives; speeds are compared in sqrt(g H)."""
 
-    com: float = float(__import__("os").environ.get("WC", "2.0"))
-    spin: float = float(__import__("os").environ.get("WS", "5.0"))
-    pose: float = float(__import__("os").environ.get("WP", "0.02"))
+    com: float = 2.0
+    """Of the centre of mass, along the ground."""
+    up: float = 2.0
+    """Of the centre of mass, up."""
+    spin: float = 5.0
+    pose: float = 0.02
+    airborne: float = 0.08
+    """Of the pose in the air, where nothing else can be steered and the feet have to get to their place. It crumples a
+    body if it is large, and one so slender that it was made stiffer to stand (``SoftBody.stiffening``) buckles under
+    less, by the square."""
+    landing: float = 1.0
+    """Share of ``com``, ``up`` and ``spin`` that is asked for at touch-down, where the ground's push comes first."""
+
+
+CLOSE = Weights(com=1000.0, up=300.0, spin=1000.0, airborne=0.5, landing=0.1)
+"""For a step whose contact forces come as they are planned (``CoupledStepper``): what is asked for is what happens,
+so balance goes before effort."""
 
 
 @dataclass(frozen=True)
@@ -213,22 +228,21 @@ class PoseFamily:
         pose_velocity = velocity + self._arms @ pose_rate.T + follow * (wanted - arms)
         momentum = body.inertia(state.positions) @ spin
         return [
-            *self._com(body, velocity, weights.com),
+            *self._balance(velocity, weights),
             SpinObjective(momentum, weights.spin),
             straining_velocities(body, state.positions, pose_velocity, weights.pose),
         ]
 
-    def _com(self, body, velocity, weight):
-        import os
-        from dataclasses import replace as rep
-        o = centre_of_mass_velocity(body, velocity, weight)
-        wv = float(os.environ.get("WV", "0"))
-        if wv == 0:
-            return [o]
-        ax = self.ground.axes
-        level, up = ax[:2], ax[2:]
-        from scipy import sparse
-        return [rep(o, rows=sparse.csr_matrix(level @ o.rows.toarray()), target=level @ o.target), rep(o, rows=sparse.csr_matrix(up @ o.rows.toarray()), target=up @ o.target, weight=wv)]
+    def _balance(self, velocity: np.ndarray, weights: Weights) -> list[Objective]:
+        """``velocity`` (3,) of the centre of mass, world axes."""
+        both = centre_of_mass_velocity(self.body, velocity, weights.com)
+        if weights.up == weights.com:
+            return [both]
+        level, up = self.ground.axes[:2], self.ground.axes[2:]
+        return [
+            replace(both, rows=sparse.csr_matrix(level @ both.rows), target=level @ velocity),
+            replace(both, rows=sparse.csr_matrix(up @ both.rows), target=up @ velocity, weight=weights.up),
+        ]
 
     def turn_towards(self, state: BodyState, pose: np.ndarray) -> np.ndarray:
         """(3,) rotation vector, world axes, from the measured best-fit rotation to that of ``pose``."""

@@ -16,8 +16,8 @@ from egs_warp.fem.body import DEFAULT_SAG, BodyState, SoftBody, make_body
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
-from egs_warp.locomotion.rollout import FRAME_RATE, settle, steps_per_frame
 from egs_warp.locomotion.coupled_stepper import CoupledStepper
+from egs_warp.locomotion.rollout import FRAME_RATE, settle, steps_per_frame
 from egs_warp.locomotion.stepper import LocomotionSettings
 from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame
 from egs_warp.meshing.cage import Cage, cage_of_body
