@@ -7,32 +7,30 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
-import scipy.sparse as sparse
 
 from egs_warp.contact.coupled_step import ContactResponse, CoupledResult, CoupledSolver
-from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet, tangent_directions
+from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet
 from egs_warp.contact.points import ContactPoints
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.locomotion.complementarity import SEPARATE, ContactLayout, states_from_prediction
-from egs_warp.locomotion.objectives import Objective, SpinObjective, lifted_contacts
-from egs_warp.locomotion.program import CostScales, LinearResponse, program_of
+from egs_warp.locomotion.contact_pieces import ContactModes, ContactPieces, search_pieces
+from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.step_cost import LinearStep, QuadraticCost, effort_cost, objectives_cost
 from egs_warp.locomotion.stepper import LocomotionSettings, StepMemory, StepReport
-from egs_warp.locomotion.strategies import SearchResult, find_states
 from egs_warp.locomotion.synergies import find_synergies
 from egs_warp.muscles.muscle_set import MuscleColumns, MuscleSet
 from egs_warp.muscles.tension import MuscleTension
 
 _ORDINARY_STRENGTH = 4.0
 _STEPS_A_UNIT = 19.0
-_FASTEST = 5.0
+_FASTEST = 7.0
 """Bounds of activations, in their bounds a sqrt(H / g): how fast a muscle is switched on and off."""
-_LOADED = 1e-3
-"""Body weights on a region, from which its foreseen forces tell how it presses."""
+_REGULAR = 1e-7
+_MOST_HALVINGS = 4
 
 
 class CoupledStepper:
@@ -53,6 +51,7 @@ class CoupledStepper:
         self.points = ContactPoints(
             geometry, near=self.settings.near * body.height, lower=0.1 * self.settings.near * body.height
         )
+        self.time_unit = float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
         self.speed_scale = float(np.sqrt(np.linalg.norm(body.gravity) * body.height))
         self._columns = MuscleColumns(muscles, device=device or "cpu")
         self._factors = SparseFactors(body.assembly.upper_pattern)
@@ -64,7 +63,7 @@ class CoupledStepper:
             penetration_tolerance=self.settings.penetration_tolerance * body.height,
         )
         rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
-        problem = StepProblem(body, rest, np.sqrt(body.height / np.linalg.norm(body.gravity)) / _STEPS_A_UNIT)
+        problem = StepProblem(body, rest, self.time_unit / _STEPS_A_UNIT)
         tangent = problem.tangent(self._factors, rest.velocities, None)
         full = self._columns.sparse(rest.positions).toarray() * muscles.bounds
         self.synergies = find_synergies(muscles, tangent.solve(full), body.node_mass)
@@ -73,22 +72,54 @@ class CoupledStepper:
         """No contacts, muscles at rest."""
         return StepMemory(np.zeros(0, int), np.zeros((0, 3)), np.zeros(self.muscles.segment_count))
 
+    def passive_step(self, state: BodyState, memory: StepMemory, dt: float) -> CoupledResult:
+        """A step of ``dt`` s without muscles."""
+        problem = StepProblem(self.body, state, dt)
+        contacts = self._detect(problem, memory)
+        response = ContactResponse.of(problem.tangent(self._factors, state.velocities, None), contacts)
+        forces = self.points.matched(contacts.points, memory.points, memory.forces)
+        return self.solver.solve(response, None, velocities=state.velocities, forces=forces)
+
     def advance(
         self,
         state: BodyState,
         memory: StepMemory,
         objectives: Sequence[Objective | SpinObjective],
         dt: float,
-        *,
-        depth: int = 0,
     ) -> tuple[BodyState, StepMemory, list[StepReport]]:
-        """One step of ``dt``; a step that does not converge is done again as two halves, at most four times over."""
+        """One step of ``dt``; one that does not converge is done again in halves under the same activations, since what
+        is asked is asked for the whole of it.
+        """
         end, after, report = self.step(state, memory, objectives, dt)
-        if report.converged or depth == 4:
+        if report.converged:
             return end, after, [report]
-        middle, between, first = self.advance(state, memory, objectives, dt / 2, depth=depth + 1)
-        end, after, second = self.advance(middle, between, objectives, dt / 2, depth=depth + 1)
-        return end, after, first + second
+        return self._in_halves(state, memory, report.activations, dt, _MOST_HALVINGS)
+
+    def _in_halves(
+        self, state: BodyState, memory: StepMemory, activations: np.ndarray, dt: float, left: int
+    ) -> tuple[BodyState, StepMemory, list[StepReport]]:
+        reports: list[StepReport] = []
+        for _ in range(2):
+            end, after, report = self._held_step(state, memory, activations, 0.5 * dt)
+            done = [report]
+            if not report.converged and left > 1:
+                end, after, done = self._in_halves(state, memory, activations, 0.5 * dt, left - 1)
+            state, memory = end, after
+            reports += done
+        return state, memory, reports
+
+    def _held_step(
+        self, state: BodyState, memory: StepMemory, activations: np.ndarray, dt: float
+    ) -> tuple[BodyState, StepMemory, StepReport]:
+        """A step of ``dt`` s under given ``activations`` (M,) metres."""
+        clock = _Clock()
+        problem = StepProblem(self.body, state, dt, self.settings.drag)
+        tension = MuscleTension.of(self.muscles, activations)
+        response, foreseen, forces = self._foresee(problem, self._detect(problem, memory), memory, tension)
+        clock.lap("foresee")
+        result = self.solver.solve(response, tension, velocities=foreseen, forces=forces)
+        clock.lap("solve")
+        return self._finish(problem, _Plan(activations, foreseen, forces, 0, 0), result, clock)
 
     def step(
         self, state: BodyState, memory: StepMemory, objectives: Sequence[Objective | SpinObjective], dt: float
@@ -147,90 +178,68 @@ class CoupledStepper:
         objectives: Sequence[Objective | SpinObjective],
         clock: _Clock,
     ) -> _Plan:
+        """Activations, and what the step's tangent makes of them."""
         problem, settings, members = response.tangent.problem, self.settings, self.synergies.members
-        regions = self._regions(response.contacts, forces)
-        count = regions.get_shape()[1]
-        layout = ContactLayout(self.synergies.count, count, settings.directions)
-        spread = sparse.kron(regions, np.eye(3)).tocsr()
-        frame = (spread.T @ response.contacts.frame).tocsr()
+        contacts, weight, m = response.contacts, self.body.weight, self.synergies.count
         each = self._columns.sparse(problem.end_positions(foreseen)).toarray() * self.muscles.bounds
-        actuation = (members.T @ each.T).T
         # Without muscles and contact, in their stiffness at last step's tension.
         free = problem.residual(foreseen, None).ravel()
-        solved = response.tangent.solve(np.column_stack([problem.dt * actuation, free]))
-        table = tangent_directions(settings.directions)
-
-        def by_unknown(columns: np.ndarray) -> np.ndarray:
-            """(rows, variables) from those of the muscles (rows, M) and of the normals and tangents (rows, n, 3)."""
-            forces = self.body.weight * (columns @ spread).reshape(len(columns), count, 3)
-            tangent = np.einsum("vnt,dt->vnd", forces[:, :, 1:], table).reshape(len(columns), count * len(table))
-            return np.hstack([forces[:, :, 0], tangent, np.zeros((len(columns), count))])
-
-        # How the foreseen forces differ from those that regions can make stays as it is.
-        totals = np.asarray(regions.astype(bool).astype(float).T @ forces)
-        uneven = (forces - regions @ totals).ravel()
-        linear = LinearResponse(
-            foreseen.ravel() - solved[:, -1] + response.columns @ uneven,
-            np.hstack([solved[:, :-1], by_unknown(response.columns)]),
+        solved = response.tangent.solve(np.column_stack([problem.dt * (members.T @ each.T).T, free]))
+        torques = problem.dt * weight * (contacts.frame @ problem.turns).T
+        linear = LinearStep(
+            foreseen.ravel() - solved[:, -1],
+            np.hstack([solved[:, :-1], weight * response.columns]),
+            np.hstack([np.zeros((3, m)), torques]),
         )
-        torques = problem.dt * (problem.turns.T @ response.contacts.frame.T)
-        moments = np.hstack([np.zeros((3, layout.activations)), by_unknown(torques)])
-        shift = self.solver.shift(response.contacts, problem.dt)
         clock.lap("linearise")
-        share = problem.dt * _STEPS_A_UNIT / np.sqrt(self.body.height / np.linalg.norm(self.body.gravity))
-        strength = self.muscles.max_forces / (_ORDINARY_STRENGTH * self.body.weight)
         previous = self.synergies.mean(memory.activations / self.muscles.bounds)
-        program = program_of(
-            problem,
-            linear,
-            frame,
-            regions.T @ shift,
-            moments,
-            layout,
-            objectives,
-            previous,
-            friction=self.geometry.friction,
-            scales=CostScales(
-                self.speed_scale,
-                settings.activation_weight * share**2 * (members.T @ strength),
-                settings.activation_change_weight * share * (members.T @ strength**2),
-            ),
+        cost = (
+            objectives_cost(problem, linear, objectives, self.speed_scale)
+            + effort_cost(problem, linear, foreseen.ravel())
+            + self._activation_cost(problem.dt, previous, linear.columns.shape[1])
         )
-        slip = (frame @ foreseen.ravel()).reshape(-1, 3)[:, 1:]
-        states = states_from_prediction(totals[:, 0], totals[:, 1:], slip, self.geometry.friction, settings.directions)
-        states[regions.T @ lifted_contacts(response.contacts, objectives) > 0.5] = SEPARATE
-        reach = _FASTEST * problem.dt / np.sqrt(self.body.height / np.linalg.norm(self.body.gravity))
-        program = replace(program, reachable=(np.maximum(previous - reach, -1.0), np.minimum(previous + reach, 1.0)))
-        found = find_states(
-            program, settings.strategy, states, previous, qp_limit=settings.qp_limit, solver=settings.qp_solver
+        rows = np.hstack([contacts.frame @ solved[:, :-1], weight * response.delassus]) / self.speed_scale
+        shift = self.solver.shift(contacts, problem.dt)
+        offset = contacts.frame @ linear.base / self.speed_scale
+        offset[::3] += shift / self.speed_scale
+        reach = _FASTEST * problem.dt / self.time_unit
+        program = ContactPieces(
+            *(cost.P, cost.q, cost.constant, rows, offset, self.geometry.friction),
+            *(np.maximum(previous - reach, -1.0), np.minimum(previous + reach, 1.0)),
+        )
+        clock.lap("program")
+        slip = (contacts.frame @ foreseen.ravel()).reshape(-1, 3)
+        found = search_pieces(
+            program,
+            np.concatenate([previous, forces.ravel() / weight]),
+            ContactModes.of(forces, slip, self.geometry.friction),
+            qp_limit=settings.qp_limit,
+            solver=settings.qp_solver,
         )
         clock.lap("qp")
-        if found.y is None:
-            return _Plan(memory.activations, foreseen, forces, found)
-        activations = (members @ np.clip(found.y[: layout.activations], -1.0, 1.0)) * self.muscles.bounds
-        moved = linear.base + linear.response[:, : layout.activations] @ found.y[: layout.activations]
-        forces = response.forces(moved, shift, self.geometry.friction, forces)
+        if found.x is None:
+            return _Plan(memory.activations, foreseen, forces, found.qp_count, found.infeasible)
+        activations = (members @ found.x[:m]) * self.muscles.bounds
+        moved = linear.base + solved[:, :-1] @ found.x[:m]
+        forces = response.forces(moved, shift, self.geometry.friction, weight * found.x[m:].reshape(-1, 3))
         velocities = (moved + response.columns @ forces.ravel()).reshape(foreseen.shape)
+        clock.lap("contact")
         if not problem.feasible(velocities):
             velocities = foreseen
-        return _Plan(activations, velocities, forces, found)
+        return _Plan(activations, velocities, forces, found.qp_count, found.infeasible)
 
-    def _regions(self, contacts: ContactSet, forces: np.ndarray) -> sparse.csr_matrix:
-        """(n, regions) share of each contact in the force of the region of the sole that stands for it in the program:
-        as the foreseen normal ``forces`` (n, 3) are shared, or alike where there are none.
-        """
-        _, region = np.unique(
-            np.column_stack([self.points.region_from_point[contacts.points], np.round(contacts.axes[:, 0], 6)]),
-            axis=0,
-            return_inverse=True,
-        )
-        region = region.ravel()
-        totals = np.bincount(region, forces[:, 0])
-        loaded = totals > _LOADED * self.body.weight
-        shares = np.where(loaded[region], forces[:, 0], 1.0)
-        shares = shares / np.bincount(region, shares)[region]
-        shape = (contacts.count, len(totals))
-        return sparse.csr_matrix((shares, (np.arange(contacts.count), region)), shape=shape)
+    def _activation_cost(self, dt: float, previous: np.ndarray, count: int) -> QuadraticCost:
+        """Of ``count`` unknowns that begin with the activations, how large they are and how they change from
+        ``previous`` (m,)."""
+        settings, members = self.settings, self.synergies.members
+        share = dt * _STEPS_A_UNIT / self.time_unit
+        strength = self.muscles.max_forces / (_ORDINARY_STRENGTH * self.body.weight)
+        size = settings.activation_weight * share**2 * (members.T @ strength)
+        change = settings.activation_change_weight * share * (members.T @ strength**2)
+        diagonal, q = np.zeros(count), np.zeros(count)
+        diagonal[: len(previous)] = 2.0 * (size + change) + _REGULAR
+        q[: len(previous)] = -2.0 * change * previous
+        return QuadraticCost(np.diag(diagonal), q, float(change @ previous**2))
 
     def _finish(
         self, problem: StepProblem, plan: _Plan, result: CoupledResult, clock: _Clock
@@ -248,8 +257,8 @@ class CoupledStepper:
             end_gaps=result.contacts.end_gaps(problem.dt, result.velocities),
             min_gap=float(gaps.min()),
             activations=plan.activations,
-            qp_count=plan.search.qp_count,
-            qp_infeasible=plan.search.infeasible,
+            qp_count=plan.qp_count,
+            qp_infeasible=plan.qp_infeasible,
             newton_iterations=result.iterations,
             converged=result.converged,
             added_spin=float(np.linalg.norm(problem.spin(internal))),
@@ -263,7 +272,8 @@ class _Plan:
     activations: np.ndarray
     velocities: np.ndarray
     forces: np.ndarray
-    search: SearchResult
+    qp_count: int
+    qp_infeasible: int
 
 
 @dataclass

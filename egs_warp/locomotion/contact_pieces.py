@@ -1,0 +1,269 @@
+"""The program of a step over the activations alone: contact as what it makes of them, one linear piece at a time
+(Eq. 9, 13).
+
+See docs/concepts/locomotion.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as dense
+
+from egs_warp.locomotion.solvers import QpSolver, quadratic_program
+
+_FACES = 8
+"""Of the pyramid that stands in for the friction cone of a contact that sticks."""
+_SINGULAR = 1e-7
+"""Of the mean of the operator's diagonal: more points than the cage can resolve leave it singular."""
+_SLOWEST = 1e-9
+"""Of sqrt(g H): tangential velocity without a direction."""
+_ACTIVE = 1e-3
+"""Multiplier, of the objective's value for a unit of the row, from which a bound is worth leaving."""
+_GAIN = 5e-3
+"""Share of the objective by which a further piece has to lower it."""
+
+_BROKEN = 0.02
+"""By which a start may break a row that its piece does not quite hold."""
+
+FREE, STICK, SLIDE = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class ContactPieces:
+    """min 1/2 x^T P x + q^T x + constant over x = (a, f), where f is what exact Coulomb contact answers to a.
+
+    Activations are in their bounds, forces in body weights (contact-major: normal and two tangents), speeds in
+    sqrt(g H). Contact velocities are ``rows`` x + ``offset``, the normal ones with the push-out's shift.
+    """
+
+    P: np.ndarray
+    """(m + 3n, m + 3n)."""
+    q: np.ndarray
+    """(m + 3n,)."""
+    constant: float
+    rows: np.ndarray
+    """(3n, m + 3n)."""
+    offset: np.ndarray
+    """(3n,)."""
+    friction: float
+    lower: np.ndarray
+    """(m,) of the activations."""
+    upper: np.ndarray
+    """(m,)."""
+
+    @property
+    def activations(self) -> int:
+        """m."""
+        return len(self.lower)
+
+    @property
+    def contacts(self) -> int:
+        """n."""
+        return len(self.offset) // 3
+
+    def objective(self, x: np.ndarray) -> float:
+        """Value at ``x``."""
+        return float(0.5 * x @ self.P @ x + self.q @ x + self.constant)
+
+
+@dataclass(frozen=True)
+class ContactModes:
+    """How each contact moves in a piece."""
+
+    kind: np.ndarray
+    """(n,) FREE, STICK or SLIDE."""
+    slip: np.ndarray
+    """(n, 2) unit vectors along which those that slide do."""
+
+    @classmethod
+    def of(cls, forces: np.ndarray, velocities: np.ndarray, friction: float) -> ContactModes:
+        """Those of ``forces`` (n, 3) and contact ``velocities`` (n, 3) that obey Coulomb's law."""
+        pull = np.linalg.norm(forces[:, 1:], axis=1)
+        pressing = forces[:, 0] > 0.0
+        sliding = pressing & (pull >= (1.0 - 1e-6) * friction * forces[:, 0])
+        kind = np.where(sliding, SLIDE, np.where(pressing, STICK, FREE))
+        return cls(kind, _unit(np.where(sliding[:, None], -forces[:, 1:], velocities[:, 1:])))
+
+
+@dataclass(frozen=True)
+class PieceSolution:
+    """Optimum of a piece."""
+
+    x: np.ndarray
+    """(m + 3n,)."""
+    objective: float
+    modes: ContactModes
+    onward: ContactModes | None
+    """Those of the piece that lies beyond the bounds that hold the optimum back; None if none does."""
+    nearest: ContactModes | None
+    """Of these bounds only the one that holds it back most is left behind."""
+
+
+@dataclass(frozen=True)
+class PieceSearch:
+    """Best point found."""
+
+    x: np.ndarray | None
+    """(m + 3n,); None if no QP had a solution."""
+    objective: float
+    qp_count: int
+    infeasible: int
+
+
+def search_pieces(
+    program: ContactPieces, start: np.ndarray, modes: ContactModes, *, qp_limit: int, solver: QpSolver | str
+) -> PieceSearch:
+    """From the piece of ``modes``, which holds ``start`` (m + 3n,), onward as long as the objective falls.
+
+    Neighbouring pieces share the point between them, so no step is lost on an infeasible one.
+    """
+    best: PieceSolution | None = None
+    count = infeasible = 0
+    while count < qp_limit:
+        count += 1
+        solution = solve_piece(program, start, modes, solver)
+        if solution is None:
+            infeasible += 1
+            if best is not None or (modes.kind != SLIDE).all():
+                break
+            modes = ContactModes(np.where(modes.kind == SLIDE, STICK, modes.kind), modes.slip)
+            continue
+        if best is not None and solution.objective >= best.objective:
+            # Together the contacts went too far; the one that is pushed most may still gain.
+            if best.nearest is None or modes is best.nearest:
+                break
+            modes = best.nearest
+            continue
+        enough = best is not None and best.objective - solution.objective < _GAIN * abs(best.objective)
+        best, start = solution, solution.x
+        if solution.onward is None or enough:
+            break
+        modes = solution.onward
+    return PieceSearch(best.x if best else None, best.objective if best else float("inf"), count, infeasible)
+
+
+def solve_piece(
+    program: ContactPieces, start: np.ndarray, modes: ContactModes, solver: QpSolver | str
+) -> PieceSolution | None:
+    """Optimum of the activations in the piece of ``modes``; what ``start`` breaks of its bounds may stay broken as
+    much. None without a solution.
+    """
+    m = program.activations
+    offset, slope = _forces_of(program, modes)
+    whole = np.vstack([np.eye(m), slope])
+    fixed = np.concatenate([np.zeros(m), offset])
+    PZ = program.P @ whole
+    P = whole.T @ PZ
+    q = whole.T @ program.q + PZ.T @ fixed
+    A, b, contact, onward = _bounds(program, modes, offset, slope)
+    lower = np.minimum(-b, np.maximum(A @ start[:m], -b - _BROKEN)) if len(A) else np.zeros(0)
+    qp = quadratic_program(0.5 * (P + P.T), q, np.vstack([np.eye(m), A]), solver=solver)
+    found = qp.solve(
+        np.concatenate([program.lower, lower]), np.concatenate([program.upper, np.full(len(lower), np.inf)])
+    )
+    if not found.usable:
+        return None
+    a = np.clip(found.x, program.lower, program.upper)
+    x = fixed + whole @ a
+    objective = program.objective(x)
+    pushes = -found.multipliers[m:]
+    active = np.flatnonzero(pushes > _ACTIVE * max(abs(objective), 1e-9))
+    further = nearest = None
+    if len(active):
+        further = _beyond(program, modes, x, contact[active], onward[active], pushes[active])
+    if len(active) > 1:
+        most = active[[int(np.argmax(pushes[active]))]]
+        nearest = _beyond(program, modes, x, contact[most], onward[most], pushes[most])
+    return PieceSolution(x, objective, modes, further, nearest)
+
+
+def _forces_of(program: ContactPieces, modes: ContactModes) -> tuple[np.ndarray, np.ndarray]:
+    """(3n,) and (3n, m): f = offset + slope a in the piece of ``modes``."""
+    n, m = program.contacts, program.activations
+    stick, slide = modes.kind == STICK, modes.kind == SLIDE
+    held = np.stack([stick | slide, stick, stick], axis=1).ravel()
+    spread = np.eye(3 * n)
+    sliding = np.flatnonzero(slide)
+    for t in (0, 1):
+        spread[3 * sliding + 1 + t, 3 * sliding] = -program.friction * modes.slip[sliding, t]
+    spread = spread[:, held]
+    operator = program.rows[held, m:] @ spread
+    if operator.size == 0:
+        return np.zeros(3 * n), np.zeros((3 * n, m))
+    operator[np.diag_indices_from(operator)] += _SINGULAR * np.abs(operator.diagonal()).mean()
+    right = -np.column_stack([program.offset[held], program.rows[held, :m]])
+    solved = spread @ dense.solve(operator, right, overwrite_a=True, overwrite_b=True, check_finite=False)
+    return solved[:, 0], solved[:, 1:]
+
+
+_LEAVES, _SLIPS, _STOPS, _LANDS = 0, 1, 2, 3
+
+
+def _bounds(
+    program: ContactPieces, modes: ContactModes, offset: np.ndarray, slope: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Rows A a + b >= 0 within which a piece holds; of each the contact and what happens to it beyond."""
+    m, friction = program.activations, program.friction
+    speed = program.rows[:, :m] + program.rows[:, m:] @ slope
+    speed_offset = program.offset + program.rows[:, m:] @ offset
+    stick, slide = np.flatnonzero(modes.kind == STICK), np.flatnonzero(modes.kind == SLIDE)
+    free = np.flatnonzero(modes.kind == FREE)
+    pressing = np.concatenate([stick, slide])
+    parts = [(slope[3 * pressing], offset[3 * pressing], pressing, _LEAVES)]
+    angle = 2.0 * np.pi * np.arange(_FACES) / _FACES
+    narrow = friction * np.cos(np.pi / _FACES)
+    for c, s in zip(np.cos(angle), np.sin(angle), strict=True):
+
+        def side(value: np.ndarray, c: float = c, s: float = s) -> np.ndarray:
+            return narrow * value[3 * stick] - c * value[3 * stick + 1] - s * value[3 * stick + 2]
+
+        parts.append((side(slope), side(offset), stick, _SLIPS))
+    d = modes.slip[slide]
+    parts.append(
+        (
+            d[:, :1] * speed[3 * slide + 1] + d[:, 1:] * speed[3 * slide + 2],
+            d[:, 0] * speed_offset[3 * slide + 1] + d[:, 1] * speed_offset[3 * slide + 2],
+            slide,
+            _STOPS,
+        )
+    )
+    parts.append((speed[3 * free], speed_offset[3 * free], free, _LANDS))
+    A = np.vstack([part[0] for part in parts])
+    b = np.concatenate([part[1] for part in parts])
+    contact = np.concatenate([part[2] for part in parts])
+    onward = np.concatenate([np.full(len(part[2]), part[3]) for part in parts])
+    return A, b, contact, onward
+
+
+def _beyond(
+    program: ContactPieces,
+    modes: ContactModes,
+    x: np.ndarray,
+    contacts: np.ndarray,
+    onward: np.ndarray,
+    pushes: np.ndarray,
+) -> ContactModes:
+    """Modes where ``contacts`` go ``onward``, the most pushed one's word last."""
+    kind, slip = modes.kind.copy(), modes.slip.copy()
+    forces = x[program.activations :].reshape(-1, 3)
+    velocities = (program.rows @ x + program.offset).reshape(-1, 3)
+    for index in np.argsort(pushes, kind="stable"):
+        i = contacts[index]
+        if onward[index] == _LEAVES:
+            kind[i] = FREE
+        elif onward[index] == _SLIPS:
+            kind[i], slip[i] = SLIDE, _unit(-forces[i : i + 1, 1:])[0]
+        elif onward[index] == _STOPS:
+            kind[i] = STICK
+        elif np.linalg.norm(velocities[i, 1:]) > _SLOWEST:
+            kind[i], slip[i] = SLIDE, _unit(velocities[i : i + 1, 1:])[0]
+        else:
+            kind[i] = STICK
+    return ContactModes(kind, slip)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.where(length > 0.0, vectors / np.where(length > 0.0, length, 1.0), [1.0, 0.0])

@@ -1,0 +1,99 @@
+"""What a step's end costs, as a quadratic over activations and contact forces: objectives and effort (Eq. 13).
+
+See docs/concepts/locomotion.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sparse
+
+from egs_warp.fem.step_problem import StepProblem
+from egs_warp.locomotion.objectives import Objective, SpinObjective
+
+EFFORT = 0.1
+"""Cost of m g H of elastic and damping energy."""
+HORIZON = 0.16
+"""Of sqrt(H / g): how far ahead that energy is foreseen. One step ahead, a body that holds itself bent gains next to
+nothing by letting go."""
+
+
+@dataclass(frozen=True)
+class LinearStep:
+    """End velocity and change of angular momentum of a step, linear in x = (activations, contact forces)."""
+
+    base: np.ndarray
+    """(3N,) m/s without muscles and contact."""
+    columns: np.ndarray
+    """(3N, k) m/s for each of x."""
+    torques: np.ndarray
+    """(3, k) kg m^2/s for each of x."""
+
+
+@dataclass(frozen=True)
+class QuadraticCost:
+    """1/2 x^T P x + q^T x + constant."""
+
+    P: np.ndarray
+    """(k, k)."""
+    q: np.ndarray
+    """(k,)."""
+    constant: float
+
+    def __add__(self, other: QuadraticCost) -> QuadraticCost:
+        return QuadraticCost(self.P + other.P, self.q + other.q, self.constant + other.constant)
+
+
+def objectives_cost(
+    problem: StepProblem, linear: LinearStep, objectives: Sequence[Objective | SpinObjective], speed: float
+) -> QuadraticCost:
+    """The weighted squares that a motion asks for, in units of ``speed`` m/s, sqrt(g H)."""
+    body, state = problem.body, problem.state
+    count = linear.columns.shape[1]
+    P, q, constant = np.zeros((count, count)), np.zeros(count), 0.0
+    for objective in objectives:
+        if isinstance(objective, SpinObjective):
+            gyration = np.sqrt(0.5 * np.trace(problem.inertia) / body.mass)
+            unit = body.mass * gyration * speed
+            rows = linear.torques / unit
+            gap = (body.angular_momentum(state.positions, state.velocities) - objective.target) / unit
+        else:
+            rows = (objective.rows @ linear.columns) / speed
+            gap = (objective.rows @ linear.base - objective.target) / speed
+        P += 2.0 * objective.weight * rows.T @ rows
+        q += 2.0 * objective.weight * rows.T @ gap
+        constant += objective.weight * float(gap @ gap)
+    return QuadraticCost(P, q, constant)
+
+
+def effort_cost(
+    problem: StepProblem,
+    linear: LinearStep,
+    foreseen: np.ndarray,
+    *,
+    weight: float = EFFORT,
+    horizon: float = HORIZON,
+) -> QuadraticCost:
+    """``weight`` / (m g H) times the elastic energy and what damping takes, ``horizon`` sqrt(H / g) after the start if
+    the body goes on at its end velocity, around ``foreseen`` (3N,) m/s.
+
+    Of all the shapes in which a body does what is asked, it takes the one that strains it least, and gives back what
+    it has stored: without this, muscles work against each other.
+    """
+    body = problem.body
+    ahead = max(horizon * float(np.sqrt(body.height / np.linalg.norm(body.gravity))), problem.dt)
+    end = problem.end_positions(foreseen.reshape(-1, 3))
+    assembly, damping = body.assembly, problem.damping
+    upper = assembly.matrix(assembly.matrix_entries(end, damping, projected=True))
+    moves = np.column_stack([ahead * linear.columns, ahead * linear.base - problem.dt * foreseen])
+    quadratic = moves.T @ (upper @ moves + sparse.triu(upper, 1).T @ moves)
+    force = assembly.gradient(end, damping).ravel() @ moves
+    unit = weight / (body.weight * body.height)
+    return QuadraticCost(
+        unit * quadratic[:-1, :-1],
+        unit * (force[:-1] + quadratic[:-1, -1]),
+        unit * (assembly.energy(end, damping) + float(force[-1] + 0.5 * quadratic[-1, -1])),
+    )
