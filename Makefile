@@ -19,8 +19,8 @@ examples: setup
 	done
 	$(BIN)/python examples/finetune.py --out out/finetune $(FRAMES:%=--steps %)
 
-# Two processes, each with one thread: tests that share a simulated run go to the same one.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadgroup
+# Two processes, each with one thread. The tests of a file go to the same one, so that what they share is made once.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 
 test: setup
 	$(PYTEST) -m "not (slow or data or example)"

@@ -22,7 +22,6 @@ from egs_warp.io import write_ply
 from egs_warp.web.page import PAGE
 from egs_warp.web.recording import CURVES, Recording
 
-pytestmark = pytest.mark.xdist_group("page")
 needs_page = pytest.mark.skipif(not PAGE.is_file(), reason="the page is not built; make web builds it")
 
 
