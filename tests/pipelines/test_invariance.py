@@ -130,10 +130,9 @@ def test_trajectory_leads_back_to_the_capture(elsewhere: tuple[Lying, Creature, 
     assert trajectory.height / trajectory.metres_per_unit == pytest.approx(0.37, rel=0.05)
 
 
-AMPLIFIED = pytest.mark.xfail(
-    reason="not met: x0.37 failed when first run, by how much was not read; rounding moves gave 2 to 3 % in a trial",
-    strict=False,
-)
+def amplified(measured: str) -> pytest.MarkDecorator:
+    """Not met: rounding grows in a jump. ``measured`` says by how much; distances and heights in body heights."""
+    return pytest.mark.xfail(reason=f"rounding grows in a jump: {measured}", strict=False)
 
 
 CHANGES = {
@@ -142,9 +141,14 @@ CHANGES = {
 }
 
 
-@AMPLIFIED
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CHANGES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("x0.37", marks=amplified("distance 0.5206 and 0.5264 (1.1 %), height 0.2116 and 0.2022 (4.4 %)")),
+        pytest.param("turned", marks=amplified("distance 0.5206 and 0.5267 (1.2 %), height 0.2116 and 0.2022 (4.4 %)")),
+    ],
+)
 def test_jump_goes_as_far_in_any_unit_and_turned(thing: Lying, name: str) -> None:
     """Distance and height within 1 %."""
     reached, again = (measure(jump(one)[1].trajectory) for one in (thing, CHANGES[name](thing)))
@@ -152,10 +156,22 @@ def test_jump_goes_as_far_in_any_unit_and_turned(thing: Lying, name: str) -> Non
     assert again.height == pytest.approx(reached.height, rel=0.01)
 
 
-@AMPLIFIED
 @pytest.mark.slow
 @pytest.mark.data
-@pytest.mark.parametrize(("name", "up"), [("monkey.ply", (0, 1, 0)), ("plush_dog.ply", (0, -1, 0))])
+@pytest.mark.parametrize(
+    ("name", "up"),
+    [
+        pytest.param(
+            *("monkey.ply", (0, 1, 0)),
+            marks=amplified("distance 0.5347 and 0.5294 (1.002 %), height 0.1972 and 0.1980 (0.4 %)"),
+        ),
+        pytest.param(
+            "plush_dog.ply",
+            (0, -1, 0),
+            marks=amplified("distance 0.5263 and 0.5224 (0.7 %), height 0.2020 and 0.1984 (1.8 %)"),
+        ),
+    ],
+)
 def test_jump_of_real_captures_goes_as_far(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:
     """Turned and in another unit, with nothing but up: distance and height within 1 %."""
     cloud = read_capture(data_dir / "objects" / name).cloud
