@@ -6,7 +6,6 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -69,7 +68,7 @@ def _train(chosen: argparse.Namespace) -> int:
     except ImportError as error:
         raise UserError("train: PyTorch is not installed; pip install 'egs-warp[torch]'") from error
     from egs_warp.io import read_cameras, writable_folder
-    from egs_warp.pipelines.report import write_report
+    from egs_warp.pipelines.train_report import TrainReport
 
     # Poses that cannot be read must not leave a new folder behind.
     read_cameras(chosen.posed)
@@ -93,14 +92,18 @@ def _train(chosen: argparse.Namespace) -> int:
     progress.say(f"writing {chosen.out}")
     stem = chosen.out.name.split(".")[0]
     write(chosen.out, result.cloud)
-    report = _report(chosen, result, progress, time.perf_counter() - began)
-    write_report(folder / f"{stem}.report.json", report)
+    report = TrainReport.of(
+        result,
+        seconds=time.perf_counter() - began,
+        frames_per_second=progress.frames_per_second,
+        device=chosen.device,
+        seed=chosen.seed,
+        sh_degree=chosen.sh_degree,
+    )
+    report.write(folder / f"{stem}.report.json")
     _write_sheet(folder / f"{stem}.sheet.png", result)
-    for which, scores in report["mean"].items():
-        if scores:
-            values = f"{scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f}"
-            print(f"{which.replace('_', ' ')}: {values} in each photo's exposure")
-    print(f"wrote {chosen.out} ({result.cloud.count} Gaussians), {stem}.sheet.png, {stem}.report.json")
+    wrote = f"wrote {chosen.out} ({result.cloud.count} Gaussians), {stem}.sheet.png, {stem}.report.json"
+    print(*report.summary(), wrote, sep="\n")
     return 0
 
 
@@ -162,38 +165,6 @@ def _writer(out: Path) -> Callable[[Path, GaussianCloud], None]:
                 raise UserError(f"--out {out}: is a folder; give the name of a file")
             return write
     raise UserError(f"--out {out}: give a name that ends in {', '.join(writers)}")
-
-
-def _report(chosen: argparse.Namespace, result: TrainResult, progress: _Progress, seconds: float) -> dict:
-    import numpy as np
-
-    from egs_warp.pipelines.report import versions
-
-    photo = result.views[0].camera
-    means = {
-        name: dict(zip(("psnr", "ssim"), score, strict=True)) if score else None
-        for name, score in (
-            ("held_out", result.mean_score(held_out=True)),
-            ("trained_on", result.mean_score(held_out=False)),
-        )
-    }
-    return {
-        "photos": len(result.views),
-        "left_out": [asdict(one) for one in result.left_out],
-        "photo_size": [photo.width, photo.height],
-        "gaussians": result.cloud.count,
-        "iterations": len(result.losses),
-        "final_loss": float(np.mean(result.losses[-100:])),
-        "background": list(result.background),
-        "mean": means,
-        "scores": [asdict(score) for score in result.scores],
-        "seconds": seconds,
-        "frames_per_second": progress.frames_per_second,
-        "device": chosen.device,
-        "seed": chosen.seed,
-        "sh_degree": chosen.sh_degree,
-        "versions": versions(("warp-lang", "numpy", "torch")),
-    }
 
 
 def _write_sheet(path: Path, result: TrainResult) -> None:

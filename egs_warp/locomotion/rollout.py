@@ -82,7 +82,7 @@ def settle(stepper: LocomotionStepper) -> BodyState:
     return state
 
 
-def simulate(
+def roll_out(
     stepper: LocomotionStepper,
     geometry: ContactGeometry,
     start: BodyState,

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from egs_warp.geometry.camera import Camera
-from egs_warp.locomotion import rollout
-from egs_warp.locomotion.rollout import FRAME_RATE, Simulation
+from egs_warp.locomotion.rollout import FRAME_RATE, Simulation, roll_out
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.script import Script
 from egs_warp.motions.sequence import MotionSequence, Place
@@ -89,7 +88,7 @@ def simulate(
     sequence = MotionSequence(place, motion.parts(creature.body.height))
     # A frame is as long as a step that is longer than it.
     share = 1.0 if step is None else min(1.0, 1.0 / (FRAME_RATE * step))
-    simulation = rollout.simulate(
+    simulation = roll_out(
         creature.stepper,
         creature.geometry,
         creature.start,

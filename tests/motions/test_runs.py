@@ -36,13 +36,11 @@ def assert_audit(trajectory: Trajectory, reports: Sequence[StepReport]) -> None:
     assert bounds.inverted_elements == 0 and bounds.newton_unconverged == 0
 
 
-@pytest.mark.xdist_group("coarse run")
 def test_every_step_of_a_coarse_run_is_audited(coarse_run: Run) -> None:
     """Eq. (4), (9): the bounds of the design, step by step."""
     assert_audit(coarse_run.trajectory, coarse_run.reports)
 
 
-@pytest.mark.xdist_group("coarse run")
 def test_a_coarse_block_hops_onto_its_square_and_twists_there(coarse_run: Run) -> None:
     """Measured: the hop misses by 1 % of its distance, the twist by 2 degrees."""
     trajectory, sequence = coarse_run.trajectory, coarse_run.sequence
@@ -56,7 +54,6 @@ def test_a_coarse_block_hops_onto_its_square_and_twists_there(coarse_run: Run) -
     assert twist.distance <= 0.1 and twist.tilt_degrees < 10.0 and twist.airborne_frames > 10.0
 
 
-@pytest.mark.xdist_group("coarse run")
 def test_a_coarse_run_ends_at_rest_with_all_motions_done(coarse_run: Run) -> None:
     assert coarse_run.sequence.finished and coarse_run.sequence.cut_short() == []
     assert [done.motion.notes() for done in coarse_run.sequence.done] == [[], []]

@@ -13,7 +13,7 @@ from egs_warp.locomotion.trajectory import audit, measure, record
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.walk import Walk, WalkPhase
 from tests.support.creatures import coarse_creature
-from tests.support.meshes import UP, figure, stool
+from tests.support.meshes import UP, coarse_stool, figure, stool
 from tests.support.places import DT
 
 
@@ -49,7 +49,7 @@ def test_a_coarse_stool_takes_a_step(slope: float) -> None:
     is met, the audit holds."""
     tilt = np.radians(slope)
     up = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
-    stepper, place, state = stiff(stool(), forward=np.array([1.0, 0.0, 0.0]), up=up)
+    stepper, place, state = stiff(coarse_stool(), forward=np.array([1.0, 0.0, 0.0]), up=up)
     body, start, walk = stepper.body, state, Walk(place, 1, 0.06)
     reports: list[StepReport] = []
     memory, air = stepper.initial_memory(), 0.0

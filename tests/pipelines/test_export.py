@@ -20,8 +20,6 @@ from egs_warp.pipelines.export import WRITERS, export_splats
 from egs_warp.pipelines.finished_run import FinishedRun
 from egs_warp.pipelines.usd import export_usd
 
-pytestmark = pytest.mark.xdist_group("page")
-
 
 @pytest.fixture(scope="module")
 def run(run_folder: Path) -> FinishedRun:
