@@ -29,7 +29,8 @@ import warp as wp
 from egs_warp.assets import figurine, pawn, stool
 from egs_warp.errors import UserError
 from egs_warp.io import read_capture
-from egs_warp.locomotion.trajectory import Trajectory, audit, measure
+from egs_warp.locomotion.audit import audit
+from egs_warp.locomotion.trajectory import Trajectory, measure
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.performance import simulate

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,14 +17,16 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.run_folder import RunFolder, run_folder
 from egs_warp.io.video import ffmpeg_program
+from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.stepper import LocomotionSettings
-from egs_warp.locomotion.trajectory import audit, measure
+from egs_warp.locomotion.trajectory import measure
 from egs_warp.motions.request import LARGEST_TARGET, LARGEST_TURN
 from egs_warp.motions.script import motion as script
 from egs_warp.pipelines import drawn
 from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.drawn import DrawnCreature
 from egs_warp.pipelines.film import Film, draw_film
+from egs_warp.pipelines.finished_run import PARTS
 from egs_warp.pipelines.oddities import oddities
 from egs_warp.pipelines.performance import Performance, simulate
 from egs_warp.pipelines.report import (
@@ -160,10 +163,16 @@ def animate(
         notes = (*notes, *oddities(creature.cloud, creature.cage.mesh, creature.body.height))
         with tqdm(total=options.frames or cut_off, desc="simulate", unit="frame", disable=quiet) as bar:
             performance = simulate(
-                creature, asked, frames=options.frames, forward=forward, progress=lambda _: bar.update()
+                creature,
+                asked,
+                frames=options.frames,
+                forward=forward,
+                parts=lambda: run.file(PARTS),
+                progress=lambda _: bar.update(),
             )
         # Whatever becomes of the film, the simulation is not lost.
-        performance.trajectory.placed(creature.frame).save(run.file("trajectory.npz"))
+        performance.trajectory.save(run.file("trajectory.npz"))
+        shutil.rmtree(run.path / PARTS, ignore_errors=True)
         with atomic_write(run.file("cage.vtu")) as temporary:
             creature.cage.mesh.write_vtu(temporary)
         film = draw_film(

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from egs_warp.io.atomic import atomic_write
+from egs_warp.locomotion.audit import Audit
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.locomotion.trajectory import Audit, Reached
+from egs_warp.locomotion.trajectory import Reached
 from egs_warp.version import __version__
 
 if TYPE_CHECKING:
@@ -214,7 +215,11 @@ class Report:
 AUDIT_LIMITS = {
     "momentum_residual": 1e-5,
     "angular_momentum_residual": 1e-4,
+    "energy_residual": 1e-6,
     "cone_violation": 1e-4,
+    "friction_gap": 1e-5,
+    # The spin that the stepper adds after a step, of which contacts do not know.
+    "contact_velocity": 0.1,
     "penetration": 1e-2,
     "complementarity_gap": 1e-4,
     "inverted_elements": 0,

@@ -13,8 +13,9 @@ from egs_warp.assets import pawn
 from egs_warp.contact.terrain import step
 from egs_warp.fem.body import BodyState
 from egs_warp.geometry.plane import Plane
+from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.locomotion.trajectory import Reached, Trajectory, audit, measure
+from egs_warp.locomotion.trajectory import Reached, Trajectory, measure
 from egs_warp.motions.follow import Follow
 from egs_warp.motions.hop import Hop
 from egs_warp.motions.keyframes import Quantity
