@@ -6,6 +6,7 @@ is what is left over of others. So ``Ledger.residual`` is an error of the run, o
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,7 @@ from egs_warp.locomotion.trajectory import Trajectory
 STORED = ("kinetic_com", "kinetic_rotation", "kinetic_deformation", "potential", "elastic")
 """Energies of a state."""
 FLOWS = (
-    "muscle_work",
+    "muscles",
     "damping",
     "drag",
     "friction",
@@ -49,7 +50,7 @@ class Ledger:
     """(F+1,) in gravity, above the origin."""
     elastic: np.ndarray
     """(F+1,) Neo-Hookean (Eq. 5)."""
-    muscle_work: np.ndarray
+    muscles: np.ndarray
     """(F,) sum of T (L before - L after)."""
     damping: np.ndarray
     """(F,) what the material dissipates."""
@@ -73,7 +74,7 @@ class Ledger:
     """(F,) work of the torque that is taken off the internal forces within the step, to keep the angular momentum."""
     spin_after: np.ndarray
     """(F,) kinetic energy of the spin that is added to the velocities after the step, for the same end."""
-    muscle_effort: np.ndarray
+    muscle_work: np.ndarray
     """(F,) sum of max(0, T (L before - L after)): what muscles give, those that are stretched not set off; no flow."""
 
     @property
@@ -85,6 +86,45 @@ class Ledger:
     def residual(self) -> np.ndarray:
         """(F,) what the stored energy gains beside all flows, over m g H."""
         return (np.diff(self.stored) - np.sum([getattr(self, name) for name in FLOWS], axis=0)) / self.unit
+
+    @property
+    def worst(self) -> float:
+        """Largest ``residual`` of any step, either way."""
+        # Not max(initial=0): where an element is inverted there is no energy, and NaN must be seen.
+        return float(np.abs(self.residual).max()) if len(self.residual) else 0.0
+
+
+@dataclass(frozen=True)
+class EnergySums:
+    """A ledger over all steps, over m g H but for its unit."""
+
+    unit_joules: float
+    """m g H."""
+    muscle_work: float
+    """Sum over segments and steps of max(0, T (L before - L after))."""
+    flows: Mapping[str, float]
+    """Of each of ``FLOWS``, its sum."""
+    gained: float
+    """Energy of the last state less that of the first."""
+    peak_deformation: float
+    """Largest kinetic energy of deformation."""
+    peak_elastic: float
+    """Largest elastic energy."""
+    worst_residual: float
+    """Of any step."""
+
+    @classmethod
+    def of(cls, books: Ledger) -> EnergySums:
+        """Of a run."""
+        return cls(
+            books.unit,
+            float(books.muscle_work.sum() / books.unit),
+            {name: float(getattr(books, name).sum() / books.unit) for name in FLOWS},
+            float((books.stored[-1] - books.stored[0]) / books.unit),
+            float(books.kinetic_deformation.max() / books.unit),
+            float(books.elastic.max() / books.unit),
+            books.worst,
+        )
 
 
 def ledger(trajectory: Trajectory) -> Ledger:
@@ -98,7 +138,7 @@ def ledger(trajectory: Trajectory) -> Ledger:
     return Ledger(
         float(mass * np.linalg.norm(t.gravity) * t.height),
         **dict(zip(STORED, stored.T, strict=True)),
-        **dict(zip((*FLOWS, "muscle_effort"), flows.T, strict=True)),
+        **dict(zip((*FLOWS, "muscle_work"), flows.T, strict=True)),
     )
 
 

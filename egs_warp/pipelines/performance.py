@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.script import Script
 from egs_warp.motions.sequence import MotionSequence, Place
 from egs_warp.pipelines.creature import FILMED_FROM, Creature, first_place
+from egs_warp.pipelines.planned import planned_com
 
 
 @dataclass(frozen=True)
@@ -103,4 +104,6 @@ def simulate(
         finished=lambda: frames is None and sequence.finished,
         progress=progress,
     )
-    return Performance(creature, place, sequence, simulation)
+    trajectory = simulation.trajectory
+    trajectory = trajectory.with_plan(planned_com(sequence, creature.body, trajectory))
+    return Performance(creature, place, sequence, replace(simulation, trajectory=trajectory))

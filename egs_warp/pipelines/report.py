@@ -14,6 +14,7 @@ import numpy as np
 
 from egs_warp.io.atomic import atomic_write
 from egs_warp.locomotion.audit import Audit
+from egs_warp.locomotion.ledger import EnergySums
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Reached
 from egs_warp.version import __version__
@@ -169,6 +170,7 @@ class Report:
     """Name of the capture."""
     motion: tuple[MotionReport, ...]
     audit: Audit
+    energy: EnergySums
     qp: QpCounts
     timing: Mapping[str, StageTime]
     cage: CageFacts
@@ -190,6 +192,7 @@ class Report:
             "asked": dict(self.asked),
             "motion": [motion.to_json() for motion in self.motion],
             "audit": asdict(self.audit),
+            "energy": asdict(self.energy),
             "qp": asdict(self.qp),
             "timing": {stage: asdict(time) for stage, time in self.timing.items()},
             "cage": asdict(self.cage),
@@ -208,6 +211,7 @@ class Report:
     def summary(self) -> str:
         """A few lines for the terminal."""
         lines = [line for motion in self.motion for line in motion.summary()]
+        lines.append(f"muscle work: {self.energy.muscle_work:.2f} of the energy that lifts the body by its height")
         lines.append(verdict(self.audit))
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 

@@ -95,7 +95,7 @@ def test_signs_are_those_of_physics(books: Ledger) -> None:
     solver leaves."""
     for flow in ("damping", "drag", "friction", "contact", "lost_inertia"):
         assert (getattr(books, flow) <= 1e-8 * books.unit).all(), flow
-    assert (books.push_out >= 0.0).all() and (books.muscle_effort >= books.muscle_work - 1e-12 * books.unit).all()
+    assert (books.push_out >= 0.0).all() and (books.muscle_work >= books.muscles - 1e-12 * books.unit).all()
 
 
 def test_stored_energies_are_those_of_the_body(name: str, trajectory: Trajectory, books: Ledger) -> None:

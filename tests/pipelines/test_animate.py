@@ -22,7 +22,7 @@ from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.performance import Performance, simulate
 from egs_warp.pipelines.report import Report, verdict
 
-FILES = ["cage.vtu", "creature.npz", "jump.mp4", MANIFEST, "report.json", "sheet.png", "trajectory.npz"]
+FILES = ["cage.vtu", "creature.npz", "jump.mp4", MANIFEST, "plots.png", "report.json", "sheet.png", "trajectory.npz"]
 OPTIONS = AnimateOptions(frames=1, size=32, friction=0.6)
 
 
@@ -57,6 +57,9 @@ def test_a_run_holds_what_was_asked_and_its_manifest(run: Callable[..., Report],
     assert asked["friction"] == 0.6 and asked["size"] == 32 and asked["frames"] == 1 and asked["up"] is None
     assert asked["plane"] == pytest.approx([*pawn(device="cpu").plane.normal, pawn(device="cpu").plane.offset])
     assert verdict(report.audit).startswith("audit: passed (momentum_residual ")
+    energy = json.loads((tmp_path / "report.json").read_text())["energy"]
+    assert energy["gained"] == pytest.approx(sum(energy["flows"].values()), abs=1e-9)
+    assert energy["muscle_work"] >= energy["flows"]["muscles"] and energy["worst_residual"] < 1e-6
 
 
 def test_a_film_that_fails_leaves_the_simulation(
@@ -110,8 +113,8 @@ def test_a_disk_that_is_full_at_any_file(
         assert MANIFEST not in names or not finished(folder)
         run(folder, overwrite=True)
         assert finished(folder) and set(FILES) <= set(os.listdir(folder))
-    # Six files, the manifest before each of them and at the end.
-    assert failures == 13
+    # Seven files, the manifest before each of them and at the end.
+    assert failures == 15
 
 
 def test_a_verdict_names_what_is_beyond(run: Callable[..., Report], tmp_path: Path) -> None:
