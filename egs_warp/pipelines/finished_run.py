@@ -36,7 +36,7 @@ def read_trajectory(path: Path) -> Trajectory:
     try:
         return Trajectory.load(path)
     except FileNotFoundError as error:
-        if (path.parent / PARTS).is_dir():
+        if not path.is_dir() and (path.parent / PARTS).is_dir():
             raise UserError(f"{path}: is missing, the run was cut off; what it did is in {PARTS}") from error
         raise UserError(f"{path}: is missing; give the folder that egs-warp animate wrote") from error
     except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:

@@ -39,7 +39,7 @@ def draw_plots(path: Path, trajectory: Trajectory, ledger: Ledger) -> None:
     # Takes a quarter of a second to import.
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(12.0, 12.0), layout="tight")
+    figure = Figure(figsize=(12.0, 12.0), layout="constrained")
     panels = figure.subplots(3, 2)
     _draw_stored(panels[0, 0], trajectory, ledger)
     _draw_flows(panels[0, 1], trajectory, ledger)
@@ -71,7 +71,7 @@ def _draw_flows(axes: Axes, t: Trajectory, ledger: Ledger) -> None:
     axes.plot(t.time, total / ledger.unit, "k", linewidth=2.0, label="sum")
     axes.plot(t.time, (ledger.stored - ledger.stored[0]) / ledger.unit, "w--", linewidth=1.0, label="gained")
     axes.set_title("Energy given and taken since the start, over m g H")
-    axes.legend(fontsize="small", facecolor="0.85", loc="center right")
+    axes.legend(fontsize="small", facecolor="0.85", ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.14))
 
 
 def _draw_load(axes: Axes, t: Trajectory) -> None:

@@ -36,11 +36,10 @@ def test_the_same_run_gives_the_same_bytes_and_another_another_picture(tmp_path:
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     changed = np.abs(picture(tmp_path / "other.png") - picture(tmp_path / "a.png")).max(axis=2) > 30.0
     high, wide = changed.shape[0] // 3, changed.shape[1] // 2
-    # Flows, load, residual, centre of mass, muscles; what is stored is the same.
-    panels = {(0, 1), (1, 0), (1, 1), (2, 0), (2, 1)}
-    for row, column in np.ndindex(3, 2):
+    # Flows, load, residual, centre of mass, muscles.
+    for row, column in ((0, 1), (1, 0), (1, 1), (2, 0), (2, 1)):
         here = changed[row * high : (row + 1) * high, column * wide : (column + 1) * wide]
-        assert (here.sum() > 50) == ((row, column) in panels), (row, column)
+        assert here.sum() > 200, (row, column)
 
 
 def test_a_flight_without_contact_or_pull_is_drawn(tmp_path: Path) -> None:
