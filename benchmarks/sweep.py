@@ -46,7 +46,10 @@ CAPTURES = {"robot": ("robot.spz", (0.0, 1.0, 0.0)), "monkey": ("monkey.ply", (0
 BOUNDS = {
     "momentum_residual": 1e-5,
     "angular_momentum_residual": 1e-4,
+    "energy_residual": 1e-6,
     "cone_violation": 1e-4,
+    "friction_gap": 1e-5,
+    "contact_velocity": 0.1,
     "complementarity_gap": 1e-4,
     "penetration": 0.01,
     "inverted_elements": 0,

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from egs_warp.contact.detection import ContactDetector, ContactGeometry
+from egs_warp.fem.body import BodyState
 from egs_warp.geometry.body_frame import BodyFrame
+from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.trajectory import Trajectory
 from tests.support.slides import slide
@@ -75,3 +79,24 @@ def test_all_that_acts_on_the_body_is_written_down() -> None:
     assert np.array_equal(t.muscle_stiffness, muscles.stiffness)
     assert (t.contact_plane == 0).all() and len(t.contact_plane) == len(t.contact_gap) > 0
     assert t.in_capture(np.array([1.0, 0.0, 0.0])) == pytest.approx([1.0, 2.25, 3.0])
+
+
+def test_each_contact_names_its_plane_among_parallel_ones() -> None:
+    """A block whose one half is lifted over a step: treads have one normal, risers another."""
+    run = slide("two-stage")
+    body, flat = run.stepper.body, run.stepper.geometry
+    step = (Plane(np.array([0.0, 0.0, 1.0]), -0.2), Plane(np.array([-1.0, 0.0, 0.0]), 0.05))
+    planes = (*flat.planes, *step)
+    points = (flat.tet_from_point, flat.weights)
+    geometry = ContactGeometry(flat.mesh, planes, 0.8, *points, 0, 0.0, solid_from_plane=(0, 1, 1))
+    detector = ContactDetector(geometry, device="cpu")
+    positions = body.mesh.nodes - np.array([*body.mesh.nodes[:, :2].mean(axis=0), 0.0])
+    positions[positions[:, 0] > 0.1] += [0.0, 0.0, 0.21]
+    contacts = detector.contact_set(np.arange(len(flat.weights)), positions)
+    _, nearest = detector.gaps(positions)
+    assert {0, 1} <= set(nearest)
+    start = BodyState(positions, np.zeros_like(positions))
+    recorder = Recorder(body, run.stepper.muscles, geometry, start, 0.0, drag=0.0)
+    forces = np.zeros((contacts.count, 3))
+    recorder.add([replace(run.reports[0], contacts=contacts, forces=forces, end_gaps=contacts.gaps)])
+    assert np.array_equal(recorder.trajectory().contact_plane, nearest)
