@@ -86,7 +86,7 @@ def _animate(chosen: argparse.Namespace) -> int:
     check_run_folder(chosen.out, overwrite=chosen.overwrite)
     report, more = _animate_scene(chosen) if chosen.object is not None else _animate_capture(chosen)
     print(report.summary())
-    print(f"wrote the video, sheet.png, report.json, trajectory.npz{more} into {chosen.out}")
+    print(f"wrote the video, sheet.png, plots.png, report.json, trajectory.npz{more} into {chosen.out}")
     return 0
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -13,9 +14,11 @@ from egs_warp.contact.detection import ContactGeometry
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.factorisation import Factorisation
 from egs_warp.fem.implicit_step import ImplicitStep
+from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
-from egs_warp.locomotion.trajectory import Trajectory, record
+from egs_warp.locomotion.trajectory import Trajectory
 
 FRAME_RATE = 60
 """Frames of a video, 1/s."""
@@ -90,13 +93,16 @@ def roll_out(
     *,
     frames: int,
     step: float | None = None,
+    place: BodyFrame | None = None,
+    parts: Callable[[], Path] | None = None,
     finished: Callable[[], bool] = lambda: False,
     progress: Callable[[int], object] = lambda frame: None,
 ) -> Simulation:
     """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``.
 
     ``step``: seconds of a solver step, if not the usual (docs/concepts/conventions.md); one longer than a
-    frame makes the frame as long. ``progress`` is told each frame done.
+    frame makes the frame as long. ``place`` is where the body lies in its capture; steps are written into the folder
+    that ``parts`` tells as they are done (``Recorder``). ``progress`` is told each frame done.
     """
     per_frame = steps_per_frame(stepper.body) if step is None else max(round(1.0 / (FRAME_RATE * step)), 1)
     dt = step or 1.0 / (FRAME_RATE * per_frame)
@@ -104,24 +110,26 @@ def roll_out(
     reports: list[StepReport] = []
     shown = [0]
     resting = 0
+    gaps, _ = stepper.detector.gaps(start.positions)
+    recorder = Recorder(
+        stepper.body,
+        stepper.muscles,
+        geometry,
+        start,
+        float(gaps.min()),
+        drag=stepper.settings.drag,
+        frame=place,
+        folder=parts,
+    )
     for frame in range(frames):
         for _ in range(per_frame):
             objectives = motion.objectives(state, reports[-1] if reports else None, dt)
             state, memory, done = stepper.advance(state, memory, objectives, dt)
             reports.extend(done)
+            recorder.add(done)
         shown.append(len(reports))
         progress(frame)
         resting = resting + 1 if finished() else 0
         if resting == REST_FRAMES:
             break
-    gaps, _ = stepper.detector.gaps(start.positions)
-    trajectory = record(
-        stepper.body,
-        geometry,
-        start,
-        float(gaps.min()),
-        reports,
-        drag=stepper.settings.drag,
-        segments=stepper.muscles.segment_count,
-    )
-    return Simulation(trajectory, tuple(reports), np.array(shown))
+    return Simulation(recorder.trajectory(), tuple(reports), np.array(shown))

@@ -13,8 +13,9 @@ from egs_warp.assets import pawn
 from egs_warp.contact.terrain import step
 from egs_warp.fem.body import BodyState
 from egs_warp.geometry.plane import Plane
+from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.locomotion.trajectory import Reached, Trajectory, audit, measure
+from egs_warp.locomotion.trajectory import Reached, Trajectory, measure
 from egs_warp.motions.follow import Follow
 from egs_warp.motions.hop import Hop
 from egs_warp.motions.keyframes import Quantity
@@ -29,9 +30,10 @@ FORWARD = np.array([1.0, 0.0, 0.0])
 
 
 def assert_audit(trajectory: Trajectory, reports: Sequence[StepReport]) -> None:
-    """Momentum, angular momentum, friction, penetration and complementarity within the bounds of the design."""
+    """Both momenta, energy, friction, penetration and complementarity within the bounds of the design."""
     bounds = audit(trajectory, newton_unconverged=sum(not report.converged for report in reports))
     assert bounds.momentum_residual <= 1e-5 and bounds.angular_momentum_residual <= 1e-4
+    assert bounds.energy_residual <= 1e-6 and bounds.friction_gap <= 1e-5 and bounds.contact_velocity <= 0.1
     assert bounds.cone_violation <= 1e-4 and bounds.penetration <= 0.01 and bounds.complementarity_gap <= 1e-4
     assert bounds.inverted_elements == 0 and bounds.newton_unconverged == 0
 

@@ -27,6 +27,9 @@ from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.base_plane import find_base_plane
 from tests.support.frames import TURN, Lying
 
+WHERE_IT_LIES = {"body_axes", "body_origin", "metres_per_unit"}
+"""Of a trajectory: what says how the file lies."""
+
 
 def jump(lying: Lying, *, frames: int | None = None, by_up: bool = False) -> tuple[Creature, Simulation]:
     """The first ``frames`` of a jump, or all of it; the plane is given, or found from up alone."""
@@ -88,7 +91,7 @@ def test_same_bits_however_the_file_lies(
         (again.geometry, creature.geometry),
         (simulated.trajectory, simulation.trajectory),
     ):
-        for name in mine.__dataclass_fields__:
+        for name in mine.__dataclass_fields__.keys() - WHERE_IT_LIES:
             a, b = getattr(mine, name), getattr(its, name)
             if hasattr(a, "toarray"):
                 a, b = a.toarray(), b.toarray()
@@ -120,8 +123,8 @@ def test_same_pictures_from_up_alone(
 
 def test_trajectory_leads_back_to_the_capture(elsewhere: tuple[Lying, Creature, Simulation]) -> None:
     """The nodes at the start stand where the Gaussians are, on the capture's plane."""
-    turned, creature, simulation = elsewhere
-    trajectory = simulation.trajectory.placed(creature.frame)
+    turned, _, simulation = elsewhere
+    trajectory = simulation.trajectory
     nodes, means = trajectory.in_capture(trajectory.rest_positions), turned.cloud.means.numpy()
     assert turned.plane.heights(nodes).min() == pytest.approx(0.0, abs=1e-9)
     slack = 0.05 * 0.37
