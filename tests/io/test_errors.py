@@ -165,7 +165,7 @@ def test_bad_spz(tmp_path: Path) -> None:
         "gzip data, but no .spz inside; unpack it first if it holds another format"
     )
     assert message(written(path, gzip.compress(body[:4] + struct.pack("<I", 7) + body[8:]))) == (
-        ".spz version 7, expected 1, 2 or 3; export it as version 3 or as .ply"
+        ".spz version 7, expected 1 to 4; export it as version 4 or as .ply"
     )
     assert message(written(path, gzip.compress(body[:12] + b"\x09" + body[13:]))).startswith(".spz with SH degree 9")
     assert message(written(path, b"NGSP\x04\0\0\0")).startswith("truncated: .spz header of 8 bytes, expected 16")
