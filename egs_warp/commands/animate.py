@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     animate = commands.add_parser("animate", help="bring a capture to life")
-    animate.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog or an unbundled SOG folder")
+    animate.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
     animate.add_argument(
         "--motion",
         default="jump",

@@ -15,7 +15,7 @@ import zstandard
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io import read_capture, write_ply, write_spz
-from tests.support.captures import assert_same_bits, make_cloud
+from tests.support.captures import assert_same_bits, make_cloud, spz_of_streams
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
@@ -47,22 +47,11 @@ def test_spz_by_hand(version: int, tmp_path: Path) -> None:
     assert_same_bits(read_capture(tmp_path / "plain.spz", device="cpu").cloud, cloud)
 
 
-def _spz_of_streams(plain: bytes, count: int, sh_bytes: int, records: bytes = b"") -> bytes:
-    """Version 4 of ``plain``, a .spz of version 3 without its gzip: header, records, table, streams."""
-    ends = 16 + count * np.cumsum([0, 9, 1, 3, 3, 4, sh_bytes])
-    blocks = [plain[start:end] for start, end in zip(ends[:-1], ends[1:], strict=True) if end > start]
-    streams = [zstandard.ZstdCompressor().compress(block) for block in blocks]
-    flags = plain[14] | (2 if records else 0)
-    header = struct.pack("<4sI", b"NGSP", 4) + plain[8:14] + bytes([flags, len(blocks)])
-    table = b"".join(struct.pack("<QQ", len(s), len(b)) for s, b in zip(streams, blocks, strict=True))
-    return header + struct.pack("<I12x", 32 + len(records)) + records + table + b"".join(streams)
-
-
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_spz_of_streams_holds_what_version_3_does(degree: int, tmp_path: Path) -> None:
     write_spz(tmp_path / "3.spz", make_cloud(900, degree))
     plain = gzip.decompress((tmp_path / "3.spz").read_bytes())
-    (tmp_path / "4.spz").write_bytes(_spz_of_streams(plain, 900, 3 * ((degree + 1) ** 2 - 1)))
+    (tmp_path / "4.spz").write_bytes(spz_of_streams(plain, 900, 3 * ((degree + 1) ** 2 - 1)))
     capture = read_capture(tmp_path / "4.spz", device="cpu")
     assert capture.format == ".spz version 4"
     np.testing.assert_array_equal(capture.up, [0.0, 1.0, 0.0])
@@ -78,12 +67,12 @@ def _one_spz(tmp_path: Path) -> bytes:
 def test_spz_of_streams_says_which_way_is_up(axes: int, up: tuple[int, int, int], tmp_path: Path) -> None:
     """RUB, RDF, RFU, LFD, behind a record of another kind."""
     records = struct.pack("<IIfff", 0xADBE0002, 12, 0.0, 1.0, 2.0) + struct.pack("<III", 0xADBE0003, 4, axes)
-    (tmp_path / "4.spz").write_bytes(_spz_of_streams(_one_spz(tmp_path), 1, 0, records))
+    (tmp_path / "4.spz").write_bytes(spz_of_streams(_one_spz(tmp_path), 1, 0, records))
     np.testing.assert_array_equal(read_capture(tmp_path / "4.spz", device="cpu").up, up)
 
 
 def test_damaged_spz_of_streams_is_one_line(tmp_path: Path) -> None:
-    good = _spz_of_streams(_one_spz(tmp_path), 1, 0)
+    good = spz_of_streams(_one_spz(tmp_path), 1, 0)
     left = struct.pack("<III", 0xADBE0003, 4, 3)
     bomb = zstandard.ZstdCompressor().compress(bytes(1 << 26))
     for data, said in {
@@ -93,7 +82,7 @@ def test_damaged_spz_of_streams_is_one_line(tmp_path: Path) -> None:
         good[:15] + b"\4" + good[16:]: ".spz with 4 streams, expected 5",
         good[:112] + b"\0" * (len(good) - 112): "corrupted .spz data",
         good[:32] + struct.pack("<QQ", len(bomb), 1 << 26) + good[48:112] + bomb: "of which 9 are needed",
-        _spz_of_streams(_one_spz(tmp_path), 1, 0, left): "left-handed axes (LUB), which would be mirrored",
+        spz_of_streams(_one_spz(tmp_path), 1, 0, left): "left-handed axes (LUB), which would be mirrored",
         gzip.compress(good): "version 4 inside gzip; unpack it first",
     }.items():
         (tmp_path / "4.spz").write_bytes(data)

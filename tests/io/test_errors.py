@@ -40,9 +40,8 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
 
 
 def test_wrong_magic(tmp_path: Path) -> None:
-    expected = (
-        "unknown format (starts with b'\\xff\\xd8\\xff\\xe0abcd'); give a .ply, .spz, .splat, .sog or a SOG folder"
-    )
+    advice = "give a .ply, .spz, .splat, .sog, .glb or a SOG folder"
+    expected = f"unknown format (starts with b'\\xff\\xd8\\xff\\xe0abcd'); {advice}"
     for name in ("photo.jpg", "a.ply", "a.spz", "a.sog"):
         assert message(written(tmp_path / name, b"\xff\xd8\xff\xe0abcdefgh")) == expected
 
