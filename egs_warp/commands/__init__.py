@@ -3,4 +3,17 @@
 In: flags. Out: files and an exit status. Nothing else in the package speaks of flags.
 """
 
-COMMANDS = ("animate", "doctor", "export", "inpaint", "muscles", "plane", "pose", "samples", "segment", "train", "view")
+COMMANDS = (
+    "animate",
+    "convert",
+    "doctor",
+    "export",
+    "inpaint",
+    "muscles",
+    "plane",
+    "pose",
+    "samples",
+    "segment",
+    "train",
+    "view",
+)
