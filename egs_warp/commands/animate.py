@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from egs_warp.commands.camera_flags import add_camera_flags, shot_of
 from egs_warp.commands.flags import (
     Commands,
     add_inpainter_flags,
@@ -46,9 +47,6 @@ def add_parser(commands: Commands) -> None:
     )
     add_straddling_flag(animate)
     add_inpainter_flags(animate, default=None)
-    animate.add_argument(
-        "--background", help="capture to draw behind the object of earlier steps, as inpaint writes it"
-    )
     animate.add_argument("--no-inpaint", action="store_true", help="leave the floor under the object as captured")
     animate.add_argument("--no-shadow", action="store_true", help="no shadow on the ground under the object")
     animate.add_argument("--forward", help="x,y,z or an axis: the way of motions; else along the feet")
@@ -69,7 +67,6 @@ def add_parser(commands: Commands) -> None:
     )
     animate.add_argument("--heading-degrees", type=float, help="of a twist, counter-clockwise from above (180)")
     animate.add_argument("--frames", type=int, help="length of the video at 60 Hz (until the body rests)")
-    animate.add_argument("--size", type=int, help="pixels, both sides (512)")
     animate.add_argument("--seed", type=int, help="recorded in the report; a jump has nothing random (0)")
     animate.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
     animate.add_argument("--metres-per-unit", type=float, help="true scale; else the body is 1 m tall")
@@ -77,6 +74,7 @@ def add_parser(commands: Commands) -> None:
     animate.add_argument(
         "--overwrite", action="store_true", help="move an earlier run in --out aside, into earlier-1, earlier-2, ..."
     )
+    add_camera_flags(animate.add_argument_group("camera"), size="512")
     animate.set_defaults(run=_animate)
 
 
@@ -101,13 +99,14 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
         if getattr(chosen, name) not in (None, False):
             raise UserError(f"--{name.replace('_', '-')}: needs --object, which says what to take out of a scene")
     asked = _asked(chosen)
+    asked["shot"], behind = shot_of(chosen)
     ffmpeg_program()
     start(chosen.device)
     up = parse_up(chosen.up) if chosen.up is not None else None
     plane = plane_of(chosen.plane) if chosen.plane is not None else None
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
     capture = read_capture(chosen.capture, device=chosen.device)
-    background = read_capture(chosen.background, device=chosen.device).cloud if chosen.background is not None else None
+    background = read_capture(behind, device=chosen.device).cloud if behind is not None else None
     notes = list(capture.notes)
     if capture.infinite_opacities:
         notes.append(f"{capture.infinite_opacities} infinite opacities were read as 0 or 1")
@@ -138,11 +137,13 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
     from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene, viewing_direction
     from egs_warp.training.photo_colours import photographs_in_colours_of
 
-    if chosen.background is not None:
+    shot, behind = shot_of(chosen)
+    if behind is not None:
         raise UserError("--background: with --object the rest of the scene is behind the object; leave one of them out")
     if chosen.inpainter is not None and chosen.no_inpaint:
         raise UserError("--inpainter: --no-inpaint leaves the floor as captured; leave one of them out")
     asked = _asked(chosen)
+    asked["shot"] = shot
     ffmpeg_program()
     start(chosen.device)
     inpainter = chosen_inpainter(chosen)
@@ -207,7 +208,7 @@ def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
     from egs_warp.motions.script import motion
     from egs_warp.pipelines.animate import AnimateOptions
 
-    numbers = ("distance", "height", "heading_degrees", "frames", "size", "seed", "metres_per_unit", "friction")
+    numbers = ("distance", "height", "heading_degrees", "frames", "seed", "metres_per_unit", "friction")
     given = {name: getattr(chosen, name) for name in numbers if getattr(chosen, name) is not None}
     options = AnimateOptions(**given, shadow=not chosen.no_shadow)
     # The files of key frames are read, too.

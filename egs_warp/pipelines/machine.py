@@ -127,7 +127,7 @@ def inspect_machine() -> Machine:
         versions=versions(MECHANICS),
         optional=optional,
         driver=".".join(map(str, driver)) if driver else None,
-        toolkit=".".join(map(str, toolkit)),
+        toolkit=".".join(map(str, toolkit)) if toolkit else "none",
         cores=available_threads(),
         devices=devices,
         cache=cache,
