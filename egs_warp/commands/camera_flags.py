@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 TRANSPARENT = "transparent"
 
 
-def add_camera_flags(parser: argparse._ArgumentGroup, *, size: str) -> None:
+def add_camera_flags(parser: argparse._ActionsContainer, *, size: str) -> None:
     """Add the flags that ``shot_of`` reads; ``size`` says what the film is like without ``--size``."""
     parser.add_argument(
         "--camera", default="fixed", help="fixed (default), follow, orbit, or a path.json of key cameras"

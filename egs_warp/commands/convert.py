@@ -13,6 +13,13 @@ from egs_warp.errors import UserError
 _KINDS = ("ply", "compressed-ply", "spz", "sog", "splat", "glb")
 
 
+EXAMPLES = (
+    "scan.ply scan.spz",
+    "scan.ply flat.splat --degree 0",
+    "frames spz_frames --to spz",
+)
+
+
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     convert = commands.add_parser("convert", help="write a capture in another format, and say what is lost")

@@ -7,6 +7,12 @@ import sys
 
 from egs_warp.commands.flags import Commands
 
+EXAMPLES = (
+    "",
+    "--warm",
+    "--warm --device cuda:0",
+)
+
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""

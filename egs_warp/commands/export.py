@@ -11,6 +11,13 @@ from egs_warp.errors import UserError
 _KINDS = ("ply", "compressed-ply", "spz", "sog", "splat", "glb", "usd")
 
 
+EXAMPLES = (
+    "out/jump --to ply --out frames --every 2",
+    "out/jump --to usd --out jump.usdc",
+    "out/jump --to glb --out still --frame 40",
+)
+
+
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     export = commands.add_parser("export", help="write a run for other tools: splat files, glTF, USD")

@@ -7,6 +7,8 @@ import argparse
 from egs_warp.commands.flags import Commands, guessed_up, named_path, parse_up
 from egs_warp.commands.scene_flags import say, start
 
+EXAMPLES = ("pawn.ply --plot muscles.png",)
+
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""

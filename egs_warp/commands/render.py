@@ -8,6 +8,13 @@ from pathlib import Path
 from egs_warp.commands.camera_flags import add_camera_flags, shot_of
 from egs_warp.commands.flags import Commands, named_path
 
+EXAMPLES = (
+    "out/jump --out close.mp4 --camera follow --size 1280x720",
+    "out/jump --out cut_out.mov --background transparent",
+    'out/jump --out turn.webm --turntable 40 --background "#204060"',
+    "out/jump --out depth --show depth",
+)
+
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""

@@ -10,6 +10,9 @@ _GAUSSIANS = 6000
 """Of the object alone: a jump of it takes about half as long as that of the whole pawn."""
 
 
+EXAMPLES = ("out/samples",)
+
+
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     samples = commands.add_parser("samples", help="write a small built-in capture and scene to try")

@@ -8,7 +8,7 @@ import sys
 from egs_warp.commands.flags import named_path
 
 
-def add_object_flags(parser: argparse.ArgumentParser) -> None:
+def add_object_flags(parser: argparse._ActionsContainer) -> None:
     """Add the flags that say where the object is."""
     parser.add_argument(
         "--object",

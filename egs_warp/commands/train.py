@@ -20,6 +20,12 @@ _DEFAULTS = {"cpu": (2000, 20_000, 360), "cuda": (7000, None, 1600)}
 """Iterations, Gaussians, longer side in pixels: a preview on two cores, a capture on a GPU."""
 
 
+EXAMPLES = (
+    "posed --out capture.ply",
+    "posed --out capture.spz --device cuda:0 --iterations 7000",
+)
+
+
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     train = commands.add_parser("train", help="make a capture from posed photos")

@@ -8,6 +8,12 @@ from pathlib import Path
 from egs_warp.commands.flags import Commands
 from egs_warp.errors import UserError
 
+EXAMPLES = (
+    "out/jump",
+    "out/jump out/hop",
+    "out/jump --export page.html",
+)
+
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""

@@ -18,7 +18,7 @@ def test_the_two_commands_fit_the_two_files(tmp_path: Path, capsys: pytest.Captu
     said = capsys.readouterr().out
     commands = [shlex.split(line) for line in re.findall(r"^  egs-warp (.+)$", said, re.MULTILINE)]
     assert len(commands) == 2
-    alone, scene = (cli._parser().parse_args(command) for command in commands)
+    alone, scene = (cli._parsers()[0].parse_args(command) for command in commands)
     thing, whole = read_capture(alone.capture).cloud, read_capture(scene.capture).cloud
     assert whole.count > thing.count > 3000
     assert np.ptp(thing.means.numpy()[:, 2]) == pytest.approx(1.0, abs=0.05)
