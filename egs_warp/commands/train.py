@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +12,6 @@ from egs_warp.commands.flags import Commands, named_path
 from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
-    from egs_warp.geometry.gaussians import GaussianCloud
     from egs_warp.pipelines.train_capture import TrainResult
 
 _SHEET_PHOTOS = 6
@@ -21,12 +19,21 @@ _DEFAULTS = {"cpu": (2000, 20_000, 360), "cuda": (7000, None, 1600)}
 """Iterations, Gaussians, longer side in pixels: a preview on two cores, a capture on a GPU."""
 
 
+EXAMPLES = (
+    "posed --out capture.ply",
+    "posed --out capture.spz --device cuda:0 --iterations 7000",
+)
+
+
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     train = commands.add_parser("train", help="make a capture from posed photos")
     train.add_argument("posed", help="COLMAP model, transforms.json or cameras.json, or a folder that holds one")
     train.add_argument(
-        "--out", required=True, type=named_path, help="capture to write: .ply, .compressed.ply, .spz or .sog"
+        "--out",
+        required=True,
+        type=named_path,
+        help="capture to write: .ply, .compressed.ply, .spz, .sog, .splat or .glb",
     )
     train.add_argument("--iterations", type=int, help="optimiser steps, one photo each (cpu 2000, cuda 7000)")
     train.add_argument(
@@ -53,9 +60,10 @@ def _train(chosen: argparse.Namespace) -> int:
             raise UserError(f"{flag} {value}: give a whole number of at least {least}")
     if not 0 <= chosen.sh_degree <= 3:
         raise UserError(f"--sh-degree {chosen.sh_degree}: give 0, 1, 2 or 3")
-    write = _writer(chosen.out)
     from egs_warp.io.run_folder import check_out
+    from egs_warp.io.writing import writer_of
 
+    write = writer_of(chosen.out)
     check_out(chosen.out.parent if chosen.out.parent != Path(".") else Path.cwd())
     import warp as wp
 
@@ -151,20 +159,6 @@ def _colour(text: str) -> tuple[float, float, float]:
     if not all(0.0 <= value <= 1.0 for value in (red, green, blue)):
         raise UserError(f"--background {text}: give three numbers r,g,b from 0 to 1")
     return red, green, blue
-
-
-def _writer(out: Path) -> Callable[[Path, GaussianCloud], None]:
-    """The function that writes a capture to ``out``; refused now rather than after training."""
-    from egs_warp import io
-
-    writers = {".compressed.ply": io.write_compressed_ply, ".ply": io.write_ply, ".spz": io.write_spz}
-    writers |= {".sog": io.write_sog, ".splat": io.write_splat}
-    for suffix, write in writers.items():
-        if out.name.lower().endswith(suffix) and out.name.lower() != suffix:
-            if out.is_dir():
-                raise UserError(f"--out {out}: is a folder; give the name of a file")
-            return write
-    raise UserError(f"--out {out}: give a name that ends in {', '.join(writers)}")
 
 
 def _write_sheet(path: Path, result: TrainResult) -> None:

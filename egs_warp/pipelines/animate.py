@@ -40,6 +40,7 @@ from egs_warp.pipelines.report import (
     Report,
     stage_times,
 )
+from egs_warp.pipelines.shot import Shot
 
 LARGEST_SIZE = 4096
 LARGEST_FRICTION = 10.0
@@ -98,6 +99,7 @@ class Asked:
     """Everything that was asked of a run, besides the capture and the motion; frame and units of the capture."""
 
     options: AnimateOptions
+    shot: Shot
     up: tuple[float, ...]
     plane: tuple[float, ...] | None
     """nx, ny, nz, d."""
@@ -110,8 +112,8 @@ class Asked:
 
     def to_json(self) -> dict[str, Any]:
         """``asked`` of the report; what was left to the program is null."""
-        given = {name: value or None for name, value in vars(self).items() if name not in ("options", "solids")}
-        return {**asdict(self.options), **given, "solids": self.solids}
+        given = {name: value or None for name, value in vars(self).items() if name not in ("options", "shot", "solids")}
+        return {**asdict(self.options), **self.shot.to_json(), **given, "solids": self.solids}
 
 
 def animate(
@@ -129,6 +131,7 @@ def animate(
     forward: np.ndarray | None = None,
     settings: LocomotionSettings | None = None,
     options: AnimateOptions | None = None,
+    shot: Shot | None = None,
     source: str = "capture",
     notes: tuple[str, ...] = (),
     overwrite: bool = False,
@@ -138,12 +141,14 @@ def animate(
 
     ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.motions.script``).
     ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
-    the object to the camera. ``muscles_file``, ``solids``, ``gravity_up`` and ``settings``: see ``make_creature``;
-    ``forward`` (3,): see ``first_place``. Returns what it wrote as ``report.json`` (docs/guide/report.md). A folder
-    belongs to one run (``egs_warp.io.run_folder``): one with an earlier run is refused, or that run moved aside
-    (``overwrite``). Raises ``UserError`` for bad input, before any file of an earlier run is touched.
+    the object to the camera; ``shot``: how it is filmed. ``muscles_file``, ``solids``, ``gravity_up``, ``settings``:
+    see ``make_creature``; ``forward`` (3,): see ``first_place``. Returns what it wrote as ``report.json``
+    (docs/guide/report.md). A folder belongs to one run (``egs_warp.io.run_folder``): one with an earlier run is
+    refused, or that run moved aside (``overwrite``). Raises ``UserError`` for bad input, before any file of an earlier
+    run is touched.
     """
-    options = options or AnimateOptions()
+    options, shot = options or AnimateOptions(), shot or Shot()
+    shot.check()
     asked = script(motion, **options.targets())
     cut_off = asked.frames()
     ffmpeg_program()
@@ -184,6 +189,7 @@ def animate(
             run,
             name=asked.name,
             size=options.size,
+            shot=shot,
             background=background,
             view_from=view_from,
             shadow=options.shadow,
@@ -192,6 +198,7 @@ def animate(
         DrawnCreature.of(film.splats, film.camera, creature.muscles).save(run.file(drawn.FILE))
         asked_for = Asked(
             options,
+            shot,
             up=_numbers(up),
             plane=None if plane is None else (*_numbers(plane.normal), plane.offset),
             view_from=_numbers(view_from),

@@ -85,7 +85,7 @@ def test_command_writes_capture_report_and_sheet(tmp_path: Path, capsys: pytest.
         (["--background", "red"], "--background red: give three numbers r,g,b from 0 to 1"),
         (["--background", "0,0,2"], "--background 0,0,2: give three numbers r,g,b from 0 to 1"),
         (["--device", "tpu"], "--device tpu: this machine has cpu"),
-        (["--out", "made/x.obj"], "--out made/x.obj: give a name that ends in"),
+        (["--out", "made/x.obj"], "made/x.obj: give a name that ends in"),
         ([], "nowhere: no such file or folder"),
     ],
 )
