@@ -41,4 +41,10 @@ def _doctor(chosen: argparse.Namespace) -> int:
             compile_kernels(chosen.device, progress=told)
     found = inspect_machine()
     print("\n".join(found.lines()))
+    for device in found.devices:
+        if device.compiled < device.files:
+            print(
+                f"to do    {device.files - device.compiled} files of kernels wait to be compiled for {device.alias}, in"
+                f" the first runs or now: egs-warp doctor --warm --device {device.alias}"
+            )
     return 1 if found.problems else 0

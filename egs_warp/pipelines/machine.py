@@ -23,9 +23,9 @@ from egs_warp.launching import available_threads
 from egs_warp.pipelines.report import MECHANICS, versions
 
 OPTIONAL = {
-    "torch": ("training, --straddling finetune", "egs-warp[torch]"),
+    "torch": ("training, fine-tuning where it straddles the ground", "egs-warp[torch]"),
     "pycolmap": ("egs-warp pose", "egs-warp[pose]"),
-    "usd-core": ("egs-warp export --to usd", "egs-warp[usd]"),
+    "usd-core": ("exports to USD", "egs-warp[usd]"),
 }
 """What each package that may be missing is for, and what installs it."""
 _ENCODERS = {"libx264": "mp4", "prores_ks": "ProRes 4444", "libvpx-vp9": "WebM with alpha"}
@@ -108,13 +108,8 @@ def inspect_machine() -> Machine:
     except UserError as error:
         problems.append(error.told())
     if len(devices) == 1:
-        advice.append("everything runs on the CPU; for --device cuda:0 give this machine an NVIDIA GPU and its driver")
+        advice.append("everything runs on the CPU; for device cuda:0 give this machine an NVIDIA GPU and its driver")
     for device in devices:
-        if device.compiled < device.files:
-            advice.append(
-                f"{device.files - device.compiled} files of kernels wait to be compiled for {device.alias}, in the"
-                f" first runs or now: egs-warp doctor --warm --device {device.alias}"
-            )
         if device.free is not None and device.free < _LITTLE_MEMORY:
             advice.append(f"{device.alias} has little free memory: end other programs, or give smaller captures")
     for name, (use, extra) in OPTIONAL.items():
