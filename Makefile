@@ -19,8 +19,8 @@ examples: setup
 	done
 	$(BIN)/python examples/finetune.py --out out/finetune $(FRAMES:%=--steps %)
 
-# Two processes, each with one thread: tests that share a simulated run go to the same one.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadgroup
+# Two processes, each with one thread. The tests of a file go to the same one, so that what they share is made once.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 
 test: setup
 	$(PYTEST) -m "not (slow or data or example)"
@@ -36,7 +36,8 @@ fuzz: setup
 	-$(PIP) -e ".[fuzz]"
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz --minutes $(MINUTES)
 
-setup: $(VENV)/setup.stamp
+# The page is built anew when its sources have changed; where npm is missing, egs-warp view says what to do.
+setup: $(VENV)/setup.stamp $(if $(shell command -v npm),web)
 
 lint: setup
 	$(BIN)/ruff check .
@@ -58,6 +59,7 @@ PAGE := egs_warp/web/client
 web: egs_warp/web/page.html
 
 egs_warp/web/page.html: $(PAGE)/package-lock.json $(PAGE)/build.mjs $(PAGE)/tsconfig.json $(wildcard $(PAGE)/src/*)
+	@command -v npm > /dev/null || { echo "make web: npm is missing; install node 20 or newer"; exit 1; }
 	cd $(PAGE) && npm ci --no-audit --no-fund --loglevel=error && npm run --silent build
 
 # Wheel and sdist into out/dist, both tried in an empty environment outside of the tree.
@@ -71,7 +73,7 @@ $(VENV)/demo.stamp: pyproject.toml constraints.txt
 
 $(VENV)/setup.stamp: $(VENV)/demo.stamp
 	$(PIP) -e ".[torch,dev,docs]"
-	if command -v npm > /dev/null; then $(MAKE) web; else echo "no npm: egs-warp view waits for make web"; fi
+	@command -v npm > /dev/null || echo "no npm: egs-warp view waits for make web, which needs node 20 or newer"
 	touch $@
 
 clean:

@@ -29,7 +29,8 @@ import warp as wp
 from egs_warp.assets import figurine, pawn, stool
 from egs_warp.errors import UserError
 from egs_warp.io import read_capture
-from egs_warp.locomotion.trajectory import Trajectory, audit, measure
+from egs_warp.locomotion.audit import audit
+from egs_warp.locomotion.trajectory import Trajectory, measure
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.performance import simulate
@@ -45,7 +46,10 @@ CAPTURES = {"robot": ("robot.spz", (0.0, 1.0, 0.0)), "monkey": ("monkey.ply", (0
 BOUNDS = {
     "momentum_residual": 1e-5,
     "angular_momentum_residual": 1e-4,
+    "energy_residual": 1e-6,
     "cone_violation": 1e-4,
+    "friction_gap": 1e-5,
+    "contact_velocity": 0.1,
     "complementarity_gap": 1e-4,
     "penetration": 0.01,
     "inverted_elements": 0,

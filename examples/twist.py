@@ -30,7 +30,7 @@ def main(arguments: list[str] | None = None) -> egs.Report:
         source="pawn",
     )
     print(report.summary())
-    print(f"wrote the video, sheet.png, report.json, trajectory.npz into {chosen.out}")
+    print(f"wrote the video, sheet.png, plots.png, report.json, trajectory.npz into {chosen.out}")
     return report
 
 

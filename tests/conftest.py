@@ -38,8 +38,7 @@ def device(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture(scope="session")
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What ``egs-warp animate`` writes: twelve frames of a small pawn that crouches. Tests that ask for it carry
-    ``xdist_group("page")``, so that it is made once."""
+    """What ``egs-warp animate`` writes: twelve frames of a small pawn that crouches."""
     from egs_warp.assets.pawn import pawn
     from egs_warp.pipelines.animate import AnimateOptions, animate
 

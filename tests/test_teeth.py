@@ -50,7 +50,6 @@ def test_the_formula_stands_where_it_is_spoiled(mutation: Mutation) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xdist_group("teeth")
 @by_formula
 def test_a_wrong_formula_is_noticed(copy: Path, mutation: Mutation) -> None:
     """The test fails by an assertion of its own, not because the spoiled program cannot run."""

@@ -3,4 +3,13 @@
 In: flags. Out: files and an exit status. Nothing else in the package speaks of flags.
 """
 
-COMMANDS = ("animate", "export", "inpaint", "muscles", "plane", "pose", "segment", "train", "view")
+GROUPS = {
+    "begin": ("doctor", "samples"),
+    "captures": ("pose", "train", "convert"),
+    "scenes": ("plane", "segment", "inpaint"),
+    "motion": ("muscles", "animate"),
+    "finished runs": ("render", "view", "export"),
+}
+"""Names of the commands, as ``egs-warp --help`` lists them."""
+
+COMMANDS = tuple(name for names in GROUPS.values() for name in names)

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from egs_warp.commands.camera_flags import add_camera_flags, shot_of
+from egs_warp.commands.config import NAME, add_config_flag, changed_capture, write_config
 from egs_warp.commands.flags import (
     Commands,
     add_inpainter_flags,
@@ -26,67 +28,80 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.report import Report
 
 
+EXAMPLES = (
+    "pawn.ply --up z --out out/jump",
+    'scan.spz --motion "hop x3, twist 180" --camera follow --size 1280x720 --out out/hop',
+    "room.ply --object 0,0,0.5 --up=-y --motion walk --out out/walk",
+    "thing.ply --up z --background transparent --out out/cut_out",
+    "--config out/jump/run.yaml --friction 0.4 --out out/slippery",
+)
+
+
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     animate = commands.add_parser("animate", help="bring a capture to life")
-    animate.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog or an unbundled SOG folder")
+    animate.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
+    animate.add_argument("--out", required=True, type=named_path, help="folder for video, sheet, report and trajectory")
     animate.add_argument(
+        "--overwrite", action="store_true", help="move an earlier run in --out aside, into earlier-1, earlier-2, ..."
+    )
+    add_config_flag(animate)
+    animate.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
+    animate.add_argument("--seed", type=int, help="recorded in the report; a jump has nothing random (0)")
+    motion = animate.add_argument_group("motion")
+    motion.add_argument(
         "--motion",
         default="jump",
         help='jump (default), hop, twist, walk, several as "hop x3, twist 180", or a script.json',
     )
-    animate.add_argument("--out", required=True, type=named_path, help="folder for video, sheet, report and trajectory")
-    animate.add_argument("--up", help="axis that points up: x, y, z or with a minus, as --up=-y; else it is guessed")
-    animate.add_argument(
-        "--plane", help="nx,ny,nz,d of the ground n.x + d = 0 in the capture's units, or a plane.json; else it is found"
-    )
-    add_object_flags(animate)
-    animate.add_argument(
-        "--view-from", help="x,y,z or an axis: from the object to the camera of the video, capture's frame"
-    )
-    add_straddling_flag(animate)
-    add_inpainter_flags(animate, default=None)
-    animate.add_argument(
-        "--background", help="capture to draw behind the object of earlier steps, as inpaint writes it"
-    )
-    animate.add_argument("--no-inpaint", action="store_true", help="leave the floor under the object as captured")
-    animate.add_argument("--no-shadow", action="store_true", help="no shadow on the ground under the object")
-    animate.add_argument("--forward", help="x,y,z or an axis: the way of motions; else along the feet")
-    animate.add_argument("--gravity-up", help="x,y,z or an axis: against gravity, if the ground is a slope")
-    animate.add_argument(
-        "--terrain", type=named_path, help="JSON with steps and walls: solids as lists of faces [nx,ny,nz,d]"
-    )
-    animate.add_argument(
-        "--muscles",
-        type=named_path,
-        help="JSON with fibres (docs/motions/muscles.md); else they are made automatically",
-    )
-    animate.add_argument("--distance", type=float, help="body heights: of a jump (0.5), hop (0.7) or twist (0)")
-    animate.add_argument(
+    motion.add_argument("--distance", type=float, help="body heights: of a jump (0.5), hop (0.7) or twist (0)")
+    motion.add_argument(
         "--height",
         type=float,
         help="rise of the centre of mass, body heights: of a jump (0.2), hop (0.3) or twist (0.3)",
     )
-    animate.add_argument("--heading-degrees", type=float, help="of a twist, counter-clockwise from above (180)")
-    animate.add_argument("--frames", type=int, help="length of the video at 60 Hz (until the body rests)")
-    animate.add_argument("--size", type=int, help="pixels, both sides (512)")
-    animate.add_argument("--seed", type=int, help="recorded in the report; a jump has nothing random (0)")
-    animate.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
-    animate.add_argument("--metres-per-unit", type=float, help="true scale; else the body is 1 m tall")
-    animate.add_argument("--friction", type=float, help="Coulomb coefficient (0.8)")
-    animate.add_argument(
-        "--overwrite", action="store_true", help="move an earlier run in --out aside, into earlier-1, earlier-2, ..."
+    motion.add_argument("--heading-degrees", type=float, help="of a twist, counter-clockwise from above (180)")
+    motion.add_argument("--forward", help="x,y,z or an axis: the way of motions; else along the feet")
+    motion.add_argument("--frames", type=int, help="length of the video at 60 Hz (until the body rests)")
+    body = animate.add_argument_group("body and ground")
+    body.add_argument("--up", help="axis that points up: x, y, z or with a minus, as --up=-y; else it is guessed")
+    body.add_argument(
+        "--plane", help="nx,ny,nz,d of the ground n.x + d = 0 in the capture's units, or a plane.json; else it is found"
     )
-    animate.set_defaults(run=_animate)
+    body.add_argument("--gravity-up", help="x,y,z or an axis: against gravity, if the ground is a slope")
+    body.add_argument(
+        "--terrain", type=named_path, help="JSON with steps and walls: solids as lists of faces [nx,ny,nz,d]"
+    )
+    body.add_argument("--friction", type=float, help="Coulomb coefficient (0.8)")
+    body.add_argument("--metres-per-unit", type=float, help="true scale; else the body is 1 m tall")
+    body.add_argument(
+        "--muscles",
+        type=named_path,
+        help="JSON with fibres (docs/motions/muscles.md); else they are made automatically",
+    )
+    scene = animate.add_argument_group("an object in a scene")
+    add_object_flags(scene)
+    add_straddling_flag(scene)
+    add_inpainter_flags(scene, default=None)
+    scene.add_argument("--no-inpaint", action="store_true", help="leave the floor under the object as captured")
+    camera = animate.add_argument_group("camera")
+    add_camera_flags(camera, size="512")
+    camera.add_argument(
+        "--view-from", help="x,y,z or an axis: from the object to the camera of the video, capture's frame"
+    )
+    camera.add_argument("--no-shadow", action="store_true", help="no shadow on the ground under the object")
+    animate.set_defaults(run=_animate, parser=animate)
 
 
 def _animate(chosen: argparse.Namespace) -> int:
     from egs_warp.io.run_folder import check_run_folder
 
     check_run_folder(chosen.out, overwrite=chosen.overwrite)
+    if chosen.config is not None and changed_capture(chosen.config, chosen.capture):
+        say(f"{chosen.capture} is not the file that the run of {chosen.config} had; the result will be another")
     report, more = _animate_scene(chosen) if chosen.object is not None else _animate_capture(chosen)
     print(report.summary())
-    print(f"wrote the video, sheet.png, report.json, trajectory.npz{more} into {chosen.out}")
+    print(f"wrote the video, sheet.png, plots.png, report.json, trajectory.npz{more} into {chosen.out}")
     return 0
 
 
@@ -94,6 +109,7 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
     """A capture that is the object alone; returns the report, and what was written besides."""
     from egs_warp.commands.scene_input import plane_of
     from egs_warp.io import read_capture
+    from egs_warp.io.run_folder import run_folder
     from egs_warp.io.video import ffmpeg_program
     from egs_warp.pipelines.animate import animate
 
@@ -101,13 +117,14 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
         if getattr(chosen, name) not in (None, False):
             raise UserError(f"--{name.replace('_', '-')}: needs --object, which says what to take out of a scene")
     asked = _asked(chosen)
+    asked["shot"], behind = shot_of(chosen)
     ffmpeg_program()
     start(chosen.device)
     up = parse_up(chosen.up) if chosen.up is not None else None
     plane = plane_of(chosen.plane) if chosen.plane is not None else None
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
     capture = read_capture(chosen.capture, device=chosen.device)
-    background = read_capture(chosen.background, device=chosen.device).cloud if chosen.background is not None else None
+    background = read_capture(behind, device=chosen.device).cloud if behind is not None else None
     notes = list(capture.notes)
     if capture.infinite_opacities:
         notes.append(f"{capture.infinite_opacities} infinite opacities were read as 0 or 1")
@@ -115,18 +132,20 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
         up, note = guessed_up(capture)
         notes.append(note)
         say(note)
-    report = animate(
-        capture.cloud,
-        chosen.out,
-        up=up,
-        plane=plane,
-        background=background,
-        view_from=view_from,
-        notes=tuple(notes),
-        overwrite=chosen.overwrite,
-        **asked,
-    )
-    return report, ""
+    with run_folder(chosen.out, overwrite=chosen.overwrite) as run:
+        report = animate(
+            capture.cloud,
+            run,
+            up=up,
+            plane=plane,
+            background=background,
+            view_from=view_from,
+            notes=tuple(notes),
+            **asked,
+        )
+        write_config(run.file(NAME), chosen, chosen.parser)
+        run.finish()
+    return report, f", {NAME}"
 
 
 def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
@@ -138,11 +157,13 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
     from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene, viewing_direction
     from egs_warp.training.photo_colours import photographs_in_colours_of
 
-    if chosen.background is not None:
+    shot, behind = shot_of(chosen)
+    if behind is not None:
         raise UserError("--background: with --object the rest of the scene is behind the object; leave one of them out")
     if chosen.inpainter is not None and chosen.no_inpaint:
         raise UserError("--inpainter: --no-inpaint leaves the floor as captured; leave one of them out")
     asked = _asked(chosen)
+    asked["shot"] = shot
     ffmpeg_program()
     start(chosen.device)
     inpainter = chosen_inpainter(chosen)
@@ -175,8 +196,9 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
             notes=(*given.notes, *scene.notes),
             **asked,
         )
+        write_config(run.file(NAME), chosen, chosen.parser)
         run.finish()
-    return report, ", ".join(["", "object.ply", "background.ply", "plane.json", *pictures])
+    return report, ", ".join(["", NAME, "object.ply", "background.ply", "plane.json", *pictures])
 
 
 def _write_pictures(run: RunFolder, given: SceneInput, scene: PreparedScene) -> list[str]:
@@ -207,7 +229,7 @@ def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
     from egs_warp.motions.script import motion
     from egs_warp.pipelines.animate import AnimateOptions
 
-    numbers = ("distance", "height", "heading_degrees", "frames", "size", "seed", "metres_per_unit", "friction")
+    numbers = ("distance", "height", "heading_degrees", "frames", "seed", "metres_per_unit", "friction")
     given = {name: getattr(chosen, name) for name in numbers if getattr(chosen, name) is not None}
     options = AnimateOptions(**given, shadow=not chosen.no_shadow)
     # The files of key frames are read, too.

@@ -36,7 +36,7 @@ def named_path(text: str) -> Path:
     return Path(text)
 
 
-def add_inpainter_flags(parser: argparse.ArgumentParser, *, default: str | None) -> None:
+def add_inpainter_flags(parser: argparse._ActionsContainer, *, default: str | None) -> None:
     """Add the flags that ``chosen_inpainter`` reads."""
     parser.add_argument("--inpainter", default=default, help="patch (default), telea, ns, or LaMa's ONNX file")
     parser.add_argument(

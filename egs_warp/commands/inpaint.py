@@ -10,6 +10,11 @@ from egs_warp.commands.flags import Commands, add_inpainter_flags, chosen_inpain
 from egs_warp.commands.scene_flags import start
 from egs_warp.errors import UserError
 
+EXAMPLES = (
+    "background.ply --plane plane.json --out filled.ply",
+    "background.ply --plane plane.json --hole 0,0,0,0.4 --out filled.ply",
+)
+
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""

@@ -7,11 +7,13 @@ import argparse
 from egs_warp.commands.flags import Commands, guessed_up, named_path, parse_up
 from egs_warp.commands.scene_flags import say, start
 
+EXAMPLES = ("pawn.ply --plot muscles.png",)
+
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     muscles = commands.add_parser("muscles", help="draw the muscles of a capture's body, automatic ones or your own")
-    muscles.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog or an unbundled SOG folder")
+    muscles.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
     muscles.add_argument(
         "--plot", required=True, type=named_path, help="picture (.png, .jpg, ...) with the body from three sides"
     )

@@ -7,6 +7,8 @@ import argparse
 from egs_warp.commands.flags import Commands
 from egs_warp.commands.scene_flags import add_scene_flags, say
 
+EXAMPLES = ("room.ply --out out/plane",)
+
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""

@@ -13,6 +13,12 @@ _NAMED = 5
 """Photos without a pose that are named; the rest is counted."""
 
 
+EXAMPLES = (
+    "photos --out posed",
+    "walkaround.mp4 --frames 200 --out posed",
+)
+
+
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     pose = commands.add_parser("pose", help="find where photos were taken from")

@@ -8,7 +8,7 @@ import sys
 from egs_warp.commands.flags import named_path
 
 
-def add_object_flags(parser: argparse.ArgumentParser) -> None:
+def add_object_flags(parser: argparse._ActionsContainer) -> None:
     """Add the flags that say where the object is."""
     parser.add_argument(
         "--object",
@@ -22,7 +22,7 @@ def add_object_flags(parser: argparse.ArgumentParser) -> None:
 
 def add_scene_flags(parser: argparse.ArgumentParser) -> None:
     """Add everything that the commands before the animation share."""
-    parser.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog or an unbundled SOG folder")
+    parser.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
     add_object_flags(parser)
     parser.add_argument("--out", required=True, type=named_path, help="folder for the result and its picture")
     parser.add_argument(

@@ -15,6 +15,12 @@ if TYPE_CHECKING:
 METHODS = {"finetune": "FINETUNE", "split": "SPLIT", "remove": "REMOVE", "none": "NONE"}
 
 
+EXAMPLES = (
+    "room.ply --object 0,0,0.5 --out out/segment",
+    "room.ply --object masks --cameras cameras.json --out out/segment",
+)
+
+
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     segment = commands.add_parser("segment", help="take an object out of a scene")
@@ -23,7 +29,7 @@ def add_parser(commands: Commands) -> None:
     segment.set_defaults(run=_segment)
 
 
-def add_straddling_flag(parser: argparse.ArgumentParser) -> None:
+def add_straddling_flag(parser: argparse._ActionsContainer) -> None:
     """Add the flag that ``clearing_of`` reads."""
     parser.add_argument(
         "--straddling",

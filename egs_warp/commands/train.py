@@ -5,8 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +12,6 @@ from egs_warp.commands.flags import Commands, named_path
 from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
-    from egs_warp.geometry.gaussians import GaussianCloud
     from egs_warp.pipelines.train_capture import TrainResult
 
 _SHEET_PHOTOS = 6
@@ -22,12 +19,21 @@ _DEFAULTS = {"cpu": (2000, 20_000, 360), "cuda": (7000, None, 1600)}
 """Iterations, Gaussians, longer side in pixels: a preview on two cores, a capture on a GPU."""
 
 
+EXAMPLES = (
+    "posed --out capture.ply",
+    "posed --out capture.spz --device cuda:0 --iterations 7000",
+)
+
+
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     train = commands.add_parser("train", help="make a capture from posed photos")
     train.add_argument("posed", help="COLMAP model, transforms.json or cameras.json, or a folder that holds one")
     train.add_argument(
-        "--out", required=True, type=named_path, help="capture to write: .ply, .compressed.ply, .spz or .sog"
+        "--out",
+        required=True,
+        type=named_path,
+        help="capture to write: .ply, .compressed.ply, .spz, .sog, .splat or .glb",
     )
     train.add_argument("--iterations", type=int, help="optimiser steps, one photo each (cpu 2000, cuda 7000)")
     train.add_argument(
@@ -54,9 +60,10 @@ def _train(chosen: argparse.Namespace) -> int:
             raise UserError(f"{flag} {value}: give a whole number of at least {least}")
     if not 0 <= chosen.sh_degree <= 3:
         raise UserError(f"--sh-degree {chosen.sh_degree}: give 0, 1, 2 or 3")
-    write = _writer(chosen.out)
     from egs_warp.io.run_folder import check_out
+    from egs_warp.io.writing import writer_of
 
+    write = writer_of(chosen.out)
     check_out(chosen.out.parent if chosen.out.parent != Path(".") else Path.cwd())
     import warp as wp
 
@@ -69,7 +76,7 @@ def _train(chosen: argparse.Namespace) -> int:
     except ImportError as error:
         raise UserError("train: PyTorch is not installed; pip install 'egs-warp[torch]'") from error
     from egs_warp.io import read_cameras, writable_folder
-    from egs_warp.pipelines.report import write_report
+    from egs_warp.pipelines.train_report import TrainReport
 
     # Poses that cannot be read must not leave a new folder behind.
     read_cameras(chosen.posed)
@@ -93,14 +100,18 @@ def _train(chosen: argparse.Namespace) -> int:
     progress.say(f"writing {chosen.out}")
     stem = chosen.out.name.split(".")[0]
     write(chosen.out, result.cloud)
-    report = _report(chosen, result, progress, time.perf_counter() - began)
-    write_report(folder / f"{stem}.report.json", report)
+    report = TrainReport.of(
+        result,
+        seconds=time.perf_counter() - began,
+        frames_per_second=progress.frames_per_second,
+        device=chosen.device,
+        seed=chosen.seed,
+        sh_degree=chosen.sh_degree,
+    )
+    report.write(folder / f"{stem}.report.json")
     _write_sheet(folder / f"{stem}.sheet.png", result)
-    for which, scores in report["mean"].items():
-        if scores:
-            values = f"{scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f}"
-            print(f"{which.replace('_', ' ')}: {values} in each photo's exposure")
-    print(f"wrote {chosen.out} ({result.cloud.count} Gaussians), {stem}.sheet.png, {stem}.report.json")
+    wrote = f"wrote {chosen.out} ({result.cloud.count} Gaussians), {stem}.sheet.png, {stem}.report.json"
+    print(*report.summary(), wrote, sep="\n")
     return 0
 
 
@@ -148,52 +159,6 @@ def _colour(text: str) -> tuple[float, float, float]:
     if not all(0.0 <= value <= 1.0 for value in (red, green, blue)):
         raise UserError(f"--background {text}: give three numbers r,g,b from 0 to 1")
     return red, green, blue
-
-
-def _writer(out: Path) -> Callable[[Path, GaussianCloud], None]:
-    """The function that writes a capture to ``out``; refused now rather than after training."""
-    from egs_warp import io
-
-    writers = {".compressed.ply": io.write_compressed_ply, ".ply": io.write_ply, ".spz": io.write_spz}
-    writers |= {".sog": io.write_sog, ".splat": io.write_splat}
-    for suffix, write in writers.items():
-        if out.name.lower().endswith(suffix) and out.name.lower() != suffix:
-            if out.is_dir():
-                raise UserError(f"--out {out}: is a folder; give the name of a file")
-            return write
-    raise UserError(f"--out {out}: give a name that ends in {', '.join(writers)}")
-
-
-def _report(chosen: argparse.Namespace, result: TrainResult, progress: _Progress, seconds: float) -> dict:
-    import numpy as np
-
-    from egs_warp.pipelines.report import versions
-
-    photo = result.views[0].camera
-    means = {
-        name: dict(zip(("psnr", "ssim"), score, strict=True)) if score else None
-        for name, score in (
-            ("held_out", result.mean_score(held_out=True)),
-            ("trained_on", result.mean_score(held_out=False)),
-        )
-    }
-    return {
-        "photos": len(result.views),
-        "left_out": [asdict(one) for one in result.left_out],
-        "photo_size": [photo.width, photo.height],
-        "gaussians": result.cloud.count,
-        "iterations": len(result.losses),
-        "final_loss": float(np.mean(result.losses[-100:])),
-        "background": list(result.background),
-        "mean": means,
-        "scores": [asdict(score) for score in result.scores],
-        "seconds": seconds,
-        "frames_per_second": progress.frames_per_second,
-        "device": chosen.device,
-        "seed": chosen.seed,
-        "sh_degree": chosen.sh_degree,
-        "versions": versions(("warp-lang", "numpy", "torch")),
-    }
 
 
 def _write_sheet(path: Path, result: TrainResult) -> None:

@@ -8,6 +8,12 @@ from pathlib import Path
 from egs_warp.commands.flags import Commands
 from egs_warp.errors import UserError
 
+EXAMPLES = (
+    "out/jump",
+    "out/jump out/hop",
+    "out/jump --export page.html",
+)
+
 
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
@@ -23,12 +29,14 @@ def add_parser(commands: Commands) -> None:
 
 
 def _view(chosen: argparse.Namespace) -> int:
+    from egs_warp.launching import use_device
     from egs_warp.web.page import export_page
     from egs_warp.web.recording import Recording
 
     folders: list[Path] = chosen.runs
     if len(folders) > 2:
         raise UserError(f"{folders[2]}: at most two runs are shown side by side; leave this one out")
+    use_device("cpu")
     recordings = [Recording.read(folder, background=chosen.background) for folder in folders]
     if chosen.export is not None:
         size = export_page(chosen.export, recordings)

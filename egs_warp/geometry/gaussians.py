@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -146,3 +146,10 @@ def joined(*clouds: GaussianCloud) -> GaussianCloud:
         stack("sh"),
         device=str(clouds[0].device),
     )
+
+
+def with_degree(cloud: GaussianCloud, degree: int | None) -> GaussianCloud:
+    """``cloud`` with colour bands up to ``degree``, all of them where that is None."""
+    if degree is None or degree >= cloud.sh_degree:
+        return cloud
+    return replace(cloud, sh=cloud.sh[:, : (degree + 1) ** 2].contiguous())

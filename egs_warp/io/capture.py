@@ -12,6 +12,7 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.compressed_ply import decode_compressed_ply, is_compressed
+from egs_warp.io.gltf import decode_glb, decode_gltf, is_glb
 from egs_warp.io.limits import FREE_BYTES, INFLATION, LARGEST_TEXT, read_bytes
 from egs_warp.io.outliers import without_outliers
 from egs_warp.io.ply import decode_ply, read_header
@@ -44,10 +45,11 @@ class Capture:
 
 
 def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
-    """Read an INRIA or PlayCanvas compressed .ply, .spz, .splat, .sog, or an unbundled SOG (its folder or meta.json).
+    """Read an INRIA or PlayCanvas compressed .ply, .spz, .splat, .sog, an unbundled SOG (its folder or meta.json), or
+    glTF with splats (.glb, .gltf).
 
-    The format is told by content; only .splat, which has no mark, by its name. Raises ``UserError`` with one line for
-    anything that cannot be read.
+    The format is told by content; only .splat, which has no mark, and .gltf by their names. Raises ``UserError``
+    with one line for anything that cannot be read.
     """
     source = Path(path)
     # Values too large for float32 and broken floats need no warning: check_finite names them.
@@ -79,6 +81,10 @@ def _decode(source: Path) -> RawCapture:
     if data[:2] == b"PK":
         del data
         return _decode_zip(source)
+    if is_glb(data):
+        return decode_glb(data, source)
+    if data[:1] == b"{" and source.suffix.lower() == ".gltf":
+        return decode_gltf(read_bytes(source, at_most=LARGEST_TEXT), source)
     if data[:1] == b"{":
         return _decode_meta(source)
     if not data:
@@ -86,7 +92,7 @@ def _decode(source: Path) -> RawCapture:
     if source.suffix.lower() == ".splat":
         return decode_splat(data, source)
     raise UserError(
-        f"{source}: unknown format (starts with {data[:8]!r}); give a .ply, .spz, .splat, .sog or a SOG folder"
+        f"{source}: unknown format (starts with {data[:8]!r}); give a .ply, .spz, .splat, .sog, .glb or a SOG folder"
     )
 
 

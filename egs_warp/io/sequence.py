@@ -1,10 +1,12 @@
-"""Numbered .ply files, which SuperSplat and the PlayCanvas player show as an animation."""
+"""Numbered captures, which SuperSplat and the PlayCanvas player show as an animation: written, and found again."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
+from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.atomic import writable_folder
 from egs_warp.io.compressed_ply import write_compressed_ply
@@ -29,3 +31,30 @@ def write_ply_sequence(
             write_ply(path, cloud)
         paths.append(path)
     return paths
+
+
+_NUMBERED = re.compile(
+    r"(?P<prefix>.*?)(?P<number>\d{1,12})(?P<ending>(\.compressed)?\.(ply|spz|splat|sog|glb))", re.IGNORECASE
+)
+
+
+def numbered_captures(folder: Path | str) -> list[Path]:
+    """The files of a sequence in ``folder``, in the order of their numbers: ``frame0001.ply``, ``frame0002.ply``, ...
+
+    Gaps are allowed; files of other names are left alone. ``read_capture`` reads each. Raises ``UserError`` where there
+    are none, or those of two sequences.
+    """
+    place = Path(folder)
+    if not place.is_dir():
+        raise UserError(f"{folder}: is no folder; give one of numbered captures")
+    found = [(match, path) for path in place.iterdir() if (match := _NUMBERED.fullmatch(path.name)) and path.is_file()]
+    kinds = sorted({(match["prefix"], match["ending"].lower()) for match, _ in found})
+    if not kinds:
+        raise UserError(f"{folder}: it has no numbered captures such as frame0001.ply; give a folder of some")
+    if len(kinds) > 1:
+        names = " and ".join(f"{prefix}0001{ending}" for prefix, ending in kinds[:2])
+        raise UserError(f"{folder}: it has two sequences ({names}); put each into a folder of its own")
+    numbers = [int(match["number"]) for match, _ in found]
+    if len(set(numbers)) != len(numbers):
+        raise UserError(f"{folder}: two of its captures have one number; remove one of them")
+    return [path for _, (_, path) in sorted(zip(numbers, found, strict=True), key=lambda pair: pair[0])]

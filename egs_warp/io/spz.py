@@ -1,8 +1,9 @@
 """Niantic's .spz: gzip around a 16-byte header and one block of bytes for each quantity.
 
 Public description: README of https://github.com/nianticlabs/spz. Versions 1 (half-float positions), 2 (24-bit
-fixed-point positions) and 3 (smallest-three rotations) are read; 2 and 3 are written. The format defines its axes as
-right, up, back: +y is up. The axes are kept as they are in the file.
+fixed-point positions), 3 (smallest-three rotations) and 4 (the blocks of 3, each a Zstandard stream: ``spz_streams``)
+are read; 2 and 3 are written. The format defines its axes as right, up, back: +y is up; version 4 may say otherwise.
+The axes are kept as they are in the file.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from egs_warp.io.raw import (
     largest_restored,
     logits_from_bytes,
 )
+from egs_warp.io.spz_streams import declared_up, inflate_streams
 
 _MAGIC = 0x5053474E
 _HEADER = struct.Struct("<IIIBBBB")
@@ -51,7 +53,7 @@ class _Layout:
     @property
     def widths(self) -> tuple[int, ...]:
         """Bytes a Gaussian takes in each block: positions, alphas, colours, scales, rotations, SH."""
-        return 6 if self.version == 1 else 9, 1, 3, 3, 4 if self.version == 3 else 3, 3 * self.sh_count
+        return 6 if self.version == 1 else 9, 1, 3, 3, 4 if self.version >= 3 else 3, 3 * self.sh_count
 
     @property
     def size(self) -> int:
@@ -65,7 +67,14 @@ def decode_spz(data: bytes, source: Path) -> RawCapture:
     gzipped = data[:2] == b"\x1f\x8b"
     header = _inflated(inflate, data, _HEADER.size, source) if gzipped else data[: _HEADER.size]
     layout = _layout(header, gzipped, source)
-    if gzipped:
+    up = None
+    if layout.version == 4:
+        if gzipped:
+            raise UserError(f"{source}: .spz version 4 inside gzip; unpack it first")
+        check_count(layout.count, len(data), source)
+        body = header + inflate_streams(data, [layout.count * width for width in layout.widths], source)
+        up = declared_up(data, source) if layout.flags & _HAS_EXTENSIONS else None
+    elif gzipped:
         check_count(layout.count, len(data), source)
         body = header + _inflated(inflate, inflate.unconsumed_tail, layout.size - len(header), source)
         # zlib compares the checksum only where it comes to the end of the stream.
@@ -74,7 +83,7 @@ def decode_spz(data: bytes, source: Path) -> RawCapture:
         body = data
     if len(body) < layout.size:
         raise _truncated(source, layout, str(len(body)))
-    return _decode(body, layout)
+    return _decode(body, layout, np.array([0.0, 1.0, 0.0]) if up is None else up)
 
 
 def _inflated(inflate: zlib._Decompress, data: bytes, size: int, source: Path) -> bytes:
@@ -105,8 +114,8 @@ def _layout(header: bytes, gzipped: bool, source: Path) -> _Layout:
     magic, version, count, degree, fractional_bits, flags, _ = _HEADER.unpack(header)
     if magic != _MAGIC:
         raise UserError(f"{source}: gzip data, but no .spz inside; unpack it first if it holds another format")
-    if version not in (1, 2, 3):
-        raise UserError(f"{source}: .spz version {version}, expected 1, 2 or 3; export it as version 3 or as .ply")
+    if version not in (1, 2, 3, 4):
+        raise UserError(f"{source}: .spz version {version}, expected 1 to 4; export it as version 4 or as .ply")
     if degree >= len(_SH_COUNTS):
         raise UserError(f"{source}: .spz with SH degree {degree}, expected 0 to 4; export it again")
     if version > 1 and fractional_bits > _MOST_FRACTIONAL_BITS:
@@ -116,7 +125,7 @@ def _layout(header: bytes, gzipped: bool, source: Path) -> _Layout:
     return _Layout(version, count, _SH_COUNTS[degree], fractional_bits, flags)
 
 
-def _decode(body: bytes, layout: _Layout) -> RawCapture:
+def _decode(body: bytes, layout: _Layout, up: np.ndarray) -> RawCapture:
     ends = _HEADER.size + layout.count * np.cumsum((0, *layout.widths))
     raw = np.frombuffer(body, np.uint8)
     positions, alphas, colours, scales, rotations, sh = (
@@ -144,7 +153,7 @@ def _decode(body: bytes, layout: _Layout) -> RawCapture:
         log_scales=scales.astype(np.float32) / np.float32(16.0) - np.float32(10.0),
         opacity_logits=logits_from_bytes(alphas[:, 0]),
         sh=np.concatenate([f_dc[:, None], rest], axis=1),
-        up=np.array([0.0, 1.0, 0.0]),
+        up=up,
         antialiased=bool(layout.flags & _ANTIALIASED),
         notes=tuple(notes),
     )

@@ -88,19 +88,46 @@ class _AbandonedError(Exception):
     """Ends the writing of a video that failed."""
 
 
+_BT709 = ("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709")
+_CODECS = {
+    ".mp4": ("mp4", "libx264", "yuv420p", ("-preset", "medium", "-movflags", "+faststart")),
+    ".mov": ("mov", "prores_ks", "yuva444p10le", ("-profile:v", "4444", "-alpha_bits", "16", "-vendor", "apl0")),
+    ".webm": ("webm", "libvpx-vp9", "yuva420p", ("-b:v", "0", "-auto-alt-ref", "0", "-cpu-used", "4", "-row-mt", "1")),
+}
+"""By the ending of a video: format, codec, pixels, and what else it is told."""
+
+
 class VideoWriter:
-    """H.264 (yuv420p) mp4 through the ffmpeg program that imageio-ffmpeg brings.
+    """Video through the ffmpeg program that imageio-ffmpeg brings: H.264 (.mp4), or with straight alpha ProRes 4444
+    (.mov) or VP9 (.webm).
 
     Use as a context manager; leaving it without an exception puts the video at ``path``, otherwise nothing is left
     behind.
     """
 
     def __init__(
-        self, path: Path | str, width: int, height: int, *, frames_per_second: float = 60.0, quality: int = 16
+        self,
+        path: Path | str,
+        width: int,
+        height: int,
+        *,
+        frames_per_second: float = 60.0,
+        quality: int = 16,
+        alpha: bool = False,
     ) -> None:
-        """``quality`` is x264's constant rate factor: 0 lossless, 16 hardly visible loss, 51 worst."""
+        """``quality`` is the constant rate factor of H.264 and VP9: 0 lossless, 16 hardly visible loss, 51 worst.
+
+        Raises ``UserError`` for another ending, and for ``alpha`` in an mp4.
+        """
         self._path = Path(path)
-        self._size = (height, width)
+        self._shape = (height, width, 4 if alpha else 3)
+        ending = self._path.suffix.lower()
+        if ending not in _CODECS:
+            raise UserError(f"{path}: give a name that ends in {', '.join(_CODECS)}")
+        if alpha and ending == ".mp4":
+            raise UserError(f"{path}: H.264 has no alpha; give a name that ends in .mov or .webm")
+        self._format, codec, pixels, more = _CODECS[ending]
+        rate = () if codec == "prores_ks" else ("-crf", str(quality))
         self._command_tail = [
             # Nothing but a pipe and a file: names may look like addresses or playlists.
             *(
@@ -109,14 +136,13 @@ class VideoWriter:
                 "-f",
                 "rawvideo",
                 "-pix_fmt",
-                "rgb24",
+                "rgba" if alpha else "rgb24",
                 "-s",
                 f"{width + width % 2}x{height + height % 2}",
             ),
             *("-r", f"{frames_per_second:g}", "-i", "pipe:0", "-an"),
-            *("-vf", "scale=out_color_matrix=bt709:out_range=tv", "-c:v", "libx264", "-pix_fmt", "yuv420p"),
-            *("-crf", str(quality), "-preset", "medium", "-movflags", "+faststart"),
-            *("-color_range", "tv", "-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709"),
+            *("-vf", "scale=out_color_matrix=bt709:out_range=tv", "-c:v", codec, "-pix_fmt", pixels),
+            *(*rate, *more, "-color_range", "tv", *_BT709),
         ]
 
     def __enter__(self) -> VideoWriter:
@@ -129,7 +155,7 @@ class VideoWriter:
             [
                 *(program, "-y", "-loglevel", "error"),
                 *self._command_tail,
-                *("-f", "mp4", str(temporary)),
+                *("-f", self._format, str(temporary)),
             ],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
@@ -140,15 +166,15 @@ class VideoWriter:
         return self
 
     def write(self, frame: np.ndarray) -> None:
-        """Append one (H, W, 3) uint8 RGB frame. An odd side is padded by repeating its last line: yuv420p needs even
-        ones.
+        """Append one (H, W, 3) uint8 RGB frame, with alpha (H, W, 4). An odd side is padded by repeating its last line:
+        yuv420p needs even ones.
         """
-        if frame.shape != (*self._size, 3) or frame.dtype != np.uint8:
+        if frame.shape != self._shape or frame.dtype != np.uint8:
             raise UserError(
                 f"{self._path}: a frame has shape {frame.shape} and type {frame.dtype},"
-                f" expected {(*self._size, 3)} and uint8"
+                f" expected {self._shape} and uint8"
             )
-        height, width = self._size
+        height, width, _ = self._shape
         if height % 2 or width % 2:
             frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         assert self._process.stdin is not None

@@ -97,7 +97,8 @@ class PieceSolution:
     modes: ContactModes
     onward: ContactModes | None
     """Those of the piece that lies beyond the bounds that hold the optimum back; None if none does."""
-    iterations: int
+    nearest: ContactModes | None
+    """Of these bounds only the one that holds it back most is left behind."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,11 @@ def search_pieces(
             modes = ContactModes(np.where(modes.kind == SLIDE, STICK, modes.kind), modes.slip)
             continue
         if best is not None and solution.objective >= best.objective:
-            break
+            # Together the contacts went too far; the one that is pushed most may still gain.
+            if best.nearest is None or modes is best.nearest:
+                break
+            modes = best.nearest
+            continue
         enough = best is not None and best.objective - solution.objective < _GAIN * abs(best.objective)
         best, start = solution, solution.x
         if solution.onward is None or enough:
@@ -165,10 +170,13 @@ def solve_piece(
     objective = program.objective(x)
     pushes = -found.multipliers[m:]
     active = np.flatnonzero(pushes > _ACTIVE * max(abs(objective), 1e-9))
-    further = None
+    further = nearest = None
     if len(active):
         further = _beyond(program, modes, x, contact[active], onward[active], pushes[active])
-    return PieceSolution(x, objective, modes, further, 0)
+    if len(active) > 1:
+        most = active[[int(np.argmax(pushes[active]))]]
+        nearest = _beyond(program, modes, x, contact[most], onward[most], pushes[most])
+    return PieceSolution(x, objective, modes, further, nearest)
 
 
 def _forces_of(program: ContactPieces, modes: ContactModes) -> tuple[np.ndarray, np.ndarray]:

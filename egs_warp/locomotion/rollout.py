@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.locomotion.coupled_stepper import CoupledStepper
 from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.locomotion.trajectory import Trajectory, record
+from egs_warp.locomotion.trajectory import Trajectory
 
 FRAME_RATE = 60
 """Frames of a video, 1/s."""
@@ -67,7 +70,7 @@ def settle(stepper: CoupledStepper) -> BodyState:
     return state
 
 
-def simulate(
+def roll_out(
     stepper: CoupledStepper,
     geometry: ContactGeometry,
     start: BodyState,
@@ -75,13 +78,16 @@ def simulate(
     *,
     frames: int,
     step: float | None = None,
+    place: BodyFrame | None = None,
+    parts: Callable[[], Path] | None = None,
     finished: Callable[[], bool] = lambda: False,
     progress: Callable[[int], object] = lambda frame: None,
 ) -> Simulation:
     """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``.
 
     ``step``: seconds of a solver step, if not the usual (docs/concepts/conventions.md); one longer than a
-    frame makes the frame as long. ``progress`` is told each frame done.
+    frame makes the frame as long. ``place`` is where the body lies in its capture; steps are written into the folder
+    that ``parts`` tells as they are done (``Recorder``). ``progress`` is told each frame done.
     """
     per_frame = steps_per_frame(stepper.body) if step is None else max(round(1.0 / (FRAME_RATE * step)), 1)
     dt = step or 1.0 / (FRAME_RATE * per_frame)
@@ -89,24 +95,26 @@ def simulate(
     reports: list[StepReport] = []
     shown = [0]
     resting = 0
+    gaps, _ = stepper.detector.gaps(start.positions)
+    recorder = Recorder(
+        stepper.body,
+        stepper.muscles,
+        geometry,
+        start,
+        float(gaps.min()),
+        drag=stepper.settings.drag,
+        frame=place,
+        folder=parts,
+    )
     for frame in range(frames):
         for _ in range(per_frame):
             objectives = motion.objectives(state, reports[-1] if reports else None, dt)
             state, memory, done = stepper.advance(state, memory, objectives, dt)
             reports.extend(done)
+            recorder.add(done)
         shown.append(len(reports))
         progress(frame)
         resting = resting + 1 if finished() else 0
         if resting == REST_FRAMES:
             break
-    gaps, _ = stepper.detector.gaps(start.positions)
-    trajectory = record(
-        stepper.body,
-        geometry,
-        start,
-        float(gaps.min()),
-        reports,
-        drag=stepper.settings.drag,
-        segments=stepper.muscles.segment_count,
-    )
-    return Simulation(trajectory, tuple(reports), np.array(shown))
+    return Simulation(recorder.trajectory(), tuple(reports), np.array(shown))

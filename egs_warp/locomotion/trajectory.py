@@ -1,6 +1,4 @@
-"""What a simulation leaves behind: every solver step, its contacts,
-and the measures and audit computed from them alone.
-"""
+"""What a simulation leaves behind: every solver step, its contacts, all that acted on the body; and what it reached."""
 
 from __future__ import annotations
 
@@ -11,12 +9,28 @@ from typing import Any
 
 import numpy as np
 
-from egs_warp.contact.detection import ContactGeometry
-from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.frames import best_turn
 from egs_warp.io.atomic import atomic_write
-from egs_warp.locomotion.stepper import StepReport
+
+SCHEMA = 2
+"""Of ``trajectory.npz`` (docs/guide/report.md)."""
+STATES = ("time", "positions", "velocities", "min_gap")
+"""Arrays of F+1 rows."""
+STEPS = ("dt", "activations")
+"""Arrays of F rows."""
+CONTACTS = (
+    "contact_step",
+    "contact_nodes",
+    "contact_weights",
+    "contact_plane",
+    "contact_normal",
+    "contact_force",
+    "contact_gap",
+)
+"""Arrays of C rows."""
+FIRST_PART = "start.npz"
+"""Of a recording that goes on: what never changes, and the state it began at."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +43,8 @@ class Trajectory:
 
     time: np.ndarray
     """(F+1,)."""
+    dt: np.ndarray
+    """(F,) of each step."""
     positions: np.ndarray
     """(F+1, N, 3)."""
     velocities: np.ndarray
@@ -47,7 +63,12 @@ class Trajectory:
     """(P,) int32: a point is inside a solid if it is below all of its planes; a solid of one plane is a half space."""
     friction: float
     drag: float
-    """1/s."""
+    """alpha of Rayleigh damping, 1/s."""
+    young_modulus: float
+    """Pascals."""
+    poisson_ratio: float
+    damping_time: float
+    """beta of Rayleigh damping, s."""
     height: float
     """H, metres."""
     contact_step: np.ndarray
@@ -56,8 +77,10 @@ class Trajectory:
     """(C, 4) int32."""
     contact_weights: np.ndarray
     """(C, 4)."""
+    contact_plane: np.ndarray
+    """(C,) int32: row of ``planes``."""
     contact_normal: np.ndarray
-    """(C, 3) unit."""
+    """(C, 3) unit, of that plane."""
     contact_force: np.ndarray
     """(C, 3) newtons on the body, world axes."""
     contact_gap: np.ndarray
@@ -65,7 +88,22 @@ class Trajectory:
     min_gap: np.ndarray
     """(F+1,) metres, smallest gap of all contact Gaussians."""
     activations: np.ndarray
-    """(F, M) metres."""
+    """(F, M) metres: a segment pulls with its stiffness times this, constant over the step."""
+    muscle_end_starts: np.ndarray
+    """(K+1,) int32: end k of the muscles is the sum of weight times node over the entries ``starts[k]`` to
+    ``starts[k + 1]``."""
+    muscle_end_nodes: np.ndarray
+    """(E,) int32."""
+    muscle_end_weights: np.ndarray
+    """(E,)."""
+    muscle_segments: np.ndarray
+    """(M, 2) int32: the two ends of each segment."""
+    muscle_rest_lengths: np.ndarray
+    """(M,)."""
+    muscle_stiffness: np.ndarray
+    """(M,) N/m."""
+    planned_com: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    """(F+1, 3) centre of mass as planned, NaN where nothing was; or no rows."""
     body_axes: np.ndarray = field(default_factory=lambda: np.eye(3))
     """(3, 3) rows: this frame's x, y and z in the capture's axes."""
     body_origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -73,43 +111,65 @@ class Trajectory:
     metres_per_unit: float = 1.0
     """Of the capture's unit."""
 
-    def placed(self, frame: BodyFrame) -> Trajectory:
-        """The same trajectory of a body whose ``frame`` in the capture is known."""
-        return replace(self, body_axes=frame.axes, body_origin=frame.origin, metres_per_unit=frame.scale)
-
     def in_capture(self, points: np.ndarray) -> np.ndarray:
         """Points (..., 3) of this frame in the capture's frame and units."""
         return BodyFrame(self.body_axes, self.body_origin, self.metres_per_unit).capture_points(points)
 
+    def with_plan(self, planned_com: np.ndarray) -> Trajectory:
+        """The same trajectory beside where the centre of mass was planned to be, (F+1, 3)."""
+        return replace(self, planned_com=planned_com)
+
     def save(self, path: Path) -> None:
         """Write ``trajectory.npz``; the same trajectory gives the same bytes."""
-        with atomic_write(path) as temporary, temporary.open("wb") as stream:
-            arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in self.__dataclass_fields__}
-            np.savez(stream, **arrays)
+        write_arrays(path, {name: np.asarray(getattr(self, name)) for name in self.__dataclass_fields__})
 
     @classmethod
     def load(cls, path: Path) -> Trajectory:
-        """Read what ``save`` wrote."""
-        with np.load(path) as data:
-            values = {name: data[name] for name in cls.__dataclass_fields__ if name in data}
-        # Files of before there were solids: every plane a half space.
-        values.setdefault("solid_from_plane", np.arange(len(values["planes"]), dtype=np.int32))
-        for name in {"friction", "drag", "height", "metres_per_unit"} & values.keys():
-            values[name] = float(values[name])
-        return cls(**values)
+        """Read what ``save`` wrote, or as much of a run as there is in the folder of a ``Recorder``.
+
+        Raises ``ValueError`` for a file of another schema.
+        """
+        if not path.is_dir():
+            return cls._of(read_arrays(path))
+        parts = [read_arrays(path / FIRST_PART)]
+        for number in range(len(list(path.glob("steps-*.npz")))):
+            parts.append(read_arrays(path / part_name(number)))
+        return cls.joined(parts)
+
+    @classmethod
+    def joined(cls, parts: Sequence[dict[str, np.ndarray]]) -> Trajectory:
+        """Of the parts of a recording, the first of which holds the start and all that never changes."""
+        values = dict(parts[0])
+        for name in (*STATES, *STEPS, *CONTACTS):
+            values[name] = np.concatenate([part[name] for part in parts])
+        return cls._of(values)
+
+    @classmethod
+    def _of(cls, values: dict[str, Any]) -> Trajectory:
+        known = {name: values[name] for name in cls.__dataclass_fields__ if name in values}
+        for name in known.keys() & {name for name, kind in cls.__annotations__.items() if kind == "float"}:
+            known[name] = float(known[name])
+        return cls(**known)
 
 
-@dataclass(frozen=True)
-class Audit:
-    """Maxima over all steps, as defined in docs/guide/report.md; all but the counts are dimensionless."""
+def part_name(number: int) -> str:
+    """File of the steps of part ``number`` of a recording, counted from 0."""
+    return f"steps-{number:06d}.npz"
 
-    momentum_residual: float
-    angular_momentum_residual: float
-    cone_violation: float
-    penetration: float
-    complementarity_gap: float
-    inverted_elements: int
-    newton_unconverged: int
+
+def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write ``arrays`` by name, whole or not at all."""
+    with atomic_write(path) as temporary, temporary.open("wb") as stream:
+        np.savez(stream, schema=np.int64(SCHEMA), **arrays)  # pyright: ignore[reportArgumentType]
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """What ``write_arrays`` wrote. Raises ``ValueError`` for a file of another schema."""
+    with np.load(path, allow_pickle=False) as data:
+        schema = int(data["schema"]) if "schema" in data else 1
+        if schema != SCHEMA:
+            raise ValueError(f"it is of schema {schema}, this version reads schema {SCHEMA}")
+        return {name: data[name] for name in data.files if name != "schema"}
 
 
 @dataclass(frozen=True)
@@ -126,81 +186,6 @@ class Reached:
     """Angle between the up of the body's best-fit rotation and the normal, at the end."""
     airborne_frames: float
     """60 x the longest time during which every contact Gaussian is above the plane."""
-
-
-def record(
-    body: SoftBody,
-    geometry: ContactGeometry,
-    start: BodyState,
-    start_gap: float,
-    reports: Sequence[StepReport],
-    *,
-    drag: float,
-    segments: int,
-) -> Trajectory:
-    """Gather the steps of a simulation that began at ``start``, whose smallest gap was ``start_gap``."""
-    states = [start, *(report.state for report in reports)]
-    counts = [report.contacts.count for report in reports]
-
-    def joined(pieces: list[np.ndarray], shape: tuple[int, ...], dtype: type) -> np.ndarray:
-        return np.concatenate([np.zeros((0, *shape), dtype), *pieces]).astype(dtype)
-
-    return Trajectory(
-        time=np.array([state.time for state in states]),
-        positions=np.stack([state.positions for state in states]),
-        velocities=np.stack([state.velocities for state in states]),
-        rest_positions=body.mesh.nodes,
-        tets=body.mesh.tets,
-        node_mass=body.node_mass,
-        gravity=body.gravity,
-        planes=np.array([[*plane.normal, plane.offset] for plane in geometry.planes]),
-        solid_from_plane=geometry.solid_of_each_plane,
-        friction=geometry.friction,
-        drag=drag,
-        height=body.height,
-        contact_step=np.repeat(np.arange(len(reports)), counts).astype(np.int32),
-        contact_nodes=joined([r.contacts.nodes for r in reports], (4,), np.int32),
-        contact_weights=joined([r.contacts.weights for r in reports], (4,), np.float64),
-        contact_normal=joined([r.contacts.axes[:, 0] for r in reports], (3,), np.float64),
-        contact_force=joined([np.einsum("na,nai->ni", r.forces, r.contacts.axes) for r in reports], (3,), np.float64),
-        contact_gap=joined([r.end_gaps for r in reports], (), np.float64),
-        min_gap=np.array([start_gap, *(report.min_gap for report in reports)]),
-        activations=joined([r.activations[None] for r in reports], (segments,), np.float64),
-    )
-
-
-def audit(trajectory: Trajectory, *, newton_unconverged: int = 0) -> Audit:
-    """Recompute every bound of the audit from the trajectory."""
-    t = trajectory
-    mass = t.node_mass.sum()
-    weight = mass * np.linalg.norm(t.gravity)
-    steps = len(t.time) - 1
-    dt = np.diff(t.time)
-    com = np.einsum("n,fni->fi", t.node_mass, t.positions) / mass
-    momentum = np.einsum("n,fni->fi", t.node_mass, t.velocities)
-    arms = t.positions - com[:, None]
-    spin = np.einsum("n,fni->fi", t.node_mass, np.cross(arms, t.velocities))
-    force = np.zeros((steps, 3))
-    np.add.at(force, t.contact_step, t.contact_force)
-    points = np.einsum("cw,cwi->ci", t.contact_weights, t.positions[t.contact_step[:, None], t.contact_nodes])
-    torque = np.zeros((steps, 3))
-    np.add.at(torque, t.contact_step, np.cross(points - com[t.contact_step], t.contact_force))
-    drag_force = t.drag * momentum[1:]
-    drag_torque = t.drag * np.einsum("n,fni->fi", t.node_mass, np.cross(arms[:-1], t.velocities[1:]))
-    linear = np.diff(momentum, axis=0) / dt[:, None] - mass * t.gravity - force + drag_force
-    angular = np.diff(spin, axis=0) / dt[:, None] - torque + drag_torque
-    normal = np.einsum("ci,ci->c", t.contact_force, t.contact_normal)
-    tangent = np.linalg.norm(t.contact_force - normal[:, None] * t.contact_normal, axis=1)
-    edges = t.positions[:, t.tets[:, 1:]] - t.positions[:, t.tets[:, :1]]
-    return Audit(
-        momentum_residual=float(np.linalg.norm(linear, axis=1).max(initial=0.0) / weight),
-        angular_momentum_residual=float(np.linalg.norm(angular, axis=1).max(initial=0.0) / (weight * t.height)),
-        cone_violation=float(max(np.maximum(tangent - t.friction * normal, -normal).max(initial=0.0) / weight, 0.0)),
-        penetration=float(max(-t.min_gap.min(), 0.0) / t.height),
-        complementarity_gap=float((normal * np.maximum(t.contact_gap, 0.0)).max(initial=0.0) / (weight * t.height)),
-        inverted_elements=int((np.linalg.det(edges) <= 0.0).sum()),
-        newton_unconverged=newton_unconverged,
-    )
 
 
 def measure(trajectory: Trajectory, *, first: int = 0, last: int = -1) -> Reached:

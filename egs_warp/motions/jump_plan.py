@@ -13,8 +13,8 @@ LEAN = 0.2
 would turn the body backward."""
 FURTHEST_LEAN = 0.35
 """Of the way from under the centre of mass to the front of the feet."""
-DEEPEST_CROUCH = 0.3
-"""Of the height of the centre of mass; a higher jump thrusts harder instead."""
+DEEPEST_CROUCH = 0.26
+"""Of the height of the centre of mass, deeper ones crush elements to a fifth; a higher jump thrusts harder instead."""
 ONSET, RAMP = 0.3, 0.4
 """Share of its full strength with which a thrust begins, where the crouch has left it, and share of its time until it
 is reached.
@@ -129,17 +129,16 @@ def plan_jump(
     speed_up = np.sqrt(2.0 * gravity * rise) + 0.5 * gravity * step
     acceleration = 1.6 * gravity
     stroke = max(speed_up**2 / (2.0 * acceleration), extension + 0.02 * height)
-    thrust_time = stroke / (ramped(1.0)[1] * speed_up)
     # Every step goes its whole way at the speed of its end: half a step's way more than the thrust itself.
     stroke += 0.5 * speed_up * step
+    crouch_depth = min(stroke - extension, DEEPEST_CROUCH * com_height)
+    way = crouch_depth + extension - 0.5 * speed_up * step
+    thrust_time = max(way / (ramped(1.0)[1] * speed_up), 2.0 * step)
     flight_time = np.sqrt(2.0 * rise / gravity) + np.sqrt(2.0 * max(rise - target.rise, 0.0) / gravity)
     # The front of the footprint helps a body that comes in to stop over its base.
     capture_time = stopping_time(com_height, np.sqrt(2.0 * gravity * max(rise - target.rise, 0.0)), gravity)
     footprint_help = min(0.3 * support_ahead, 0.5 * target.distance * capture_time / flight_time)
     speed_forward = (target.distance - lean + footprint_help) / (flight_time + capture_time + 0.5 * thrust_time)
-    crouch_depth = min(stroke - extension, DEEPEST_CROUCH * com_height)
-    way = crouch_depth + extension - 0.5 * speed_up * step
-    thrust_time = max(way / (ramped(1.0)[1] * speed_up), 2.0 * step)
     return JumpPlan(
         crouch_depth=float(crouch_depth),
         extension=float(extension),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,16 +17,20 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.run_folder import RunFolder, run_folder
 from egs_warp.io.video import ffmpeg_program
+from egs_warp.locomotion.audit import audit
+from egs_warp.locomotion.ledger import EnergySums, Ledger, ledger
 from egs_warp.locomotion.stepper import LocomotionSettings
-from egs_warp.locomotion.trajectory import audit, measure
+from egs_warp.locomotion.trajectory import measure
 from egs_warp.motions.request import LARGEST_TARGET, LARGEST_TURN
 from egs_warp.motions.script import motion as script
 from egs_warp.pipelines import drawn
 from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.drawn import DrawnCreature
 from egs_warp.pipelines.film import Film, draw_film
+from egs_warp.pipelines.finished_run import PARTS
 from egs_warp.pipelines.oddities import oddities
 from egs_warp.pipelines.performance import Performance, simulate
+from egs_warp.pipelines.plots import draw_plots
 from egs_warp.pipelines.report import (
     CageFacts,
     GaussianCounts,
@@ -35,6 +40,7 @@ from egs_warp.pipelines.report import (
     Report,
     stage_times,
 )
+from egs_warp.pipelines.shot import Shot
 
 LARGEST_SIZE = 4096
 LARGEST_FRICTION = 10.0
@@ -93,6 +99,7 @@ class Asked:
     """Everything that was asked of a run, besides the capture and the motion; frame and units of the capture."""
 
     options: AnimateOptions
+    shot: Shot
     up: tuple[float, ...]
     plane: tuple[float, ...] | None
     """nx, ny, nz, d."""
@@ -105,8 +112,8 @@ class Asked:
 
     def to_json(self) -> dict[str, Any]:
         """``asked`` of the report; what was left to the program is null."""
-        given = {name: value or None for name, value in vars(self).items() if name not in ("options", "solids")}
-        return {**asdict(self.options), **given, "solids": self.solids}
+        given = {name: value or None for name, value in vars(self).items() if name not in ("options", "shot", "solids")}
+        return {**asdict(self.options), **self.shot.to_json(), **given, "solids": self.solids}
 
 
 def animate(
@@ -124,21 +131,24 @@ def animate(
     forward: np.ndarray | None = None,
     settings: LocomotionSettings | None = None,
     options: AnimateOptions | None = None,
+    shot: Shot | None = None,
     source: str = "capture",
     notes: tuple[str, ...] = (),
     overwrite: bool = False,
     quiet: bool = False,
 ) -> Report:
-    """Bring ``cloud`` (scene units) to life and write video, contact sheet, report and trajectory into ``out``.
+    """Bring ``cloud`` (scene units) to life and write video, contact sheet, plots, report and trajectory into ``out``.
 
     ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.motions.script``).
     ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
-    the object to the camera. ``muscles_file``, ``solids``, ``gravity_up`` and ``settings``: see ``make_creature``;
-    ``forward`` (3,): see ``first_place``. Returns what it wrote as ``report.json`` (docs/guide/report.md). A folder
-    belongs to one run (``egs_warp.io.run_folder``): one with an earlier run is refused, or that run moved aside
-    (``overwrite``). Raises ``UserError`` for bad input, before any file of an earlier run is touched.
+    the object to the camera; ``shot``: how it is filmed. ``muscles_file``, ``solids``, ``gravity_up``, ``settings``:
+    see ``make_creature``; ``forward`` (3,): see ``first_place``. Returns what it wrote as ``report.json``
+    (docs/guide/report.md). A folder belongs to one run (``egs_warp.io.run_folder``): one with an earlier run is
+    refused, or that run moved aside (``overwrite``). Raises ``UserError`` for bad input, before any file of an earlier
+    run is touched.
     """
-    options = options or AnimateOptions()
+    options, shot = options or AnimateOptions(), shot or Shot()
+    shot.check()
     asked = script(motion, **options.targets())
     cut_off = asked.frames()
     ffmpeg_program()
@@ -160,10 +170,18 @@ def animate(
         notes = (*notes, *oddities(creature.cloud, creature.cage.mesh, creature.body.height))
         with tqdm(total=options.frames or cut_off, desc="simulate", unit="frame", disable=quiet) as bar:
             performance = simulate(
-                creature, asked, frames=options.frames, forward=forward, progress=lambda _: bar.update()
+                creature,
+                asked,
+                frames=options.frames,
+                forward=forward,
+                parts=lambda: run.file(PARTS),
+                progress=lambda _: bar.update(),
             )
         # Whatever becomes of the film, the simulation is not lost.
-        performance.trajectory.placed(creature.frame).save(run.file("trajectory.npz"))
+        performance.trajectory.save(run.file("trajectory.npz"))
+        shutil.rmtree(run.path / PARTS, ignore_errors=True)
+        books = ledger(performance.trajectory)
+        draw_plots(run.file("plots.png"), performance.trajectory, books)
         with atomic_write(run.file("cage.vtu")) as temporary:
             creature.cage.mesh.write_vtu(temporary)
         film = draw_film(
@@ -171,6 +189,7 @@ def animate(
             run,
             name=asked.name,
             size=options.size,
+            shot=shot,
             background=background,
             view_from=view_from,
             shadow=options.shadow,
@@ -179,6 +198,7 @@ def animate(
         DrawnCreature.of(film.splats, film.camera, creature.muscles).save(run.file(drawn.FILE))
         asked_for = Asked(
             options,
+            shot,
             up=_numbers(up),
             plane=None if plane is None else (*_numbers(plane.normal), plane.offset),
             view_from=_numbers(view_from),
@@ -187,7 +207,8 @@ def animate(
             muscles=None if muscles_file is None else Path(muscles_file).name,
             solids=len(solids),
         )
-        report = _report(performance, film, asked_for, source=source, notes=(*notes, *performance.sequence.cut_short()))
+        notes = (*notes, *performance.sequence.cut_short())
+        report = _report(performance, books, film, asked_for, source=source, notes=notes)
         report.write(run.file("report.json"))
         if not isinstance(out, RunFolder):
             run.finish()
@@ -198,7 +219,9 @@ def _numbers(vector: np.ndarray | None) -> tuple[float, ...]:
     return () if vector is None else tuple(float(x) for x in vector)
 
 
-def _report(performance: Performance, film: Film, asked: Asked, *, source: str, notes: tuple[str, ...]) -> Report:
+def _report(
+    performance: Performance, books: Ledger, film: Film, asked: Asked, *, source: str, notes: tuple[str, ...]
+) -> Report:
     creature, sequence, simulation = performance.creature, performance.sequence, performance.simulation
     trajectory, reports = simulation.trajectory, simulation.reports
     mesh, spans = creature.cage.mesh, sequence.spans(trajectory.time)
@@ -215,7 +238,8 @@ def _report(performance: Performance, film: Film, asked: Asked, *, source: str, 
             )
             for entry, (first, last) in zip(sequence.done, spans, strict=True)
         ),
-        audit=audit(trajectory, newton_unconverged=sum(not report.converged for report in reports)),
+        audit=audit(trajectory, energy=books, newton_unconverged=sum(not report.converged for report in reports)),
+        energy=EnergySums.of(books),
         qp=QpCounts.of(reports, simulation.frames),
         timing=stage_times(reports, simulation.frames, film.milliseconds),
         cage=CageFacts(len(mesh.nodes), len(mesh.tets), mesh.min_dihedral_degrees(), creature.body.mass),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,27 +11,11 @@ from egs_warp import io
 from egs_warp.deformation.rigid import in_body_frame
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.body_frame import BodyFrame
-from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.io.glb import write_glb
+from egs_warp.geometry.gaussians import with_degree
+from egs_warp.io.writing import WRITERS
 from egs_warp.pipelines.finished_run import FinishedRun
 
-WRITERS: dict[str, tuple[str, Callable[[Path, GaussianCloud], None]]] = {
-    "ply": (".ply", io.write_ply),
-    "compressed-ply": (".compressed.ply", io.write_compressed_ply),
-    "spz": (".spz", io.write_spz),
-    "sog": (".sog", io.write_sog),
-    "splat": (".splat", io.write_splat),
-    "glb": (".glb", write_glb),
-}
-"""Ending and writer of each kind of splat file."""
 _Y_UP = BodyFrame(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), np.zeros(3), 1.0)
-
-
-def with_degree(cloud: GaussianCloud, degree: int | None) -> GaussianCloud:
-    """``cloud`` with colour bands up to ``degree``, all of them where that is None."""
-    if degree is None or degree >= cloud.sh_degree:
-        return cloud
-    return replace(cloud, sh=cloud.sh[:, : (degree + 1) ** 2].contiguous())
 
 
 def chosen_frames(run: FinishedRun, *, frame: int | None, every: int) -> np.ndarray:

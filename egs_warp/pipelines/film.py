@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -17,10 +19,12 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.io.video import VideoWriter, contact_sheet, write_png
-from egs_warp.locomotion.rollout import Simulation
-from egs_warp.pipelines.creature import Creature
+from egs_warp.locomotion.rollout import FRAME_RATE
+from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.performance import Performance
-from egs_warp.render.backdrop import Behind, CapturedScene, Floor
+from egs_warp.pipelines.shot import Shot, resized
+from egs_warp.render.backdrop import Behind, CapturedScene, Floor, PlainColour
+from egs_warp.render.compositing import RenderedImage
 from egs_warp.render.rasteriser import render_gaussians
 
 SHEET_FRAMES = 12
@@ -34,8 +38,30 @@ class Film:
     splats: GaussianCloud
     """What was drawn, at rest, splits among them."""
     camera: Camera
+    """As it stands where it does not move."""
     milliseconds: dict[str, list[float]]
     """Of each frame, by stage; the splits, made once, are shared out among the frames."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture of a film."""
+
+    image: RenderedImage
+    """Over what is behind it; over black where the shot is transparent."""
+    shade: np.ndarray | None
+    """(H, W) how much the shadow hides of what will be behind it, where the shot is transparent."""
+    milliseconds: tuple[float, float]
+    """To deform and to render."""
+
+    def picture(self) -> np.ndarray:
+        """(H, W, 3) uint8; of a transparent shot (H, W, 4), colours not multiplied by alpha."""
+        if self.shade is None:
+            return self.image.colour_srgb8()
+        alpha = self.image.alpha.numpy()
+        whole = alpha + (1.0 - alpha) * self.shade
+        straight = self.image.colour.numpy() / np.maximum(whole, 1e-6)[..., None]
+        return np.rint(255.0 * np.clip(np.dstack([straight, whole]), 0.0, 1.0)).astype(np.uint8)
 
 
 def draw_film(
@@ -44,64 +70,112 @@ def draw_film(
     *,
     name: str,
     size: int,
+    shot: Shot | None = None,
     background: GaussianCloud | None = None,
     view_from: np.ndarray | None = None,
     shadow: bool = True,
     quiet: bool = False,
 ) -> Film:
-    """Write ``name``.mp4 and sheet.png, ``size`` pixels both ways, into the folder of ``run``.
+    """Write ``name``.mp4 and sheet.png, ``size`` pixels both ways, into the folder of ``run``; a transparent ``shot``
+    is ``name``.mov.
 
     ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
     the object to the camera, both in the capture's frame.
     """
     creature, simulation = performance.creature, performance.simulation
-    trajectory, frames = simulation.trajectory, simulation.frames
-    camera = performance.camera(size, view_from)
-    behind = _behind(creature, simulation, camera, background, shadow=shadow)
+    trajectory, shot = simulation.trajectory, shot or Shot()
+    steps = simulation.frames if shot.fps == FRAME_RATE else shot.steps(trajectory.time)
+    camera = resized(performance.camera(size, view_from), *(shot.size or (size, size)))
+    cameras = shot.cameras(camera, trajectory, steps)
     # The whole motion is known, so what it will bend is split before the first frame, and nothing can pop.
     started = time.perf_counter()
-    keys = frames[:: max(1, len(frames) // SPLIT_KEY_FRAMES)]
+    keys = simulation.frames[:: max(1, len(simulation.frames) // SPLIT_KEY_FRAMES)]
     embedding = embed_gaussians(creature.cloud, creature.cage.mesh)
     split = split_for_motion(creature.cloud, embedding, [trajectory.positions[step] for step in keys])
     splitting = 1e3 * (time.perf_counter() - started)
-    deformer = Deformer(split.cloud, split.embedding)
+    frames = drawn_frames(
+        Deformer(split.cloud, split.embedding),
+        trajectory,
+        steps,
+        cameras,
+        shot,
+        scene=creature.placed(background) if background is not None else None,
+        shadow=shadow,
+    )
     milliseconds: dict[str, list[float]] = {"deform": [], "render": [], "encode": []}
     kept: list[np.ndarray] = []
-    wanted = np.unique(np.linspace(0, len(frames) - 1, SHEET_FRAMES).round().astype(int))
+    wanted = np.unique(np.linspace(0, len(steps) - 1, SHEET_FRAMES).round().astype(int))
+    path = run.file(f"{name}.{'mov' if shot.transparent else 'mp4'}")
     with (
-        VideoWriter(run.file(f"{name}.mp4"), size, size) as video,
-        tqdm(total=len(frames), desc="render", unit="frame", disable=quiet) as bar,
+        _writer(path, cameras[0], shot) as video,
+        tqdm(total=len(steps), desc="render", unit="frame", disable=quiet) as bar,
     ):
-        for index, step in enumerate(frames):
-            marks = [time.perf_counter()]
-            deformed = deformer.deform(trajectory.positions[step])
-            marks.append(time.perf_counter())
-            backdrop = behind.background(deformed.cloud, height=creature.body.height)
-            image = render_gaussians(deformed.cloud, camera, background=backdrop).colour_srgb8()
-            wp.synchronize_device(creature.cloud.device)
-            marks.append(time.perf_counter())
+        for index, frame in enumerate(frames):
+            started = time.perf_counter()
+            image = frame.picture()
             video.write(image)
             if index in wanted:
-                kept.append(image)
-            marks.append(time.perf_counter())
-            for stage, spent in zip(milliseconds, np.diff(marks), strict=True):
-                milliseconds[stage].append(1e3 * float(spent))
+                kept.append(_over_white(image))
+            encoding = 1e3 * (time.perf_counter() - started)
+            for stage, spent in zip(milliseconds, (*frame.milliseconds, encoding), strict=True):
+                milliseconds[stage].append(spent)
             bar.update()
-    labels = [f"{trajectory.time[frames[i]]:.2f} s" for i in wanted]
+    labels = [f"{trajectory.time[steps[i]]:.2f} s" for i in wanted]
     write_png(run.file("sheet.png"), contact_sheet(kept, 4, labels))
-    milliseconds["split"] = [splitting / len(frames)]
+    milliseconds["split"] = [splitting / len(steps)]
     return Film(split.cloud, camera, milliseconds)
 
 
-def _behind(
-    creature: Creature, simulation: Simulation, camera: Camera, background: GaussianCloud | None, *, shadow: bool
-) -> Behind:
-    trajectory, height = simulation.trajectory, creature.body.height
+def drawn_frames(
+    deformer: Deformer,
+    trajectory: Trajectory,
+    steps: np.ndarray,
+    cameras: Sequence[Camera],
+    shot: Shot,
+    *,
+    scene: GaussianCloud | None = None,
+    shadow: bool = True,
+) -> Iterator[Frame]:
+    """A picture for each of ``steps`` (n,) of the trajectory through each of the n ``cameras``; what does not change
+    from one to the next is made once. ``scene`` lies in the body's frame.
+    """
+    behind: Behind | None = None
+    for index, (step, camera) in enumerate(zip(steps, cameras, strict=True)):
+        if behind is None or camera is not cameras[index - 1]:
+            behind = _behind(trajectory, camera, scene, shot, shadow=shadow)
+        marks = [time.perf_counter()]
+        deformed = deformer.deform(trajectory.positions[step])
+        marks.append(time.perf_counter())
+        cloud, height = deformed.cloud, trajectory.height
+        shade = behind.cover(cloud, height=height) if isinstance(behind, PlainColour) and shot.transparent else None
+        backdrop = behind.background(cloud, height=height) if shade is None else (0.0, 0.0, 0.0)
+        image = render_gaussians(cloud, camera, background=backdrop)
+        wp.synchronize_device(cloud.device)
+        marks.append(time.perf_counter())
+        deforming, rendering = (1e3 * np.diff(marks)).tolist()
+        yield Frame(image, shade, (deforming, rendering))
+
+
+def _writer(path: Path, camera: Camera, shot: Shot) -> VideoWriter:
+    return VideoWriter(path, camera.width, camera.height, frames_per_second=shot.fps, alpha=shot.transparent)
+
+
+def _over_white(image: np.ndarray) -> np.ndarray:
+    if image.shape[2] == 3:
+        return image
+    alpha = image[..., 3:] / 255.0
+    return np.rint(alpha * image[..., :3] + 255.0 * (1.0 - alpha)).astype(np.uint8)
+
+
+def _behind(trajectory: Trajectory, camera: Camera, scene: GaussianCloud | None, shot: Shot, *, shadow: bool) -> Behind:
+    height = trajectory.height
     path = np.einsum("n,fni->fi", trajectory.node_mass, trajectory.positions) / trajectory.node_mass.sum()
     com = path.mean(axis=0)
     centre = com * [1.0, 1.0, 0.0]
     reach = 2.2 * (height + float(np.linalg.norm(np.ptp(path, axis=0))))
-    if background is None:
+    if shot.transparent or shot.colour is not None:
+        colour = (0.0, 0.0, 0.0) if shot.colour is None else shot.colour
+        return PlainColour(colour, camera, GROUND, centre=centre, reach=reach, shadow=shadow)
+    if scene is None:
         return Floor(camera, GROUND, centre=centre, reach=reach, cell=0.25 * height, shadow=shadow)
-    scene = creature.placed(background)
     return CapturedScene(scene, camera, GROUND, centre=centre, reach=reach, shadow=shadow)

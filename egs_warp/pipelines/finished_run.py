@@ -24,12 +24,20 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines import drawn
 from egs_warp.pipelines.drawn import DrawnCreature
 
+PARTS = "trajectory.parts"
+"""Folder that takes the steps of a run as they are done; it goes when ``trajectory.npz`` is there."""
+
 
 def read_trajectory(path: Path) -> Trajectory:
-    """Read a run's trajectory. Raises ``UserError`` where there is none, or another kind of file."""
+    """Read a run's trajectory: its file, or the folder of parts of one that was cut off.
+
+    Raises ``UserError`` where there is none, or another kind of file.
+    """
     try:
         return Trajectory.load(path)
     except FileNotFoundError as error:
+        if not path.is_dir() and (path.parent / PARTS).is_dir():
+            raise UserError(f"{path}: is missing, the run was cut off; what it did is in {PARTS}") from error
         raise UserError(f"{path}: is missing; give the folder that egs-warp animate wrote") from error
     except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise UserError(f"{path}: is no trajectory ({error}); run egs-warp animate again, which writes it") from error

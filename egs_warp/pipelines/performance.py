@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from egs_warp.geometry.camera import Camera
-from egs_warp.locomotion import rollout
-from egs_warp.locomotion.rollout import FRAME_RATE, Simulation
+from egs_warp.locomotion.rollout import FRAME_RATE, Simulation, roll_out
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.script import Script
 from egs_warp.motions.sequence import MotionSequence, Place
 from egs_warp.pipelines.creature import FILMED_FROM, Creature, first_place
+from egs_warp.pipelines.planned import planned_com
 
 
 @dataclass(frozen=True)
@@ -76,27 +77,32 @@ def simulate(
     frames: int | None = None,
     forward: np.ndarray | None = None,
     step: float | None = None,
+    parts: Callable[[], Path] | None = None,
     progress: Callable[[int], object] = lambda frame: None,
 ) -> Performance:
     """Run ``motion`` for ``frames`` at 60 Hz, or else until the body has come to rest or the motion is cut off.
 
     ``forward`` (3,) is the way of the motion, the long axis of the footprint if not given; ``step`` the seconds of a
-    solver step, if not the usual. ``progress`` is told each frame done. Raises ``UserError`` for a motion that the body
-    cannot do.
+    solver step, if not the usual; ``parts`` tells the folder that takes the steps as they are done. ``progress`` is
+    told each frame done. Raises ``UserError`` for a motion that the body cannot do.
     """
     place = first_place(creature, forward, step=step)
     motion.check(place)
     sequence = MotionSequence(place, motion.parts(creature.body.height))
     # A frame is as long as a step that is longer than it.
     share = 1.0 if step is None else min(1.0, 1.0 / (FRAME_RATE * step))
-    simulation = rollout.simulate(
+    simulation = roll_out(
         creature.stepper,
         creature.geometry,
         creature.start,
         sequence,
         frames=frames or round(share * motion.frames()),
         step=step,
+        place=creature.frame,
+        parts=parts,
         finished=lambda: frames is None and sequence.finished,
         progress=progress,
     )
-    return Performance(creature, place, sequence, simulation)
+    trajectory = simulation.trajectory
+    trajectory = trajectory.with_plan(planned_com(sequence, creature.body, trajectory))
+    return Performance(creature, place, sequence, replace(simulation, trajectory=trajectory))

@@ -13,8 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from egs_warp.io.atomic import atomic_write
+from egs_warp.locomotion.audit import Audit
+from egs_warp.locomotion.ledger import EnergySums
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.locomotion.trajectory import Audit, Reached
+from egs_warp.locomotion.trajectory import Reached
 from egs_warp.version import __version__
 
 if TYPE_CHECKING:
@@ -168,6 +170,7 @@ class Report:
     """Name of the capture."""
     motion: tuple[MotionReport, ...]
     audit: Audit
+    energy: EnergySums
     qp: QpCounts
     timing: Mapping[str, StageTime]
     cage: CageFacts
@@ -189,6 +192,7 @@ class Report:
             "asked": dict(self.asked),
             "motion": [motion.to_json() for motion in self.motion],
             "audit": asdict(self.audit),
+            "energy": asdict(self.energy),
             "qp": asdict(self.qp),
             "timing": {stage: asdict(time) for stage, time in self.timing.items()},
             "cage": asdict(self.cage),
@@ -207,6 +211,7 @@ class Report:
     def summary(self) -> str:
         """A few lines for the terminal."""
         lines = [line for motion in self.motion for line in motion.summary()]
+        lines.append(f"muscle work: {self.energy.muscle_work:.2f} of the energy that lifts the body by its height")
         lines.append(verdict(self.audit))
         return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
 
@@ -214,7 +219,11 @@ class Report:
 AUDIT_LIMITS = {
     "momentum_residual": 1e-5,
     "angular_momentum_residual": 1e-4,
+    "energy_residual": 1e-6,
     "cone_violation": 1e-4,
+    "friction_gap": 1e-5,
+    # The spin that the stepper adds after a step, of which contacts do not know.
+    "contact_velocity": 0.1,
     "penetration": 1e-2,
     "complementarity_gap": 1e-4,
     "inverted_elements": 0,

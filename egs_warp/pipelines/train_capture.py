@@ -47,6 +47,15 @@ class PhotoScore:
 
 
 @dataclass(frozen=True)
+class MeanScore:
+    """How well the capture shows several photos, each in its own exposure."""
+
+    psnr: float
+    """dB."""
+    ssim: float
+
+
+@dataclass(frozen=True)
 class TrainResult:
     """What training from photos gave."""
 
@@ -66,13 +75,10 @@ class TrainResult:
     left_out: tuple[LeftOut, ...] = ()
     """Photos that are not used, or no longer, and why."""
 
-    def mean_score(self, *, held_out: bool) -> tuple[float, float] | None:
-        """Mean PSNR and SSIM of photos held out, or of those trained on, misfits apart; None where there are none."""
+    def mean_score(self, *, held_out: bool) -> MeanScore | None:
+        """Of photos held out, or of those trained on, misfits apart; None where there are none."""
         chosen = [(s.psnr, s.ssim) for s in self.scores if s.held_out is held_out and not s.misfit]
-        if not chosen:
-            return None
-        psnr_mean, ssim_mean = np.mean(chosen, axis=0)
-        return float(psnr_mean), float(ssim_mean)
+        return MeanScore(*np.mean(chosen, axis=0).tolist()) if chosen else None
 
 
 def train(

@@ -10,10 +10,10 @@ import numpy as np
 from tqdm import tqdm
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import GaussianCloud, with_degree
 from egs_warp.io.atomic import atomic_write
 from egs_warp.locomotion.rollout import FRAME_RATE
-from egs_warp.pipelines.export import chosen_frames, with_degree
+from egs_warp.pipelines.export import chosen_frames
 from egs_warp.pipelines.finished_run import FinishedRun
 
 SPLATS, CAGE, MUSCLES, FORCES, SCENE = "splats", "cage", "muscles", "forces", "scene"

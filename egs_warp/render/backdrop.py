@@ -126,6 +126,36 @@ class Floor:
         return self._bare * (1.0 - darkness[..., None] * self._fade)
 
 
+class PlainColour:
+    """One colour, on which only the shadow falls; black with ``cover`` is a shadow to be laid over something else."""
+
+    def __init__(
+        self,
+        colour: tuple[float, float, float],
+        camera: Camera,
+        plane: Plane,
+        *,
+        centre: np.ndarray,
+        reach: float,
+        shadow: bool = True,
+    ) -> None:
+        """``centre`` (3,) and ``reach`` (world units) bound the shadow."""
+        self._shadow = ContactShadow(camera, plane, centre=centre, reach=reach)
+        fade = np.clip(1.6 - 1.6 * np.linalg.norm(self._shadow.flat, axis=-1) / reach, 0.0, 1.0) * self._shadow.hit
+        self._fade = fade.astype(np.float32) * (1.0 if shadow else 0.0)
+        self._colour = np.asarray(colour, np.float32)
+
+    def cover(self, body: GaussianCloud, *, height: float) -> np.ndarray:
+        """(H, W) float32, 0 to about 0.5: how much of what is behind the shadow hides."""
+        if not self._fade.any():
+            return self._fade
+        return self._shadow.darkness(body, height=height) * self._fade
+
+    def background(self, body: GaussianCloud, *, height: float) -> np.ndarray:
+        """See ``Behind``."""
+        return self._colour * (1.0 - self.cover(body, height=height)[..., None])
+
+
 class CapturedScene:
     """The rest of a capture, rendered once; the shadow falls where the plane is what one sees."""
 

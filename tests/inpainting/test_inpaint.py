@@ -271,7 +271,7 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         ),
         (
             [*files, "a.ply", *where, "--inpainter", "magic"],
-            "--inpainter magic: give patch, telea, ns or a TorchScript",
+            "--inpainter magic: give patch, telea, ns or an ONNX file",
         ),
     ):
         assert main(["inpaint", *flags]) == 2

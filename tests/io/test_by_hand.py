@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import gzip
+import re
 import struct
 import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 
+from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
-from egs_warp.io import read_capture, write_ply
-from tests.support.captures import assert_same_bits, make_cloud
+from egs_warp.io import read_capture, write_ply, write_spz
+from tests.support.captures import assert_same_bits, make_cloud, spz_of_streams
 
 
 @pytest.mark.parametrize("version", [1, 2, 3])
@@ -42,6 +45,49 @@ def test_spz_by_hand(version: int, tmp_path: Path) -> None:
     np.testing.assert_array_equal(capture.up, [0.0, 1.0, 0.0])
     assert capture.antialiased == (version == 3)
     assert_same_bits(read_capture(tmp_path / "plain.spz", device="cpu").cloud, cloud)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_spz_of_streams_holds_what_version_3_does(degree: int, tmp_path: Path) -> None:
+    write_spz(tmp_path / "3.spz", make_cloud(900, degree))
+    plain = gzip.decompress((tmp_path / "3.spz").read_bytes())
+    (tmp_path / "4.spz").write_bytes(spz_of_streams(plain, 900, 3 * ((degree + 1) ** 2 - 1)))
+    capture = read_capture(tmp_path / "4.spz", device="cpu")
+    assert capture.format == ".spz version 4"
+    np.testing.assert_array_equal(capture.up, [0.0, 1.0, 0.0])
+    assert_same_bits(capture.cloud, read_capture(tmp_path / "3.spz", device="cpu").cloud)
+
+
+def _one_spz(tmp_path: Path) -> bytes:
+    write_spz(tmp_path / "3.spz", make_cloud(1))
+    return gzip.decompress((tmp_path / "3.spz").read_bytes())
+
+
+@pytest.mark.parametrize(("axes", "up"), [(4, (0, 1, 0)), (6, (0, -1, 0)), (12, (0, 0, 1)), (9, (0, 0, -1))])
+def test_spz_of_streams_says_which_way_is_up(axes: int, up: tuple[int, int, int], tmp_path: Path) -> None:
+    """RUB, RDF, RFU, LFD, behind a record of another kind."""
+    records = struct.pack("<IIfff", 0xADBE0002, 12, 0.0, 1.0, 2.0) + struct.pack("<III", 0xADBE0003, 4, axes)
+    (tmp_path / "4.spz").write_bytes(spz_of_streams(_one_spz(tmp_path), 1, 0, records))
+    np.testing.assert_array_equal(read_capture(tmp_path / "4.spz", device="cpu").up, up)
+
+
+def test_damaged_spz_of_streams_is_one_line(tmp_path: Path) -> None:
+    good = spz_of_streams(_one_spz(tmp_path), 1, 0)
+    left = struct.pack("<III", 0xADBE0003, 4, 3)
+    bomb = zstandard.ZstdCompressor().compress(bytes(1 << 26))
+    for data, said in {
+        good[:20]: "truncated: .spz header of 20 bytes, expected 32",
+        good[:50]: "its table lies outside of the file",
+        good[:-3]: "corrupt or truncated .spz: a stream",
+        good[:15] + b"\4" + good[16:]: ".spz with 4 streams, expected 5",
+        good[:112] + b"\0" * (len(good) - 112): "corrupted .spz data",
+        good[:32] + struct.pack("<QQ", len(bomb), 1 << 26) + good[48:112] + bomb: "of which 9 are needed",
+        spz_of_streams(_one_spz(tmp_path), 1, 0, left): "left-handed axes (LUB), which would be mirrored",
+        gzip.compress(good): "version 4 inside gzip; unpack it first",
+    }.items():
+        (tmp_path / "4.spz").write_bytes(data)
+        with pytest.raises(UserError, match=re.escape(said)):
+            read_capture(tmp_path / "4.spz", device="cpu")
 
 
 def test_splat_by_hand(tmp_path: Path) -> None:

@@ -40,9 +40,8 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
 
 
 def test_wrong_magic(tmp_path: Path) -> None:
-    expected = (
-        "unknown format (starts with b'\\xff\\xd8\\xff\\xe0abcd'); give a .ply, .spz, .splat, .sog or a SOG folder"
-    )
+    advice = "give a .ply, .spz, .splat, .sog, .glb or a SOG folder"
+    expected = f"unknown format (starts with b'\\xff\\xd8\\xff\\xe0abcd'); {advice}"
     for name in ("photo.jpg", "a.ply", "a.spz", "a.sog"):
         assert message(written(tmp_path / name, b"\xff\xd8\xff\xe0abcdefgh")) == expected
 
@@ -165,7 +164,7 @@ def test_bad_spz(tmp_path: Path) -> None:
         "gzip data, but no .spz inside; unpack it first if it holds another format"
     )
     assert message(written(path, gzip.compress(body[:4] + struct.pack("<I", 7) + body[8:]))) == (
-        ".spz version 7, expected 1, 2 or 3; export it as version 3 or as .ply"
+        ".spz version 7, expected 1 to 4; export it as version 4 or as .ply"
     )
     assert message(written(path, gzip.compress(body[:12] + b"\x09" + body[13:]))).startswith(".spz with SH degree 9")
     assert message(written(path, b"NGSP\x04\0\0\0")).startswith("truncated: .spz header of 8 bytes, expected 16")

@@ -8,12 +8,14 @@ import pytest
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
 from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.locomotion.audit import audit
+from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
-from egs_warp.locomotion.trajectory import audit, measure, record
+from egs_warp.locomotion.trajectory import measure
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.walk import Walk, WalkPhase
 from tests.support.creatures import coarse_creature
-from tests.support.meshes import UP, figure, stool
+from tests.support.meshes import UP, coarse_stool, figure, stool
 from tests.support.places import DT
 
 
@@ -49,7 +51,7 @@ def test_a_coarse_stool_takes_a_step(slope: float) -> None:
     is met, the audit holds."""
     tilt = np.radians(slope)
     up = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
-    stepper, place, state = stiff(stool(), forward=np.array([1.0, 0.0, 0.0]), up=up)
+    stepper, place, state = stiff(coarse_stool(), forward=np.array([1.0, 0.0, 0.0]), up=up)
     body, start, walk = stepper.body, state, Walk(place, 1, 0.06)
     reports: list[StepReport] = []
     memory, air = stepper.initial_memory(), 0.0
@@ -61,7 +63,9 @@ def test_a_coarse_stool_takes_a_step(slope: float) -> None:
             air = max(air, float(state.positions[walk.feet[index].sole, 2].min()))
         if walk.phase is WalkPhase.REST:
             break
-    trajectory = record(body, stepper.geometry, start, 0.0, reports, drag=0.0, segments=stepper.muscles.segment_count)
+    recorder = Recorder(body, stepper.muscles, stepper.geometry, start, 0.0, drag=0.0)
+    recorder.add(reports)
+    trajectory = recorder.trajectory()
     fell, reached, found = walk.reached(trajectory, 0, -1), measure(trajectory), audit(trajectory)
     assert walk.phase is WalkPhase.REST and walk.notes() == []
     assert fell.landings == 4 and fell.slip < 0.02 and fell.sole_shift < 0.05

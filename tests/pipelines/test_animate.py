@@ -10,6 +10,7 @@ from dataclasses import replace as replaced
 from itertools import count
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from egs_warp.assets import pawn
@@ -19,10 +20,12 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.animate import AnimateOptions, animate
 from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.finished_run import PARTS, read_trajectory
 from egs_warp.pipelines.performance import Performance, simulate
 from egs_warp.pipelines.report import Report, verdict
+from tests.support.slides import slide
 
-FILES = ["cage.vtu", "creature.npz", "jump.mp4", MANIFEST, "report.json", "sheet.png", "trajectory.npz"]
+FILES = ["cage.vtu", "creature.npz", "jump.mp4", MANIFEST, "plots.png", "report.json", "sheet.png", "trajectory.npz"]
 OPTIONS = AnimateOptions(frames=1, size=32, friction=0.6)
 
 
@@ -57,6 +60,9 @@ def test_a_run_holds_what_was_asked_and_its_manifest(run: Callable[..., Report],
     assert asked["friction"] == 0.6 and asked["size"] == 32 and asked["frames"] == 1 and asked["up"] is None
     assert asked["plane"] == pytest.approx([*pawn(device="cpu").plane.normal, pawn(device="cpu").plane.offset])
     assert verdict(report.audit).startswith("audit: passed (momentum_residual ")
+    energy = json.loads((tmp_path / "report.json").read_text())["energy"]
+    assert energy["gained"] == pytest.approx(sum(energy["flows"].values()), abs=1e-9)
+    assert energy["muscle_work"] >= energy["flows"]["muscles"] and energy["worst_residual"] < 1e-6
 
 
 def test_a_film_that_fails_leaves_the_simulation(
@@ -70,6 +76,32 @@ def test_a_film_that_fails_leaves_the_simulation(
         run(tmp_path)
     assert len(Trajectory.load(tmp_path / "trajectory.npz").time) >= 2
     assert not finished(tmp_path)
+
+
+def test_a_run_that_is_cut_off_leaves_its_steps(
+    run: Callable[..., Report], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was simulated is read from the parts; the next run moves them aside."""
+    monkeypatch.setattr("egs_warp.locomotion.recorder._STEPS_A_PART", 7)
+    slid = slide("two-stage")
+
+    def interrupted(*_: object, parts: Callable[[], Path], **__: object) -> None:
+        recorder = slid.recorder(folder=parts)
+        for report in slid.reports[:16]:
+            recorder.add([report])
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("egs_warp.pipelines.animate.simulate", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path)
+    assert not finished(tmp_path) and sorted(os.listdir(tmp_path)) == [MANIFEST, PARTS]
+    assert np.array_equal(read_trajectory(tmp_path / PARTS).positions, slid.trajectory().positions[:15])
+    with pytest.raises(UserError, match=r"the run was cut off; what it did is in trajectory\.parts"):
+        read_trajectory(tmp_path / "trajectory.npz")
+    run(tmp_path, overwrite=True)
+    assert sorted(os.listdir(tmp_path)) == sorted([*FILES, "earlier-1"])
+    assert len(read_trajectory(tmp_path / "earlier-1" / PARTS).dt) == 14
 
 
 def test_no_ffmpeg_is_told_before_anything_is_done(
@@ -110,8 +142,8 @@ def test_a_disk_that_is_full_at_any_file(
         assert MANIFEST not in names or not finished(folder)
         run(folder, overwrite=True)
         assert finished(folder) and set(FILES) <= set(os.listdir(folder))
-    # Six files, the manifest before each of them and at the end.
-    assert failures == 13
+    # Seven files, the manifest before each of them and at the end.
+    assert failures == 15
 
 
 def test_a_verdict_names_what_is_beyond(run: Callable[..., Report], tmp_path: Path) -> None:

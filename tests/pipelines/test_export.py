@@ -16,11 +16,10 @@ from egs_warp.cli import main
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io import read_capture
-from egs_warp.pipelines.export import WRITERS, export_splats
+from egs_warp.io.writing import WRITERS
+from egs_warp.pipelines.export import export_splats
 from egs_warp.pipelines.finished_run import FinishedRun
 from egs_warp.pipelines.usd import export_usd
-
-pytestmark = pytest.mark.xdist_group("page")
 
 
 @pytest.fixture(scope="module")

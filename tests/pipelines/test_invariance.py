@@ -13,10 +13,12 @@ import pytest
 from egs_warp.assets import figurine, pawn
 from egs_warp.deformation.deformer import deform
 from egs_warp.deformation.embedding import embed_gaussians
+from egs_warp.fem.body import BodyState
 from egs_warp.geometry.body_frame import GROUND
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.io import read_capture
 from egs_warp.locomotion.rollout import Simulation
+from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.trajectory import measure
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import FILMED_FROM, Creature, first_place, make_creature
@@ -24,6 +26,9 @@ from egs_warp.pipelines.performance import simulate
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.base_plane import find_base_plane
 from tests.support.frames import TURN, Lying
+
+WHERE_IT_LIES = {"body_axes", "body_origin", "metres_per_unit"}
+"""Of a trajectory: what says how the file lies."""
 
 
 def jump(lying: Lying, *, frames: int | None = None, by_up: bool = False) -> tuple[Creature, Simulation]:
@@ -42,6 +47,11 @@ def pictures(creature: Creature, positions: np.ndarray) -> np.ndarray:
     return np.stack([render_gaussians(carried, camera).colour.numpy() for camera in cameras])
 
 
+def at_rest(stepper: LocomotionStepper) -> BodyState:
+    nodes = stepper.body.mesh.nodes
+    return BodyState(nodes.copy(), np.zeros_like(nodes))
+
+
 @pytest.fixture(scope="module")
 def thing() -> Lying:
     made = pawn(gaussian_count=2500)
@@ -53,14 +63,22 @@ def first_steps(thing: Lying) -> tuple[Creature, Simulation]:
     return jump(thing, frames=2, by_up=True)
 
 
+@pytest.fixture(scope="module")
+def elsewhere(thing: Lying) -> tuple[Lying, Creature, Simulation]:
+    """The same, moved, turned and in another unit, with its plane."""
+    lying = thing.moved((3.0, 1.0, -2.0)).turned().scaled(0.37)
+    return lying, *jump(lying, frames=2)
+
+
 @pytest.mark.parametrize(
     "other",
     [
-        lambda thing: thing.shuffled(),
-        lambda thing: thing.scaled(4.0),
-        lambda thing: thing.moved((1000.0, -333.0, 17.0)),
+        lambda thing: thing.shuffled().scaled(4.0).moved((1000.0, -333.0, 17.0)),
+        pytest.param(lambda thing: thing.shuffled(), marks=pytest.mark.slow),
+        pytest.param(lambda thing: thing.scaled(4.0), marks=pytest.mark.slow),
+        pytest.param(lambda thing: thing.moved((1000.0, -333.0, 17.0)), marks=pytest.mark.slow),
     ],
-    ids=["shuffled", "x4", "moved"],
+    ids=["all", "shuffled", "x4", "moved"],
 )
 def test_same_bits_however_the_file_lies(
     thing: Lying, first_steps: tuple[Creature, Simulation], other: Callable[[Lying], Lying]
@@ -73,7 +91,7 @@ def test_same_bits_however_the_file_lies(
         (again.geometry, creature.geometry),
         (simulated.trajectory, simulation.trajectory),
     ):
-        for name in mine.__dataclass_fields__:
+        for name in mine.__dataclass_fields__.keys() - WHERE_IT_LIES:
             a, b = getattr(mine, name), getattr(its, name)
             if hasattr(a, "toarray"):
                 a, b = a.toarray(), b.toarray()
@@ -81,24 +99,32 @@ def test_same_bits_however_the_file_lies(
                 assert np.array_equal(a, b), name
 
 
+def assert_same_pictures(one: tuple[Creature, Simulation], other: tuple[Creature, Simulation]) -> None:
+    truth, again = (pictures(creature, done.trajectory.positions[-1]) for creature, done in (one, other))
+    assert truth.std() > 0.05
+    assert np.abs(again - truth).mean() < 1e-3
+
+
+def test_same_pictures_elsewhere(
+    first_steps: tuple[Creature, Simulation], elsewhere: tuple[Lying, Creature, Simulation]
+) -> None:
+    assert_same_pictures(first_steps, elsewhere[1:])
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "other", [lambda thing: thing.scaled(0.37), lambda thing: thing.turned()], ids=["x0.37", "turned"]
 )
-def test_same_pictures_in_any_unit_and_turned(
+def test_same_pictures_from_up_alone(
     thing: Lying, first_steps: tuple[Creature, Simulation], other: Callable[[Lying], Lying]
 ) -> None:
-    creature, simulation = first_steps
-    again, simulated = jump(other(thing), frames=2, by_up=True)
-    truth = pictures(creature, simulation.trajectory.positions[-1])
-    assert truth.std() > 0.05
-    assert np.abs(pictures(again, simulated.trajectory.positions[-1]) - truth).mean() < 1e-3
+    assert_same_pictures(first_steps, jump(other(thing), frames=2, by_up=True))
 
 
-def test_trajectory_leads_back_to_the_capture(thing: Lying, first_steps: tuple[Creature, Simulation]) -> None:
+def test_trajectory_leads_back_to_the_capture(elsewhere: tuple[Lying, Creature, Simulation]) -> None:
     """The nodes at the start stand where the Gaussians are, on the capture's plane."""
-    turned = thing.moved((3.0, 1.0, -2.0)).turned().scaled(0.37)
-    creature, simulation = jump(turned, frames=1)
-    trajectory = simulation.trajectory.placed(creature.frame)
+    turned, _, simulation = elsewhere
+    trajectory = simulation.trajectory
     nodes, means = trajectory.in_capture(trajectory.rest_positions), turned.cloud.means.numpy()
     assert turned.plane.heights(nodes).min() == pytest.approx(0.0, abs=1e-9)
     slack = 0.05 * 0.37
@@ -107,10 +133,9 @@ def test_trajectory_leads_back_to_the_capture(thing: Lying, first_steps: tuple[C
     assert trajectory.height / trajectory.metres_per_unit == pytest.approx(0.37, rel=0.05)
 
 
-AMPLIFIED = pytest.mark.xfail(
-    reason="not met: x0.37 failed when first run, by how much was not read; rounding moves gave 2 to 3 % in a trial",
-    strict=False,
-)
+def amplified(measured: str) -> pytest.MarkDecorator:
+    """Not met: rounding grows in a jump. ``measured`` says by how much; distances and heights in body heights."""
+    return pytest.mark.xfail(reason=f"rounding grows in a jump: {measured}", strict=False)
 
 
 CHANGES = {
@@ -119,9 +144,14 @@ CHANGES = {
 }
 
 
-@AMPLIFIED
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CHANGES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("x0.37", marks=amplified("distance 0.5206 and 0.5264 (1.1 %), height 0.2116 and 0.2022 (4.4 %)")),
+        pytest.param("turned", marks=amplified("distance 0.5206 and 0.5267 (1.2 %), height 0.2116 and 0.2022 (4.4 %)")),
+    ],
+)
 def test_jump_goes_as_far_in_any_unit_and_turned(thing: Lying, name: str) -> None:
     """Distance and height within 1 %."""
     reached, again = (measure(jump(one)[1].trajectory) for one in (thing, CHANGES[name](thing)))
@@ -129,10 +159,22 @@ def test_jump_goes_as_far_in_any_unit_and_turned(thing: Lying, name: str) -> Non
     assert again.height == pytest.approx(reached.height, rel=0.01)
 
 
-@AMPLIFIED
 @pytest.mark.slow
 @pytest.mark.data
-@pytest.mark.parametrize(("name", "up"), [("monkey.ply", (0, 1, 0)), ("plush_dog.ply", (0, -1, 0))])
+@pytest.mark.parametrize(
+    ("name", "up"),
+    [
+        pytest.param(
+            *("monkey.ply", (0, 1, 0)),
+            marks=amplified("distance 0.5347 and 0.5294 (1.002 %), height 0.1972 and 0.1980 (0.4 %)"),
+        ),
+        pytest.param(
+            "plush_dog.ply",
+            (0, -1, 0),
+            marks=amplified("distance 0.5263 and 0.5224 (0.7 %), height 0.2020 and 0.1984 (1.8 %)"),
+        ),
+    ],
+)
 def test_jump_of_real_captures_goes_as_far(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:
     """Turned and in another unit, with nothing but up: distance and height within 1 %."""
     cloud = read_capture(data_dir / "objects" / name).cloud
@@ -142,8 +184,12 @@ def test_jump_of_real_captures_goes_as_far(data_dir: Path, name: str, up: tuple[
     assert again.height == pytest.approx(reached.height, rel=0.01)
 
 
-def test_front_is_where_the_face_is() -> None:
-    """The figurine looks along -y of its file; its camera stands before it, however the file lies."""
+def test_front_is_where_the_face_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The figurine looks along -y of its file; its camera stands before it, however the file lies.
+
+    Its front does not hang on how its weight bends it, so it is not settled.
+    """
+    monkeypatch.setattr("egs_warp.pipelines.creature.settle", at_rest)
     made = figurine(gaussian_count=6000)
     turned = Lying(made.cloud, made.plane).turned()
     creature = make_creature(turned.cloud, plane=turned.plane)

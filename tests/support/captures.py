@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import struct
 import tempfile
 from collections.abc import Callable
 from functools import cache
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import zstandard
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -51,6 +53,17 @@ def small_cloud() -> GaussianCloud:
         0.3 * rng.normal(size=(7, 4, 3)),
         device="cpu",
     )
+
+
+def spz_of_streams(plain: bytes, count: int, sh_bytes: int, records: bytes = b"") -> bytes:
+    """Version 4 of ``plain``, a .spz of version 3 without its gzip: header, records, table, streams."""
+    ends = 16 + count * np.cumsum([0, 9, 1, 3, 3, 4, sh_bytes])
+    blocks = [plain[start:end] for start, end in zip(ends[:-1], ends[1:], strict=True) if end > start]
+    streams = [zstandard.ZstdCompressor().compress(block) for block in blocks]
+    flags = plain[14] | (2 if records else 0)
+    header = struct.pack("<4sI", b"NGSP", 4) + plain[8:14] + bytes([flags, len(blocks)])
+    table = b"".join(struct.pack("<QQ", len(s), len(b)) for s, b in zip(streams, blocks, strict=True))
+    return header + struct.pack("<I12x", 32 + len(records)) + records + table + b"".join(streams)
 
 
 WRITERS: dict[str, Callable[..., None]] = {

@@ -77,6 +77,13 @@ def stool() -> TetMesh:
     )
 
 
+def coarse_stool() -> TetMesh:
+    """Four legs of one cell each, under a seat: 152 nodes."""
+    return carved(
+        (0.75, 0.75, 0.9), 0.15, lambda c: (c[:, 2] > 0.75) | ((np.abs(c[:, 0]) > 0.2) & (np.abs(c[:, 1]) > 0.2))
+    )
+
+
 def figure() -> TetMesh:
     """Two legs, a trunk that ends in a head, two arms held out."""
 

@@ -266,6 +266,56 @@ BESIDE_THE_PAPER: list[Mutation] = [
             *("diameter * count // (2 * self.detail.diameters)", "0"),
             "muscles/test_muscle_set.py::test_radial_fibres_are_diameters_spread_over_length_and_directions",
         ),
+        (
+            *("ledger: the half of lambda log^2 J", "locomotion/ledger.py"),
+            *("+ 0.5 * self.lam * log_j**2", "+ 0.51 * self.lam * log_j**2"),
+            "locomotion/test_ledger.py::test_every_step_closes",
+        ),
+        (
+            *("ledger: the damping's rate of strain", "locomotion/ledger.py"),
+            *("np.swapaxes(F0, 1, 2) @ F0) / (2.0 * dt)", "np.swapaxes(F0, 1, 2) @ F0) / (1.98 * dt)"),
+            "locomotion/test_ledger.py::test_every_step_closes",
+        ),
+        (
+            *("ledger: the curvature of the elastic energy", "locomotion/ledger.py"),
+            *("(self.mu - self.lam * along) * bend", "(self.mu + self.lam * along) * bend"),
+            "locomotion/test_ledger.py::test_every_step_closes",
+        ),
+        (
+            *("ledger: the half of what a turning muscle loses", "locomotion/ledger.py"),
+            *("turned = 0.5 * long", "turned = 0.6 * long"),
+            "locomotion/test_ledger.py::test_every_step_closes",
+        ),
+        (
+            *("ledger: the half of what the integrator takes of the inertia", "locomotion/ledger.py"),
+            *("-0.5 * _squared(mass, velocity - t.", "-0.51 * _squared(mass, velocity - t."),
+            "locomotion/test_ledger.py::test_every_step_closes",
+        ),
+        (
+            *("ledger: the arms of the torque that is taken off", "locomotion/ledger.py"),
+            *("given @ _momentum(mass, before, velocity)", "given @ _momentum(mass, after, t.velocities[step])"),
+            "locomotion/test_ledger.py::test_every_step_closes",
+        ),
+        (
+            *("ledger: the energy of the spin that is added", "locomotion/ledger.py"),
+            *("+ 0.5 * _inertia(mass, after) @ added", "+ 1.0 * _inertia(mass, after) @ added"),
+            "locomotion/test_ledger.py::test_every_step_closes",
+        ),
+        (
+            *("audit: friction against slip", "locomotion/audit.py"),
+            *('+ np.einsum("ci,ci->c", tangential, slip)', '- np.einsum("ci,ci->c", tangential, slip)'),
+            "locomotion/test_audit.py::test_a_run_that_slides_passes",
+        ),
+        (
+            *("audit: the gap at the end", "locomotion/audit.py"),
+            *("normal * np.maximum(_start_gaps(t) + along, 0.0)", "normal * np.maximum(_start_gaps(t), 0.0)"),
+            "locomotion/test_audit.py::test_a_run_that_slides_passes",
+        ),
+        (
+            *("audit: the torque of contact", "locomotion/audit.py"),
+            *("np.cross(_start_points(t) - com[t.contact_step]", "np.cross(_start_points(t)"),
+            "locomotion/test_audit.py::test_a_run_that_slides_passes",
+        ),
     ]
 ]
 """Formulas that the paper leaves open."""

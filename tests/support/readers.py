@@ -9,6 +9,7 @@ import gzip
 import io
 import json
 import struct
+import tempfile
 import time
 import zipfile
 from collections.abc import Callable
@@ -26,6 +27,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.io import read_cameras, read_capture
 from egs_warp.io.cameras import PosedImage, read_points
+from egs_warp.io.glb import write_glb
 from egs_warp.io.limits import FURTHEST, LONGEST_SIDE
 from egs_warp.io.onnx import read_onnx
 from egs_warp.io.photos import read_photo
@@ -35,7 +37,7 @@ from egs_warp.motions.keyframes import read_keyframes
 from egs_warp.motions.script import motion
 from egs_warp.muscles.files import read_muscles
 from tests.support import onnx
-from tests.support.captures import ARRAYS, good_bytes, small_cloud
+from tests.support.captures import ARRAYS, good_bytes, small_cloud, spz_of_streams
 from tests.support.meshes import block_mesh
 
 LONGEST = 2.0
@@ -267,12 +269,24 @@ def _zip_with_meta(meta: bytes) -> bytes:
     return data.getvalue()
 
 
+def _glb() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        write_glb(Path(folder) / "a.glb", small_cloud())
+        return (Path(folder) / "a.glb").read_bytes()
+
+
+def _spz_of_streams() -> bytes:
+    return spz_of_streams(gzip.decompress(good_bytes("a.spz")), 7, 9)
+
+
 READERS: tuple[Reader, ...] = (
     Reader("ply", "a.ply", lambda: good_bytes("a.ply"), _capture),
     Reader("text ply", "a.ply", _text_ply, _capture),
     Reader("compressed ply", "a.ply", lambda: good_bytes("b.ply"), _capture),
     Reader("spz", "a.spz", lambda: good_bytes("a.spz"), _capture),
     Reader("spz inside gzip", "a.spz", lambda: gzip.decompress(good_bytes("a.spz")), _capture, wrap=gzip.compress),
+    Reader("spz of streams", "a.spz", _spz_of_streams, _capture),
+    Reader("glb", "a.glb", _glb, _capture),
     Reader("splat", "a.splat", lambda: good_bytes("a.splat"), _capture),
     Reader("sog", "a.sog", lambda: good_bytes("a.sog"), _capture),
     Reader("sog meta", "a.sog", lambda: _sog()["meta.json"], _capture, wrap=_zip_with_meta, json=True),

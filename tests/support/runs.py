@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from egs_warp.fem.body import SoftBody
-from egs_warp.locomotion.rollout import simulate
+from egs_warp.locomotion.rollout import roll_out
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.script import motion
@@ -30,7 +30,7 @@ def coarse_block_run(script: str) -> Run:
     made = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD)
     asked = motion(script)
     sequence = MotionSequence(made.place, asked.parts(made.place.body.height))
-    done = simulate(
+    done = roll_out(
         made.stepper,
         made.stepper.geometry,
         made.start,

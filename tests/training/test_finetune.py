@@ -196,7 +196,7 @@ def test_photos_become_a_capture(data_dir: Path) -> None:
     )
     held_out, trained_on = result.mean_score(held_out=True), result.mean_score(held_out=False)
     assert held_out is not None and trained_on is not None
-    assert held_out[0] > 23.0
+    assert held_out.psnr > 23.0
     assert len(result.views) == len(result.scores) == 100
     assert sum(score.held_out for score in result.scores) == 13
 

@@ -33,7 +33,6 @@ _BROWSER = os.environ.get("EGS_WARP_BROWSER") or next(
 )
 pytestmark = [
     pytest.mark.browser,
-    pytest.mark.xdist_group("page"),
     pytest.mark.skipif(not PAGE.is_file(), reason="the page is not built; make web builds it"),
     pytest.mark.skipif(_BROWSER is None, reason="no Chromium; install it, or set EGS_WARP_BROWSER"),
 ]

@@ -19,10 +19,9 @@ from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.errors import UserError
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io import write_ply
-from egs_warp.web.page import PAGE
+from egs_warp.web.page import PAGE, page_text
 from egs_warp.web.recording import CURVES, Recording
 
-pytestmark = pytest.mark.xdist_group("page")
 needs_page = pytest.mark.skipif(not PAGE.is_file(), reason="the page is not built; make web builds it")
 
 
@@ -158,3 +157,9 @@ def test_a_folder_that_is_no_run_is_told_in_one_line(
 def test_three_runs_are_one_too_many(run_folder: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["view", *[str(run_folder)] * 3]) == 2
     assert "at most two runs" in capsys.readouterr().err
+
+
+def test_without_the_page_it_is_said_how_to_build_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("egs_warp.web.page.PAGE", tmp_path / "page.html")
+    with pytest.raises(UserError, match=r"page.html: the page is not built; run make web in the source tree"):
+        page_text()

@@ -18,10 +18,7 @@ from egs_warp.web.recording import Recording
 from egs_warp.web.server import LARGEST_MESSAGE, PageServer
 from tests.support.pages import RecordedFeed, served
 
-pytestmark = [
-    pytest.mark.xdist_group("page"),
-    pytest.mark.skipif(not PAGE.is_file(), reason="the page is not built; make web builds it"),
-]
+pytestmark = pytest.mark.skipif(not PAGE.is_file(), reason="the page is not built; make web builds it")
 
 
 @pytest.fixture(scope="module")

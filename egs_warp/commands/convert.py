@@ -1,0 +1,85 @@
+"""``egs-warp convert``: a capture, or numbered ones, in another format."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from egs_warp.commands.flags import Commands, named_path
+from egs_warp.commands.scene_flags import say
+from egs_warp.errors import UserError
+
+_KINDS = ("ply", "compressed-ply", "spz", "sog", "splat", "glb")
+
+
+EXAMPLES = (
+    "scan.ply scan.spz",
+    "scan.ply flat.splat --degree 0",
+    "frames spz_frames --to spz",
+)
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the subparsers ``commands``."""
+    convert = commands.add_parser("convert", help="write a capture in another format, and say what is lost")
+    convert.add_argument(
+        "capture",
+        metavar="in",
+        type=named_path,
+        help=".ply, compressed .ply, .spz, .splat, .sog, .glb, a SOG folder, or with --to a folder of numbered files",
+    )
+    convert.add_argument(
+        "out", type=named_path, help="by its ending .ply, .compressed.ply, .spz, .sog, .splat, .glb; with --to a folder"
+    )
+    convert.add_argument("--to", choices=_KINDS, help="write each of the numbered captures as this")
+    convert.add_argument("--degree", type=int, choices=(0, 1, 2, 3), help="bands of colour to keep (all)")
+    convert.set_defaults(run=_convert)
+
+
+def _convert(chosen: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
+    from egs_warp.geometry.gaussians import with_degree
+    from egs_warp.io import read_capture, writable_folder
+    from egs_warp.io.losses import losses
+    from egs_warp.io.sequence import numbered_captures
+    from egs_warp.io.writing import WRITERS, writer_of
+    from egs_warp.launching import use_device
+
+    if chosen.to is None:
+        write = writer_of(chosen.out)
+        # A long reading must not end in vain.
+        if not chosen.out.absolute().parent.is_dir():
+            raise UserError(f"{chosen.out}: its folder does not exist; create {chosen.out.parent} first")
+        if chosen.out.exists() and chosen.capture.exists() and chosen.out.samefile(chosen.capture):
+            raise UserError(f"{chosen.out}: is what is read; give another name")
+        pairs = [(chosen.capture, chosen.out)]
+    else:
+        ending, write = WRITERS[chosen.to]
+        sources = numbered_captures(chosen.capture)
+        if chosen.out.exists() and chosen.out.samefile(chosen.capture):
+            raise UserError(f"{chosen.out}: is the folder that is read; give another one")
+        folder = writable_folder(chosen.out)
+        pairs = [(source, folder / f"{source.name.split('.')[0]}{ending}") for source in sources]
+    use_device("cpu")
+    told = []
+    for source, target in tqdm(pairs, desc="convert", unit="file", disable=len(pairs) == 1, file=sys.stderr):
+        before = read_capture(source)
+        write(target, with_degree(before.cloud, chosen.degree))
+        if not told:
+            for note in before.notes:
+                say(f"{source}: {note}")
+            told = losses(before, read_capture(target))
+    size, was = (sum(_size(pair[k]) for pair in pairs) for k in (1, 0))
+    names = str(pairs[0][1]) if len(pairs) == 1 else f"{pairs[0][1]} to {pairs[-1][1].name}"
+    print(f"wrote {names} ({size / 1e6:.2f} MB from {was / 1e6:.2f} MB)")
+    for line in told:
+        print(f"  {line}" if len(pairs) == 1 else f"  of the first: {line}")
+    return 0
+
+
+def _size(path: Path) -> int:
+    return (
+        sum(file.stat().st_size for file in path.rglob("*") if file.is_file()) if path.is_dir() else path.stat().st_size
+    )

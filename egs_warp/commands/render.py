@@ -1,0 +1,56 @@
+"""``egs-warp render``: the film of a finished run again, from anywhere."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from egs_warp.commands.camera_flags import add_camera_flags, shot_of
+from egs_warp.commands.flags import Commands, named_path
+
+EXAMPLES = (
+    "out/jump --out close.mp4 --camera follow --size 1280x720",
+    "out/jump --out cut_out.mov --background transparent",
+    'out/jump --out turn.webm --turntable 40 --background "#204060"',
+    "out/jump --out depth --show depth",
+)
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the subparsers ``commands``."""
+    render = commands.add_parser("render", help="film a finished run again: any camera, any size, depth, alpha")
+    render.add_argument("folder", metavar="run", type=Path, help="folder that animate wrote")
+    render.add_argument(
+        "--out",
+        required=True,
+        type=named_path,
+        help=".mp4, .mov (ProRes 4444), .webm (VP9), or a folder of PNGs; all but .mp4 can be transparent",
+    )
+    camera = render.add_argument_group("camera")
+    add_camera_flags(camera, size="as the film's")
+    camera.add_argument(
+        "--turntable", type=int, metavar="FRAME", help="hold this frame (60 Hz, -1 is the last) and go around it once"
+    )
+    camera.add_argument(
+        "--show",
+        choices=("colour", "depth", "alpha"),
+        default="colour",
+        help="colour (default); depth, near is white, as PNG 16 bits of millimetres; alpha",
+    )
+    render.add_argument("--no-shadow", action="store_true", help="no shadow on the ground under the object")
+    render.set_defaults(run=_render)
+
+
+def _render(chosen: argparse.Namespace) -> int:
+    from egs_warp.launching import use_device
+    from egs_warp.pipelines.finished_run import FinishedRun
+    from egs_warp.pipelines.render_run import Show, render_run
+
+    shot, background = shot_of(chosen)
+    use_device("cpu")
+    run = FinishedRun.read(chosen.folder, background=Path(background) if background is not None else None)
+    count = render_run(
+        run, chosen.out, shot, show=Show(chosen.show), hold=chosen.turntable, shadow=not chosen.no_shadow
+    )
+    print(f"wrote {chosen.out} ({count} frames)")
+    return 0

@@ -1,0 +1,40 @@
+"""``egs-warp samples``: a small built-in capture and scene to try the commands on."""
+
+from __future__ import annotations
+
+import argparse
+
+from egs_warp.commands.flags import Commands, named_path
+
+_GAUSSIANS = 6000
+"""Of the object alone: a jump of it takes about half as long as that of the whole pawn."""
+
+
+EXAMPLES = ("out/samples",)
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the subparsers ``commands``."""
+    samples = commands.add_parser("samples", help="write a small built-in capture and scene to try")
+    samples.add_argument("folder", type=named_path, help="folder to write into, made where it is missing")
+    samples.set_defaults(run=_samples)
+
+
+def _samples(chosen: argparse.Namespace) -> int:
+    from egs_warp.assets import pawn, scene
+    from egs_warp.io import write_ply
+    from egs_warp.io.atomic import writable_folder
+    from egs_warp.io.run_folder import check_out
+    from egs_warp.launching import use_device
+
+    check_out(chosen.folder)
+    use_device("cpu")
+    folder = writable_folder(chosen.folder)
+    capture, whole = folder / "pawn.ply", folder / "pawn_on_its_board.ply"
+    made = scene("pawn")
+    write_ply(capture, pawn(gaussian_count=_GAUSSIANS).cloud)
+    write_ply(whole, made.whole()[0])
+    print(f"wrote {capture}, an object alone, and {whole}, the object in a scene; z is up; now try")
+    print(f"  egs-warp animate {capture} --up z --size 256 --out {folder / 'jump'}")
+    print(f"  egs-warp animate {whole} --up z --object 0,0,0.5 --size 256 --out {folder / 'scene'}")
+    return 0

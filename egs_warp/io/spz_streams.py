@@ -1,0 +1,100 @@
+"""The container of .spz version 4: a plain header of 32 bytes, extensions, a table, one Zstandard stream a quantity.
+
+Public description: README of https://github.com/nianticlabs/spz. The header begins as that of versions 1 to 3; its
+byte 15 counts the streams, the next four say where their table lies, twelve are reserved. A row of the table is two
+uint64: bytes compressed and not. Streams follow it in turn. Between header and table lie extensions, each a uint32 of
+its kind, one of its length, and that many bytes.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import zstandard
+
+from egs_warp.errors import UserError
+
+_HEADER = struct.Struct("<IIIBBBBI12x")
+_ROW = struct.Struct("<QQ")
+_RECORD = struct.Struct("<II")
+_LARGEST_WINDOW = 1 << 27
+"""Bytes of memory that a stream may ask for beside its output: what the usual tools write by default."""
+_COORDINATES = 0xADBE0003
+"""Extension SPZ_ADOBE_coordinate_system: a uint32 that says which way each axis points."""
+_AXES = (
+    *("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
+    *("LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"),
+)
+"""Where x, y and z point: left or right, up or down, forward or back."""
+
+
+def inflate_streams(data: bytes, sizes: Sequence[int], source: Path) -> bytes:
+    """The blocks of ``sizes`` bytes, one after another. Raises ``UserError`` where the file holds others.
+
+    Only as much is inflated as ``sizes`` says, so that a crafted file cannot fill the memory.
+    """
+    table, count = _table(data, source)
+    wanted = [size for size in sizes if size > 0]
+    if count != len(wanted):
+        raise UserError(f"{source}: .spz with {count} streams, expected {len(wanted)}; export it again")
+    end = table + count * _ROW.size
+    rows = [_ROW.unpack_from(data, table + k * _ROW.size) for k in range(count)]
+    blocks = []
+    for (packed, unpacked), size in zip(rows, wanted, strict=True):
+        if unpacked != size or end + packed > len(data):
+            raise UserError(
+                f"{source}: corrupt or truncated .spz: a stream of {packed} bytes for {unpacked}, of which {size} are"
+                f" needed and {len(data) - end} are there; copy or export it again"
+            )
+        try:
+            reader = zstandard.ZstdDecompressor(max_window_size=_LARGEST_WINDOW).stream_reader(data[end : end + packed])
+            block = reader.read(size)
+        except zstandard.ZstdError as error:
+            raise UserError(f"{source}: corrupted .spz data ({error}); copy or export the file again") from error
+        if len(block) != size:
+            raise UserError(f"{source}: truncated: a stream has {len(block)} of {size} bytes; copy it again")
+        blocks.append(block)
+        end += packed
+    return b"".join(blocks)
+
+
+def declared_up(data: bytes, source: Path) -> np.ndarray | None:
+    """(3,) up, where an extension says which way the axes point; None without one.
+
+    Raises ``UserError`` for axes that are left-handed: the capture would be its mirror image.
+    """
+    table, _ = _table(data, source)
+    place = _HEADER.size
+    while place + _RECORD.size <= table:
+        kind, size = _RECORD.unpack_from(data, place)
+        place += _RECORD.size
+        if kind == _COORDINATES and size == 4 and place + 4 <= table:
+            (number,) = struct.unpack_from("<I", data, place)
+            return _up_of(_AXES[number], source) if 0 < number < len(_AXES) else None
+        place += size
+    return None
+
+
+def _table(data: bytes, source: Path) -> tuple[int, int]:
+    """Where the table begins, and how many streams it has."""
+    if len(data) < _HEADER.size:
+        raise UserError(
+            f"{source}: truncated: .spz header of {len(data)} bytes, expected {_HEADER.size}; copy it again"
+        )
+    *_, count, table = _HEADER.unpack_from(data)
+    if table < _HEADER.size or table + count * _ROW.size > len(data):
+        raise UserError(f"{source}: corrupt or truncated .spz: its table lies outside of the file; copy it again")
+    return table, count
+
+
+def _up_of(axes: str, source: Path) -> np.ndarray:
+    signs = {letter: 1.0 if letter in "RUB" else -1.0 for letter in axes}
+    hand = np.prod([signs[letter] for letter in axes])
+    if axes[1] in "FB":
+        hand = -hand
+    if hand < 0:
+        raise UserError(f"{source}: .spz in left-handed axes ({axes}), which would be mirrored; export it in RUB")
+    return np.array([signs[letter] if letter in "UD" else 0.0 for letter in axes])

@@ -1,0 +1,94 @@
+"""Whether a run obeys its equations, from a trajectory's arrays alone; shares no code with the solver."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from egs_warp.locomotion.ledger import Ledger, ledger
+from egs_warp.locomotion.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class Audit:
+    """Maxima over all steps, as defined in docs/guide/report.md; all but the counts are dimensionless."""
+
+    momentum_residual: float
+    angular_momentum_residual: float
+    energy_residual: float
+    cone_violation: float
+    friction_gap: float
+    contact_velocity: float
+    penetration: float
+    complementarity_gap: float
+    inverted_elements: int
+    newton_unconverged: int
+
+
+def audit(trajectory: Trajectory, *, energy: Ledger | None = None, newton_unconverged: int = 0) -> Audit:
+    """Recompute every bound of the audit from the trajectory; ``energy`` is its ledger, if that is known."""
+    t = trajectory
+    unit = t.node_mass.sum() * np.linalg.norm(t.gravity) * t.height
+    linear, angular = _momentum_residuals(t)
+    normal = np.einsum("ci,ci->c", t.contact_force, t.contact_normal)
+    tangential = t.contact_force - normal[:, None] * t.contact_normal
+    rubbing = np.linalg.norm(tangential, axis=1)
+    stored, way = _contact_ways(t)
+    along = np.einsum("ci,ci->c", way, t.contact_normal)
+    slip = way - along[:, None] * t.contact_normal
+    # Coulomb: mu f_n |slip| + f_t . slip is nowhere negative, and zero where friction is all it can be and opposes
+    # slip, or where nothing slips.
+    friction_gap = np.abs(t.friction * normal * np.linalg.norm(slip, axis=1) + np.einsum("ci,ci->c", tangential, slip))
+    missed = np.linalg.norm(stored - way, axis=1) / t.dt[t.contact_step]
+    edges = t.positions[:, t.tets[:, 1:]] - t.positions[:, t.tets[:, :1]]
+    energy = energy or ledger(t)
+    return Audit(
+        momentum_residual=float(np.linalg.norm(linear, axis=1).max(initial=0.0) * t.height / unit),
+        angular_momentum_residual=float(np.linalg.norm(angular, axis=1).max(initial=0.0) / unit),
+        energy_residual=energy.worst,
+        cone_violation=float(np.maximum(rubbing - t.friction * normal, -normal).max(initial=0.0) * t.height / unit),
+        friction_gap=float(friction_gap.max(initial=0.0) / unit),
+        contact_velocity=float(missed[normal > 0.0].max(initial=0.0) / np.sqrt(np.linalg.norm(t.gravity) * t.height)),
+        penetration=float(max(-t.min_gap.min(), 0.0) / t.height),
+        complementarity_gap=float((normal * np.maximum(_start_gaps(t) + along, 0.0)).max(initial=0.0) / unit),
+        inverted_elements=int((np.linalg.det(edges) <= 0.0).sum()),
+        newton_unconverged=newton_unconverged,
+    )
+
+
+def _momentum_residuals(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """(F, 3) newtons and (F, 3) newton metres by which the two momenta change beside what acts from outside."""
+    mass = t.node_mass.sum()
+    com = np.einsum("n,fni->fi", t.node_mass, t.positions) / mass
+    momentum = np.einsum("n,fni->fi", t.node_mass, t.velocities)
+    arms = t.positions - com[:, None]
+    spin = np.einsum("n,fni->fi", t.node_mass, np.cross(arms, t.velocities))
+    force, torque = np.zeros((len(t.dt), 3)), np.zeros((len(t.dt), 3))
+    np.add.at(force, t.contact_step, t.contact_force)
+    np.add.at(torque, t.contact_step, np.cross(_start_points(t) - com[t.contact_step], t.contact_force))
+    dt = t.dt[:, None]
+    moved = np.diff(t.positions, axis=0) / dt[:, None]
+    drag_force = t.drag * np.einsum("n,fni->fi", t.node_mass, moved)
+    drag_torque = t.drag * np.einsum("n,fni->fi", t.node_mass, np.cross(arms[:-1], moved))
+    linear = np.diff(momentum, axis=0) / dt - mass * t.gravity - force + drag_force
+    return linear, np.diff(spin, axis=0) / dt - torque + drag_torque
+
+
+def _start_points(t: Trajectory) -> np.ndarray:
+    """(C, 3) metres: the contacts at the start of their steps."""
+    return np.einsum("cw,cwi->ci", t.contact_weights, t.positions[t.contact_step[:, None], t.contact_nodes])
+
+
+def _start_gaps(t: Trajectory) -> np.ndarray:
+    """(C,) metres from its plane to each contact at the start of its step."""
+    planes = t.planes[t.contact_plane]
+    return np.einsum("ci,ci->c", planes[:, :3], _start_points(t)) + planes[:, 3]
+
+
+def _contact_ways(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:
+    """(C, 3) metres that each contact goes in its step by the stored velocities of the end, and by the positions."""
+    after = t.contact_step + 1
+    velocities = np.einsum("cw,cwi->ci", t.contact_weights, t.velocities[after[:, None], t.contact_nodes])
+    ends = np.einsum("cw,cwi->ci", t.contact_weights, t.positions[after[:, None], t.contact_nodes])
+    return t.dt[t.contact_step, None] * velocities, ends - _start_points(t)

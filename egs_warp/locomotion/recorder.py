@@ -1,0 +1,154 @@
+"""Writes a simulation down as it goes, so that a run that is killed loses no more than its last steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from egs_warp.contact.detection import ContactGeometry, ContactSet
+from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.geometry.body_frame import BodyFrame
+from egs_warp.io.atomic import writable_folder
+from egs_warp.locomotion.stepper import StepReport
+from egs_warp.locomotion.trajectory import FIRST_PART, Trajectory, part_name, write_arrays
+from egs_warp.muscles.muscle_set import MuscleSet
+
+_STEPS_A_PART = 30
+
+
+class Recorder:
+    """Gathers the steps of one body; parts of them go to a folder as soon as they are full."""
+
+    def __init__(
+        self,
+        body: SoftBody,
+        muscles: MuscleSet,
+        geometry: ContactGeometry,
+        start: BodyState,
+        start_gap: float,
+        *,
+        drag: float,
+        frame: BodyFrame | None = None,
+        folder: Callable[[], Path] | None = None,
+    ) -> None:
+        """``start_gap``: smallest gap at ``start``, metres; ``frame``: where the body lies in its capture; ``folder``:
+        tells, once the first part is full, where the parts go; it is made where it is missing.
+        """
+        self._planes = np.array([[*plane.normal, plane.offset] for plane in geometry.planes])
+        self._folder, self._path = folder, None
+        self._steps = self._written = 0
+        self._last = start.positions
+        self._reports: list[StepReport] = []
+        self._parts = [self._first(body, muscles, geometry, start, start_gap, drag, frame)]
+
+    def add(self, reports: Sequence[StepReport]) -> None:
+        """Write down the next steps."""
+        self._reports += reports
+        if len(self._reports) >= _STEPS_A_PART:
+            self._parts.append(self._part())
+            self._write()
+
+    def trajectory(self) -> Trajectory:
+        """All steps so far."""
+        if self._reports:
+            self._parts.append(self._part())
+        if self._path is None:
+            return Trajectory.joined(self._parts)
+        self._write()
+        return Trajectory.load(self._path)
+
+    def _write(self) -> None:
+        if self._folder is None:
+            return
+        if self._path is None:
+            self._path = writable_folder(self._folder())
+            write_arrays(self._path / FIRST_PART, self._parts.pop(0))
+        for part in self._parts:
+            write_arrays(self._path / part_name(self._written), part)
+            self._written += 1
+        self._parts.clear()
+
+    def _first(
+        self,
+        body: SoftBody,
+        muscles: MuscleSet,
+        geometry: ContactGeometry,
+        start: BodyState,
+        start_gap: float,
+        drag: float,
+        frame: BodyFrame | None,
+    ) -> dict[str, np.ndarray]:
+        material = body.assembly.material
+        part = {
+            "time": np.array([start.time]),
+            "positions": start.positions[None],
+            "velocities": start.velocities[None],
+            "min_gap": np.array([start_gap]),
+            "rest_positions": body.mesh.nodes,
+            "tets": body.mesh.tets,
+            "node_mass": body.node_mass,
+            "gravity": body.gravity,
+            "planes": self._planes,
+            "solid_from_plane": geometry.solid_of_each_plane,
+            "friction": np.float64(geometry.friction),
+            "drag": np.float64(drag),
+            "young_modulus": np.float64(material.young_modulus),
+            "poisson_ratio": np.float64(material.poisson_ratio),
+            "damping_time": np.float64(material.damping_time),
+            "height": np.float64(body.height),
+            "muscle_end_starts": muscles.end_rows.indptr.astype(np.int32),
+            "muscle_end_nodes": muscles.end_rows.indices.astype(np.int32),
+            "muscle_end_weights": muscles.end_rows.data,
+            "muscle_segments": muscles.segments,
+            "muscle_rest_lengths": muscles.rest_lengths,
+            "muscle_stiffness": muscles.stiffness,
+            "dt": np.zeros(0),
+            "activations": np.zeros((0, muscles.segment_count)),
+            "contact_step": np.zeros(0, np.int32),
+            "contact_nodes": np.zeros((0, 4), np.int32),
+            "contact_weights": np.zeros((0, 4)),
+            "contact_plane": np.zeros(0, np.int32),
+            "contact_normal": np.zeros((0, 3)),
+            "contact_force": np.zeros((0, 3)),
+            "contact_gap": np.zeros(0),
+        }
+        if frame is not None:
+            part |= {
+                "body_axes": frame.axes,
+                "body_origin": frame.origin,
+                "metres_per_unit": np.float64(frame.scale),
+            }
+        return part
+
+    def _part(self) -> dict[str, np.ndarray]:
+        """The steps since the last part."""
+        reports, self._reports = self._reports, []
+        starts = [self._last, *(report.state.positions for report in reports)]
+        counts = [report.contacts.count for report in reports]
+        planes = [self._plane(report.contacts, start) for report, start in zip(reports, starts, strict=False)]
+        part = {
+            "time": np.array([report.state.time for report in reports]),
+            "positions": np.stack(starts[1:]),
+            "velocities": np.stack([report.state.velocities for report in reports]),
+            "min_gap": np.array([report.min_gap for report in reports]),
+            "dt": np.array([report.dt for report in reports]),
+            "activations": np.stack([report.activations for report in reports]),
+            "contact_step": np.repeat(np.arange(self._steps, self._steps + len(reports)), counts).astype(np.int32),
+            "contact_nodes": np.concatenate([report.contacts.nodes for report in reports]).astype(np.int32),
+            "contact_weights": np.concatenate([report.contacts.weights for report in reports]),
+            "contact_plane": np.concatenate(planes).astype(np.int32),
+            "contact_normal": np.concatenate([report.contacts.axes[:, 0] for report in reports]),
+            "contact_force": np.concatenate([np.einsum("na,nai->ni", r.forces, r.contacts.axes) for r in reports]),
+            "contact_gap": np.concatenate([report.end_gaps for report in reports]),
+        }
+        self._last, self._steps = starts[-1], self._steps + len(reports)
+        return part
+
+    def _plane(self, contacts: ContactSet, positions: np.ndarray) -> np.ndarray:
+        """(n,) the plane that each contact is held to: of those with its normal, that at its gap."""
+        points = np.einsum("nw,nwi->ni", contacts.weights, positions[contacts.nodes])
+        gaps = points @ self._planes[:, :3].T + self._planes[:, 3]
+        turned = np.abs(contacts.axes[:, None, 0] - self._planes[None, :, :3]).max(axis=2)
+        return np.argmin(np.abs(gaps - contacts.gaps[:, None]) + np.where(turned < 1e-9, 0.0, np.inf), axis=1)

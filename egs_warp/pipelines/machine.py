@@ -1,0 +1,208 @@
+"""What this machine offers to the package, and all kernels compiled before they are needed."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pkgutil
+import platform
+import re
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+from egs_warp import kernels
+from egs_warp.errors import UserError
+from egs_warp.io.video import ffmpeg_program
+from egs_warp.launching import available_threads
+from egs_warp.pipelines.report import MECHANICS, versions
+
+OPTIONAL = {
+    "torch": ("training, fine-tuning where it straddles the ground", "egs-warp[torch]"),
+    "pycolmap": ("egs-warp pose", "egs-warp[pose]"),
+    "usd-core": ("exports to USD", "egs-warp[usd]"),
+}
+"""What each package that may be missing is for, and what installs it."""
+_ENCODERS = {"libx264": "mp4", "prores_ks": "ProRes 4444", "libvpx-vp9": "WebM with alpha"}
+_LITTLE_MEMORY = 2**31
+"""Bytes: a scene of half a million Gaussians and its body take about as much."""
+_THREADS_OF_A_BLOCK = 256
+"""Warp's own, on a GPU; a file of kernels that is launched with others says so by ``BLOCK``."""
+
+
+@dataclass(frozen=True)
+class DeviceFacts:
+    """One device of Warp."""
+
+    alias: str
+    """``cpu``, ``cuda:0``, ..."""
+    name: str
+    free: int | None
+    """Bytes; None where the system does not tell."""
+    total: int | None
+    """Bytes."""
+    compiled: int
+    """Files of kernels that lie in the cache, compiled for this device from these very sources."""
+    files: int
+    """Files of kernels that it can run."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What was found, and what is to be done about it."""
+
+    system: str
+    versions: dict[str, str]
+    optional: dict[str, str | None]
+    """Versions of ``OPTIONAL``; None where one is missing."""
+    driver: str | None
+    """Newest CUDA that NVIDIA's driver serves; None without a driver."""
+    toolkit: str
+    """CUDA that Warp was built with."""
+    cores: int
+    devices: tuple[DeviceFacts, ...]
+    cache: Path
+    cache_bytes: int
+    ffmpeg: str | None
+    encoders: tuple[str, ...]
+    """Kinds of film that this ffmpeg writes."""
+    problems: tuple[str, ...]
+    """Without a cure of these nothing works."""
+    advice: tuple[str, ...]
+
+    def lines(self) -> list[str]:
+        """For the terminal."""
+        said = [f"system   {self.system}, {self.cores} cores"]
+        said.append(f"versions {', '.join(f'{name} {number}' for name, number in self.versions.items())}")
+        there = [f"{name} {number}" if number else f"no {name}" for name, number in self.optional.items()]
+        said.append(f"optional {', '.join(there)}")
+        driver = f"serves CUDA {self.driver}" if self.driver else "none"
+        said.append(f"driver   NVIDIA: {driver}; Warp was built with CUDA {self.toolkit}")
+        for device in self.devices:
+            memory = f"{_gib(device.free)} of {_gib(device.total)} GiB free"
+            said.append(f"device   {device.alias}: {device.name}, {memory}, kernels {device.compiled}/{device.files}")
+        said.append(f"cache    {self.cache} ({self.cache_bytes / 1e6:.0f} MB)")
+        said.append(f"ffmpeg   {self.ffmpeg or 'none'}{': ' if self.encoders else ''}{', '.join(self.encoders)}")
+        said += [f"problem  {line}" for line in self.problems]
+        return said + [f"to do    {line}" for line in self.advice]
+
+
+def inspect_machine() -> Machine:
+    """Look at everything; call ``use_device`` before. Nothing is installed, compiled or written but a probe."""
+    driver, toolkit = wp.get_cuda_driver_version(), wp.get_cuda_toolkit_version()
+    devices = tuple(_device_facts(device) for device in wp.get_devices())
+    cache = Path(wp.config.kernel_cache_dir or ".")
+    optional = {name: _version(name) for name in OPTIONAL}
+    problems, advice = [], []
+    if not os.access(cache, os.W_OK):
+        problems.append(f"kernel cache {cache}: cannot be written; set WARP_CACHE_PATH to a folder that can be")
+    ffmpeg, encoders = None, ()
+    try:
+        ffmpeg = ffmpeg_program()
+        encoders = _encoders(ffmpeg)
+    except UserError as error:
+        problems.append(error.told())
+    if len(devices) == 1:
+        advice.append("everything runs on the CPU; for device cuda:0 give this machine an NVIDIA GPU and its driver")
+    for device in devices:
+        if device.free is not None and device.free < _LITTLE_MEMORY:
+            advice.append(f"{device.alias} has little free memory: end other programs, or give smaller captures")
+    for name, (use, extra) in OPTIONAL.items():
+        if optional[name] is None:
+            advice.append(f'for {use}: pip install "{extra}"')
+    if not (Path(kernels.__file__).parents[1] / "web/page.html").is_file():
+        advice.append("for egs-warp view: run make web in the source tree (node 20 or newer), or install the wheel")
+    return Machine(
+        system=f"{platform.system()} {platform.release()} {platform.machine()}",
+        versions=versions(MECHANICS),
+        optional=optional,
+        driver=".".join(map(str, driver)) if driver else None,
+        toolkit=".".join(map(str, toolkit)) if toolkit else "none",
+        cores=available_threads(),
+        devices=devices,
+        cache=cache,
+        cache_bytes=sum(file.stat().st_size for file in cache.rglob("*") if file.is_file()),
+        ffmpeg=ffmpeg,
+        encoders=encoders,
+        problems=tuple(problems),
+        advice=tuple(advice),
+    )
+
+
+def compile_kernels(device: str, *, progress: Callable[[str, int, int], object] = lambda name, done, of: None) -> None:
+    """Compile every kernel of the package for ``device``, except those that lie in the cache.
+
+    ``progress`` is told each file before it begins, how many are done, and of how many. Call ``use_device`` before.
+    """
+    target: wp.Device = wp.get_device(device)
+    files = _kernel_files(target)
+    for done, file in enumerate(files):
+        progress(file.__name__.removeprefix(f"{kernels.__name__}."), done, len(files))
+        wp.load_module(file.__name__, device=target, block_dim=_block(file, target))
+    progress("all", len(files), len(files))
+
+
+def _kernel_files(device: wp.Device) -> list[Any]:
+    """Modules of kernels that ``device`` can run, by name."""
+    names = sorted(found.name for found in pkgutil.walk_packages(kernels.__path__, f"{kernels.__name__}."))
+    # What is written in CUDA is compiled for no CPU.
+    files = [importlib.import_module(name) for name in names if device.is_cuda or not name.endswith("_cuda")]
+    return [file for file in files if wp.get_module(file.__name__).kernels]
+
+
+def _block(file: Any, device: wp.Device) -> int:
+    return getattr(file, "BLOCK", _THREADS_OF_A_BLOCK) if device.is_cuda else 1
+
+
+def _device_facts(device: wp.Device) -> DeviceFacts:
+    files = _kernel_files(device)
+    folder = Path(wp.config.kernel_cache_dir or ".")
+    compiled = 0
+    for file in files:
+        name = wp.get_module(file.__name__).get_module_identifier(_block(file, device))
+        kinds = (".sm*.cubin", ".sm*.ptx") if device.is_cuda else (".o",)
+        compiled += any(any((folder / name).glob(f"*{kind}")) for kind in kinds)
+    free, total = (device.free_memory, device.total_memory) if device.is_cuda else _host_memory()
+    name = device.name if device.is_cuda else _processor()
+    return DeviceFacts(device.alias, name, free, total, compiled, len(files))
+
+
+def _host_memory() -> tuple[int | None, int | None]:
+    """Bytes that a program may still take, and all; Linux only."""
+    try:
+        lines = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
+        free, total = (1024 * int(lines[name].split()[0]) for name in ("MemAvailable", "MemTotal"))
+        return free, total
+    except (OSError, KeyError, ValueError):
+        return None, None
+
+
+def _processor() -> str:
+    try:
+        found = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    except OSError:
+        found = None
+    return found[1].strip() if found else platform.processor() or platform.machine()
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def _encoders(program: str) -> tuple[str, ...]:
+    done = subprocess.run(
+        [program, "-hide_banner", "-encoders"], stdin=subprocess.DEVNULL, capture_output=True, text=True
+    )
+    return tuple(kind for name, kind in _ENCODERS.items() if f" {name} " in done.stdout)
+
+
+def _gib(size: int | None) -> str:
+    return "?" if size is None else f"{size / 2**30:.1f}"

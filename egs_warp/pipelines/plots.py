@@ -1,0 +1,125 @@
+"""``plots.png``: a run over time, by its trajectory and ledger."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from egs_warp.io.atomic import atomic_write
+from egs_warp.locomotion.ledger import Ledger
+from egs_warp.locomotion.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_STORED = {
+    "potential": "potential",
+    "elastic": "elastic",
+    "kinetic_com": "kinetic: centre of mass",
+    "kinetic_rotation": "kinetic: rotation",
+    "kinetic_deformation": "kinetic: deformation",
+}
+_FLOWS = {
+    "muscles": ("muscles",),
+    "damping": ("damping",),
+    "friction": ("friction",),
+    "contact and push-out": ("contact", "push_out"),
+    "air": ("drag",),
+    "lost by the integrator": ("lost_inertia", "lost_elastic", "lost_muscle", "lost_damping"),
+    "spin given back": ("spin_inside", "spin_after"),
+}
+_LOUDEST = 99.0
+"""Percentile of the tensions at which their colours end."""
+
+
+def draw_plots(path: Path, trajectory: Trajectory, ledger: Ledger) -> None:
+    """Energies and their flows, the load on the ground, the centre of mass beside its plan, and the muscles' pull."""
+    # Takes a quarter of a second to import.
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12.0, 12.0), layout="constrained")
+    panels = figure.subplots(3, 2)
+    _draw_stored(panels[0, 0], trajectory, ledger)
+    _draw_flows(panels[0, 1], trajectory, ledger)
+    _draw_load(panels[1, 0], trajectory)
+    _draw_residual(panels[1, 1], trajectory, ledger)
+    _draw_centre(panels[2, 0], trajectory)
+    _draw_muscles(panels[2, 1], trajectory)
+    for axes in panels.flat:
+        axes.set_xlabel("s")
+        axes.set_xlim(trajectory.time[0], max(trajectory.time[-1], trajectory.time[0] + 1e-9))
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=100, format="png")
+
+
+def _draw_stored(axes: Axes, t: Trajectory, ledger: Ledger) -> None:
+    for name, label in _STORED.items():
+        values = getattr(ledger, name)
+        axes.plot(t.time, (values - (values[0] if name == "potential" else 0.0)) / ledger.unit, label=label)
+    axes.set_title("Energy in the body, over m g H")
+    axes.legend(fontsize="small")
+
+
+def _draw_flows(axes: Axes, t: Trajectory, ledger: Ledger) -> None:
+    total = np.zeros(len(t.time))
+    for label, names in _FLOWS.items():
+        flow = np.concatenate([[0.0], np.sum([getattr(ledger, name) for name in names], axis=0).cumsum()])
+        total += flow
+        axes.plot(t.time, flow / ledger.unit, label=f"{label} {flow[-1] / ledger.unit:+.2f}")
+    axes.plot(t.time, total / ledger.unit, "k", linewidth=2.0, label="sum")
+    axes.plot(t.time, (ledger.stored - ledger.stored[0]) / ledger.unit, "w--", linewidth=1.0, label="gained")
+    axes.set_title("Energy given and taken since the start, over m g H")
+    axes.legend(fontsize="small", facecolor="0.85", ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.14))
+
+
+def _draw_load(axes: Axes, t: Trajectory) -> None:
+    normal = np.einsum("ci,ci->c", t.contact_force, t.contact_normal)
+    rubbing = np.linalg.norm(t.contact_force - normal[:, None] * t.contact_normal, axis=1)
+    weight = t.node_mass.sum() * np.linalg.norm(t.gravity)
+    for force, label in ((normal, "normal"), (rubbing, "friction")):
+        load = np.bincount(t.contact_step, force, minlength=len(t.dt)) / weight
+        axes.stairs(load, t.time, label=label)
+    axes.set_title("Load on the ground, body weights")
+    axes.legend(fontsize="small")
+
+
+def _draw_residual(axes: Axes, t: Trajectory, ledger: Ledger) -> None:
+    residual = np.abs(ledger.residual)
+    axes.stairs(np.maximum(residual, 1e-17), t.time, label="what a step misses", baseline=1e-17)
+    axes.axhline(1e-6, color="k", linestyle=":", label="bound")
+    axes.set_yscale("log")
+    axes.set_title(f"Ledger: closes to {residual.max(initial=0.0):.1e} of m g H")
+    axes.legend(fontsize="small")
+
+
+def _draw_centre(axes: Axes, t: Trajectory) -> None:
+    up = -t.gravity / np.linalg.norm(t.gravity)
+    com = np.einsum("n,fni->fi", t.node_mass, t.positions) / t.node_mass.sum()
+    moved = com[-1] - com[0]
+    level = moved - (moved @ up) * up
+    length = np.linalg.norm(level)
+    ahead = level / length if length > 1e-3 * t.height else np.zeros(3)
+    for direction, label, colour in ((up, "up", "C0"), (ahead, "ahead", "C1")):
+        axes.plot(t.time, (com - com[0]) @ direction / t.height, colour, label=label)
+        if len(t.planned_com):
+            axes.plot(
+                t.time, (t.planned_com - com[0]) @ direction / t.height, colour, linestyle="--", label=f"{label}, plan"
+            )
+    axes.set_title("Centre of mass since the start, body heights")
+    axes.legend(fontsize="small")
+
+
+def _draw_muscles(axes: Axes, t: Trajectory) -> None:
+    pull = (t.activations * t.muscle_stiffness).T / (t.node_mass.sum() * np.linalg.norm(t.gravity))
+    axes.set_title("Pull of the muscle segments, body weights")
+    axes.set_ylabel("segment")
+    if pull.size == 0:
+        return
+    reach = max(float(np.percentile(np.abs(pull), _LOUDEST)), 1e-9)
+    rows = np.arange(len(pull) + 1)
+    mesh = axes.pcolormesh(t.time, rows, pull, cmap="RdBu_r", vmin=-reach, vmax=reach, rasterized=True)
+    figure = axes.get_figure()
+    assert figure is not None
+    figure.colorbar(mesh, ax=axes)

@@ -1,0 +1,106 @@
+"""The film of a finished run again: through any camera, at any size, in colour, depth or alpha."""
+
+from __future__ import annotations
+
+import contextlib
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from egs_warp.errors import ArgumentError, UserError
+from egs_warp.io.atomic import writable_folder
+from egs_warp.io.video import VideoWriter, write_png
+from egs_warp.pipelines.film import Frame, drawn_frames
+from egs_warp.pipelines.finished_run import FinishedRun
+from egs_warp.pipelines.shot import Shot, around, resized, turntable
+
+_MILLIMETRES = 1000.0
+
+
+class Show(Enum):
+    """What a picture shows of the creature."""
+
+    COLOUR = "colour"
+    DEPTH = "depth"
+    """Grey, white at the nearest of the whole film; as PNG 16 bits of millimetres, 0 where there is nothing."""
+    ALPHA = "alpha"
+    """Grey: how much light the creature keeps from what is behind it."""
+
+
+def render_run(
+    run: FinishedRun,
+    out: Path,
+    shot: Shot,
+    *,
+    show: Show = Show.COLOUR,
+    hold: int | None = None,
+    shadow: bool = True,
+    quiet: bool = False,
+) -> int:
+    """Write a video (.mp4, .mov, .webm), or a folder of PNGs where ``out`` has no ending; returns how many frames.
+
+    ``hold``: this frame at 60 Hz alone, and the camera goes around it once. The same arguments give the same pictures.
+    Raises ``UserError`` for a frame that the run does not have, and a name or shot that does not fit the other.
+    """
+    folder = out.suffix == ""
+    if shot.transparent and (show is not Show.COLOUR or (not folder and out.suffix.lower() == ".mp4")):
+        advice = "give a .mov, a .webm or a folder" if show is Show.COLOUR else "leave out what to show besides colour"
+        raise ArgumentError("background", f"H.264, depth and alpha have no transparency; {advice}", value="transparent")
+    t = run.trajectory
+    if hold is None:
+        steps = shot.steps(t.time)
+        cameras = shot.cameras(run.creature.camera, t, steps)
+    else:
+        count = len(run.steps)
+        if not -count <= hold < count:
+            raise ArgumentError("turntable", f"the run has {count} frames; give 0 to {count - 1}, or -1", value=hold)
+        steps = np.full(turntable(shot.fps), run.steps[hold])
+        base = resized(run.creature.camera, *(shot.size or (run.creature.camera.width, run.creature.camera.height)))
+        cameras = around(base, t.positions[steps[:1]], count=len(steps))
+    frames = drawn_frames(run.deformer(), t, steps, cameras, shot, scene=run.scene, shadow=shadow)
+    corners = t.positions[steps] if hold is None else t.positions[steps[:1]]
+    near, far = _depths(corners.reshape(-1, 3), cameras) if show is Show.DEPTH else (0.0, 1.0)
+    with contextlib.ExitStack() as stack:
+        if folder:
+            place, video = writable_folder(out), None
+        else:
+            width, height = cameras[0].width, cameras[0].height
+            writer = VideoWriter(out, width, height, frames_per_second=shot.fps, alpha=shot.transparent)
+            place, video = out, stack.enter_context(writer)
+        bar = stack.enter_context(tqdm(total=len(steps), desc="render", unit="frame", disable=quiet))
+        for index, frame in enumerate(frames):
+            if video is not None:
+                video.write(_picture(frame, show, near, far))
+            elif show is Show.DEPTH:
+                write_png(place / f"frame{index:04d}.png", _millimetres(frame))
+            else:
+                write_png(place / f"frame{index:04d}.png", _picture(frame, show, near, far))
+            bar.update()
+    return len(steps)
+
+
+def _picture(frame: Frame, show: Show, near: float, far: float) -> np.ndarray:
+    if show is Show.COLOUR:
+        return frame.picture()
+    alpha = frame.image.alpha.numpy()
+    grey = alpha if show is Show.ALPHA else alpha * np.clip((far - frame.image.depth.numpy()) / (far - near), 0.0, 1.0)
+    return np.repeat(np.rint(255.0 * np.clip(grey, 0.0, 1.0)).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def _millimetres(frame: Frame) -> np.ndarray:
+    """(H, W) uint16, 0 where less than half of the light is kept."""
+    there = frame.image.alpha.numpy() > 0.5
+    return np.where(there, np.clip(np.rint(_MILLIMETRES * frame.image.depth.numpy()), 1, 65535), 0).astype(np.uint16)
+
+
+def _depths(points: np.ndarray, cameras: list) -> tuple[float, float]:
+    """Least and greatest z-depth of the nodes ``points`` (n, 3) in any of the cameras."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    depths = np.concatenate([(corners - camera.centre) @ camera.rotation[2] for camera in cameras])
+    if depths.max() <= 0.0:
+        raise UserError("camera: the creature is behind it all the time; turn it round")
+    near = max(float(depths.min()), 0.0)
+    return near, max(float(depths.max()), near + 1e-6)

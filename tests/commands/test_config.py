@@ -1,0 +1,120 @@
+"""A run from the file that another run wrote is that run; bad files are one line."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import yaml
+
+from egs_warp import cli
+from egs_warp.assets import pawn
+from egs_warp.commands import COMMANDS
+from egs_warp.commands.config import with_config, write_config
+from egs_warp.io import write_ply
+
+
+def test_a_run_from_its_file_has_the_same_bits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=4000).cloud)
+    flags = ["--up", "z", "--frames", "4", "--size", "48x32", "--camera", "follow", "--background", "#204060"]
+    assert cli.main(["animate", str(tmp_path / "pawn.ply"), *flags, "--out", str(tmp_path / "a")]) == 0
+    again = ["animate", "--config", str(tmp_path / "a" / "run.yaml"), "--out", str(tmp_path / "b")]
+    assert cli.main(again) == 0
+    for name in ("jump.mp4", "sheet.png", "trajectory.npz", "creature.npz", "run.yaml"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
+    assert '"run.yaml"' in (tmp_path / "a" / "manifest.json").read_text()
+    assert "is not the file" not in capsys.readouterr().err
+    write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=4100).cloud)
+    assert cli.main([*again[:-1], str(tmp_path / "c"), "--frames", "2"]) == 0
+    assert "is not the file that the run of" in capsys.readouterr().err
+    assert yaml.safe_load((tmp_path / "c" / "run.yaml").read_text())["frames"] == 2
+
+
+def _given(arguments: list[str]) -> dict:
+    parser, commands = cli._parsers()
+    return vars(parser.parse_args(["animate", *with_config(arguments, commands["animate"]), "--out", "x"]))
+
+
+def test_files_are_relative_to_the_file_and_flags_go_before_it(tmp_path: Path) -> None:
+    (tmp_path / "here").mkdir()
+    for name in ("a.ply", "steps.json", "bow.csv", "fixed"):
+        (tmp_path / "here" / name).write_text("")
+    config = tmp_path / "here" / "run.yaml"
+    config.write_text(
+        "capture: a.ply\nterrain: steps.json\nmotion: trajectory bow.csv\nfriction: 0.3\nno-shadow: true\n"
+        "up: -y\nobject: 0,0,1\ncamera: fixed\nno_inpaint: false\ndistance: null\n"
+    )
+    given = _given(["--config", str(config)])
+    here = tmp_path / "here"
+    assert given["capture"] == str(here / "a.ply") and given["terrain"] == here / "steps.json"
+    assert given["motion"] == f"trajectory {here / 'bow.csv'}"
+    assert (given["friction"], given["no_shadow"], given["no_inpaint"], given["distance"]) == (0.3, True, False, None)
+    assert (given["up"], given["object"], given["camera"]) == ("-y", "0,0,1", "fixed")
+    other = _given(["other.ply", "--config", str(config), "--friction", "0.7"])
+    assert (other["capture"], other["friction"]) == ("other.ply", 0.7)
+
+
+def test_what_is_written_is_what_was_given(tmp_path: Path) -> None:
+    parser, commands = cli._parsers()
+    flags = ["a.ply", "--up=-y", "--motion", "hop x3, twist 180", "--view-from=-1,0,.5", "--frames", "9", "--no-shadow"]
+    chosen = parser.parse_args(["animate", *flags, "--out", "x"])
+    write_config(tmp_path / "run.yaml", chosen, commands["animate"])
+    again = parser.parse_args(
+        ["animate", *with_config(["--config", str(tmp_path / "run.yaml")], commands["animate"]), "--out", "x"]
+    )
+    assert vars(again) | {"config": None} == vars(chosen)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("speed: 3", "unknown key 'speed'; give some of background, camera,"),
+        ("trust: true", "unknown key 'trust'"),
+        ("motion: [jump]", "motion is ['jump']; give a text or a number"),
+        ("motion: true", "motion is True; give a text or a number"),
+        ("no-shadow: 3", "no-shadow is 3; give true"),
+        ("frames: many", "argument --frames: invalid int value: 'many'"),
+        ("seed: 2026-01-01", "seed is datetime.date(2026, 1, 1); give a text"),
+        ("- jump", "no keys and values"),
+        ("", "no keys and values"),
+        ("a: [", "not YAML"),
+        ("motion: !!python/object/apply:os.system [id]", "not YAML"),
+        ("a: " + "[" * 5000, "not YAML"),
+    ],
+)
+def test_bad_files_are_one_line(text: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "run.yaml").write_text(text)
+    flags = ["animate", "a.ply", "--config", str(tmp_path / "run.yaml"), "--out", str(tmp_path / "out")]
+    try:
+        status = cli.main(flags)
+    except SystemExit as stop:
+        status = stop.code
+    error = capsys.readouterr().err
+    assert status == 2 and said in error and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["animate", "--config", str(tmp_path / "none.yaml"), "--out", "x"]) == 2
+    assert "none.yaml: no such file" in capsys.readouterr().err
+
+
+def test_help_names_every_command_and_its_examples_are_valid(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["--help"])
+    said = capsys.readouterr().out
+    assert stop.value.code == 0 and "exit status:" in said and max(map(len, said.splitlines())) <= 100
+    for name in COMMANDS:
+        assert re.search(rf"^  {name} +\S", said, re.MULTILINE)
+    parser, commands = cli._parsers()
+    for line in re.findall(r"^  egs-warp (?!COMMAND)(.+)$", said, re.MULTILINE):
+        parser.parse_args(shlex.split(line))
+    for name in COMMANDS:
+        text = commands[name].format_help()
+        examples = re.findall(rf"^  egs-warp {name}(.*)$", text, re.MULTILINE)
+        assert examples and "exit status:" in text
+        for example in examples:
+            if "--config" not in example:
+                parser.parse_args([name, *cli._joined(shlex.split(example))])

@@ -1,0 +1,63 @@
+"""What ``egs-warp doctor`` says is so, and what it compiles is all that a run needs."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+from egs_warp.cli import main
+from egs_warp.errors import UserError
+from egs_warp.io.video import ffmpeg_program
+from egs_warp.pipelines import machine
+
+
+def test_it_names_device_versions_memory_and_cache(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor"]) == 0
+    said = capsys.readouterr().out
+    assert f"warp-lang {wp.__version__}" in said and "device   cpu: " in said and "GiB free" in said
+    assert str(wp.config.kernel_cache_dir) in said and ffmpeg_program() in said and "mp4" in said
+
+
+def test_without_ffmpeg_it_says_so_and_ends_with_1(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def none() -> str:
+        raise UserError("no ffmpeg, so no video could be written (gone); pip install imageio-ffmpeg")
+
+    monkeypatch.setattr(machine, "ffmpeg_program", none)
+    assert main(["doctor"]) == 1
+    assert "problem  no ffmpeg, so no video could be written (gone); pip install" in capsys.readouterr().out
+
+
+def test_an_unknown_device_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--device", "tpu"]) == 2
+    error = capsys.readouterr().err
+    assert "--device tpu: this machine has cpu" in error and error.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_after_warm_a_run_compiles_nothing(tmp_path: Path) -> None:
+    """In a cache of its own: what lies there after the run lay there before."""
+    environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache")}
+
+    def run(*flags: str) -> str:
+        command = [sys.executable, "-m", "egs_warp.cli", *flags]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=400).stdout
+
+    before = run("doctor")
+    assert "kernels 0/" in before and "wait to be compiled for cpu" in before
+    warm = run("doctor", "--warm")
+    assert "wait to be compiled" not in warm
+    there = {path for path in (tmp_path / "cache").rglob("*.o")}
+    code = (
+        "import sys; from egs_warp.assets.pawn import pawn; from egs_warp.pipelines.animate import *;"
+        "made = pawn(gaussian_count=4000);"
+        "animate(made.cloud, sys.argv[1], plane=made.plane, options=AnimateOptions(frames=2, size=32), quiet=True)"
+    )
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "out")], env=environment, check=True, timeout=400)
+    assert {path for path in (tmp_path / "cache").rglob("*.o")} == there

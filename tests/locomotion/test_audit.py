@@ -1,0 +1,120 @@
+"""Each bound of the audit, kept and broken on purpose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from egs_warp.locomotion.audit import audit
+from egs_warp.locomotion.trajectory import Trajectory
+from tests.support.flights import rigid_flight
+from tests.support.places import DT
+from tests.support.slides import STEPPERS, slide
+
+
+@pytest.fixture
+def flight() -> Trajectory:
+    return rigid_flight()
+
+
+def test_ballistic_flight_passes(flight: Trajectory) -> None:
+    result = audit(flight)
+    assert result.momentum_residual < 1e-10
+    assert result.angular_momentum_residual < 1e-10
+    assert result.penetration == result.cone_violation == result.complementarity_gap == 0.0
+    assert result.inverted_elements == 0
+
+
+def test_each_violation_is_seen(flight: Trajectory) -> None:
+    """A known error in each quantity comes back as the number its definition says."""
+    weight = flight.node_mass.sum() * 9.81
+    kicked = flight.velocities.copy()
+    kicked[7:] += [0.0, 0.01, 0.0]
+    assert audit(replace(flight, velocities=kicked)).momentum_residual == pytest.approx(0.01 / DT / 9.81, rel=1e-9)
+    com = np.einsum("n,fni->fi", flight.node_mass, flight.positions) / flight.node_mass.sum()
+    turned = flight.velocities.copy()
+    turned[7:] += np.cross([0.0, 0.02, 0.0], flight.positions[7:] - com[7:, None])
+    arms = flight.positions[7] - com[7]
+    spin = (flight.node_mass[:, None] * np.cross(arms, np.cross([0.0, 0.02, 0.0], arms))).sum(0)
+    seen = audit(replace(flight, velocities=turned)).angular_momentum_residual
+    assert seen == pytest.approx(np.linalg.norm(spin) / DT / weight, rel=0.05)
+    pushed = replace(
+        flight,
+        contact_step=np.array([3], np.int32),
+        contact_nodes=np.array([[0, 1, 2, 3]], np.int32),
+        contact_weights=np.full((1, 4), 0.25),
+        contact_plane=np.zeros(1, np.int32),
+        contact_normal=np.array([[0.0, 0.0, 1.0]]),
+        contact_force=np.array([[weight, 0.0, weight]]),
+        contact_gap=np.array([0.01]),
+    )
+    result = audit(pushed)
+    assert result.cone_violation == pytest.approx(0.2)
+    # The four nodes come down with the block, in the air.
+    end = flight.positions[4, :4, 2].mean()
+    assert result.complementarity_gap == pytest.approx(end)
+    assert result.momentum_residual == pytest.approx(np.sqrt(2.0))
+    assert audit(replace(flight, min_gap=flight.min_gap - 0.03)).penetration == pytest.approx(0.03)
+    flipped = flight.positions.copy()
+    flipped[5] *= [1.0, 1.0, -1.0]
+    assert audit(replace(flight, positions=flipped)).inverted_elements == len(flight.tets)
+
+
+@pytest.mark.parametrize("name", STEPPERS)
+def test_a_run_that_slides_passes(name: str) -> None:
+    """Of the two-stage stepper all but the spin that it adds after the step, which contacts did not know of."""
+    result = audit(slide(name).trajectory())
+    assert result.momentum_residual < 1e-8 and result.angular_momentum_residual < 1e-8
+    assert result.energy_residual < 1e-9
+    assert result.cone_violation < 1e-9 and result.friction_gap < 1e-7 and result.complementarity_gap < 1e-7
+    furthest = max(report.added_spin for report in slide(name).reports) * 1.0 / np.sqrt(9.81)
+    assert result.contact_velocity < (1e-12 if name == "coupled" else furthest)
+    assert result.newton_unconverged == result.inverted_elements == 0 and result.penetration < 5e-3
+
+
+def sliding(t: Trajectory) -> np.ndarray:
+    """The contacts whose friction does most work."""
+    way = np.diff(t.positions, axis=0)[t.contact_step[:, None], t.contact_nodes]
+    moved = np.einsum("cw,cwi->ci", t.contact_weights, way)
+    level = t.contact_force * [1.0, 1.0, 0.0]
+    return np.argsort(np.einsum("ci,ci->c", level, moved))[:5]
+
+
+def test_friction_that_pushes_is_seen() -> None:
+    """Turned about, at a right angle, and half as much as there is: all within the cone."""
+    t = slide("coupled").trajectory()
+    for turn in (np.diag([-1.0, -1.0, 1.0]), np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), np.diag([0.5, 0.5, 1.0])):
+        forces = t.contact_force.copy()
+        forces[sliding(t)] = forces[sliding(t)] @ turn.T
+        wrong = audit(replace(t, contact_force=forces))
+        assert wrong.friction_gap > 1e-5 and wrong.cone_violation < 1e-12
+
+
+def test_a_contact_that_pulls_over_a_gap_is_seen() -> None:
+    """All contacts lifted off their plane by 1 mm."""
+    t = slide("coupled").trajectory()
+    normal = (t.contact_force * t.contact_normal).sum(axis=1)
+    lifted = replace(t, planes=t.planes - [0.0, 0.0, 0.0, -1e-3])
+    weight = t.node_mass.sum() * 9.81
+    assert audit(lifted).complementarity_gap == pytest.approx(normal.max() * 1e-3 / weight, rel=0.01)
+
+
+def test_contact_velocities_that_were_not_solved_for_are_seen() -> None:
+    """1 mm/s across, in one step."""
+    t = slide("coupled").trajectory()
+    velocities = t.velocities.copy()
+    velocities[t.contact_step[0] + 1] += [0.0, 1e-3, 0.0]
+    assert audit(replace(t, velocities=velocities)).contact_velocity == pytest.approx(1e-3 / np.sqrt(9.81), rel=1e-6)
+
+
+def test_lost_momenta_are_seen_where_contact_and_drag_act() -> None:
+    """Contact forces 1 % too large; drag of twice as much; a spin of 0.01 rad/s that nothing turned."""
+    t = slide("coupled").trajectory()
+    assert audit(replace(t, contact_force=1.01 * t.contact_force)).momentum_residual > 1e-3
+    assert audit(replace(t, drag=2.0 * t.drag)).momentum_residual > 1e-3
+    arms = t.positions[-1] - t.node_mass @ t.positions[-1] / t.node_mass.sum()
+    spun = np.concatenate([t.velocities[:-1], t.velocities[-1:] + np.cross([0.0, 0.0, 0.01], arms)])
+    found = audit(replace(t, velocities=spun))
+    assert found.angular_momentum_residual > 1e-4 and found.momentum_residual < 1e-8

@@ -1,0 +1,110 @@
+"""The program over activations alone: what it plans is what exact Coulomb contact answers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.contact.coulomb import coulomb_forces
+from egs_warp.locomotion.contact_pieces import (
+    FREE,
+    SLIDE,
+    STICK,
+    ContactModes,
+    ContactPieces,
+    search_pieces,
+    solve_piece,
+)
+from egs_warp.locomotion.solvers import QpSolver
+
+FRICTION = 0.6
+CONTACTS = 3
+
+
+def random_program(seed: int) -> ContactPieces:
+    """Two activations and three contacts of a random stiff body, costs of a few squares of velocities."""
+    rng = np.random.default_rng(seed)
+    to_velocity = rng.standard_normal((12, 2 + 3 * CONTACTS))
+    half = rng.standard_normal((12, 12))
+    inverse = half @ half.T / 12.0 + 0.5 * np.eye(12)
+    frame = rng.standard_normal((3 * CONTACTS, 12))
+    to_velocity[:, 2:] = inverse @ frame.T
+    base = rng.standard_normal(12)
+    goals = rng.standard_normal((4, 12))
+    target = 0.5 * rng.standard_normal(4)
+    rows, gap = goals @ to_velocity, goals @ base - target
+    P = 2.0 * rows.T @ rows + np.diag([0.02, 0.02] + [0.0] * 3 * CONTACTS)
+    return ContactPieces(
+        *(P, 2.0 * rows.T @ gap, float(gap @ gap), frame @ to_velocity, frame @ base, FRICTION),
+        *(-np.ones(2), np.ones(2)),
+    )
+
+
+def under(program: ContactPieces, activations: np.ndarray) -> np.ndarray:
+    """x of ``activations`` (2,) and the forces of exact contact."""
+    free = program.offset + program.rows[:, :2] @ activations
+    forces, residual = coulomb_forces(
+        program.rows[:, 2:], free, np.zeros(CONTACTS), FRICTION, np.zeros((CONTACTS, 3)), tolerance=1e-12
+    )
+    assert residual < 1e-9
+    return np.concatenate([activations, forces.ravel()])
+
+
+def started(program: ContactPieces) -> tuple[np.ndarray, ContactModes]:
+    start = under(program, np.zeros(2))
+    velocities = (program.rows @ start + program.offset).reshape(-1, 3)
+    return start, ContactModes.of(start[2:].reshape(-1, 3), velocities, FRICTION)
+
+
+@pytest.mark.parametrize("solver", [QpSolver.OSQP, QpSolver.DAQP])
+def test_the_search_ends_where_no_activations_near_by_do_better(solver: QpSolver) -> None:
+    """Against exact contact for activations all round the end, and far better than the start.
+
+    Contacts that slide are taken to go on the way they went; where such large activations turn them, some is left.
+    """
+    if solver is QpSolver.DAQP:
+        pytest.importorskip("daqp")
+    turns = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    around = 0.03 * np.column_stack([np.cos(turns), np.sin(turns)])
+    best = gained = 0
+    for seed in range(12):
+        program = random_program(seed)
+        start, modes = started(program)
+        found = search_pieces(program, start, modes, qp_limit=20, solver=solver)
+        assert found.x is not None and found.qp_count <= 20
+        first, reached = (program.objective(x) for x in (start, under(program, found.x[:2])))
+        assert reached <= first + 1e-6
+        others = [program.objective(under(program, np.clip(found.x[:2] + step, -1.0, 1.0))) for step in around]
+        assert first - reached >= 0.85 * (first - found.objective)
+        best += min(others) > reached - 0.02 * (first - reached) - 1e-6
+        gained += reached < first - 1e-3
+    assert best >= 7 and gained >= 10
+
+
+def test_within_a_piece_the_plan_is_what_contact_answers() -> None:
+    """Forces and objective of a piece's optimum are those of exact contact, up to the sliding directions that turn."""
+    kinds = set()
+    for seed in range(12):
+        program = random_program(seed)
+        start, modes = started(program)
+        kinds |= set(modes.kind.tolist())
+        if (modes.kind == SLIDE).any():
+            continue
+        solution = solve_piece(program, start, modes, QpSolver.OSQP)
+        assert solution is not None
+        exact = under(program, solution.x[:2])
+        assert np.allclose(solution.x, exact, atol=2e-3 * max(1.0, np.abs(exact).max()))
+    assert kinds == {FREE, STICK, SLIDE}
+
+
+def test_a_piece_holds_its_start() -> None:
+    """The piece of a point's own modes gives that point's forces back, sliding contacts included."""
+    for seed in range(12):
+        program = random_program(seed)
+        start, modes = started(program)
+        held = ContactPieces(
+            *(program.P, program.q, program.constant, program.rows, program.offset, FRICTION), start[:2], start[:2]
+        )
+        solution = solve_piece(held, start, modes, QpSolver.OSQP)
+        assert solution is not None
+        assert np.allclose(solution.x, start, atol=1e-5 * max(1.0, np.abs(start).max()))

@@ -1,0 +1,122 @@
+"""The ledger closes for both steppers, and no longer where any of its terms, or of the file's numbers, is wrong."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egs_warp.locomotion import ledger as module
+from egs_warp.locomotion.ledger import FLOWS, STORED, Ledger, ledger
+from egs_warp.locomotion.trajectory import Trajectory
+from tests.support.slides import STEPPERS, slide
+
+CLOSES = 1e-6
+"""Of m g H, in every step."""
+IDLE = {
+    "two-stage": {"spin_inside"},
+    "coupled": {"spin_after", "push_out"},
+}
+"""Flows that this stepper, or the slide by it, does not have."""
+
+
+@pytest.fixture(params=list(STEPPERS), scope="module")
+def name(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def trajectory(name: str) -> Trajectory:
+    return slide(name).trajectory()
+
+
+@pytest.fixture(scope="module")
+def books(trajectory: Trajectory) -> Ledger:
+    return ledger(trajectory)
+
+
+def worst(books: Ledger) -> float:
+    return float(np.abs(books.residual).max())
+
+
+def test_every_step_closes(books: Ledger) -> None:
+    assert len(books.residual) >= 24 and worst(books) < 1e-9
+
+
+def test_each_flow_counts(name: str, books: Ledger) -> None:
+    """A tenth more of any of them is beyond the bound; those that the stepper does not have are nothing."""
+    for flow in FLOWS:
+        values = getattr(books, flow)
+        if flow in IDLE[name]:
+            assert np.abs(values).max() < 1e-8 * books.unit, flow
+        else:
+            assert worst(replace(books, **{flow: 1.1 * values})) > CLOSES, flow
+
+
+def test_each_stored_energy_counts(books: Ledger) -> None:
+    for energy in STORED:
+        assert worst(replace(books, **{energy: 1.01 * getattr(books, energy)})) > CLOSES, energy
+
+
+@pytest.mark.parametrize(
+    "number",
+    [
+        "young_modulus",
+        "poisson_ratio",
+        "damping_time",
+        "drag",
+        "gravity",
+        "node_mass",
+        "muscle_stiffness",
+        "activations",
+        "contact_force",
+        "dt",
+    ],
+)
+def test_the_file_s_numbers_are_those_of_the_run(trajectory: Trajectory, number: str) -> None:
+    """Each 1 % too large."""
+    wrong = replace(trajectory, **{number: 1.01 * getattr(trajectory, number)})
+    assert worst(ledger(wrong)) > CLOSES
+
+
+def test_velocities_that_belong_to_no_step_are_seen(trajectory: Trajectory) -> None:
+    """A swelling of 0.1 / s, which has no momentum, is no spin that was added."""
+    velocities = trajectory.velocities.copy()
+    middle = trajectory.positions[10] - trajectory.node_mass @ trajectory.positions[10] / trajectory.node_mass.sum()
+    velocities[10] += 0.1 * middle
+    assert worst(ledger(replace(trajectory, velocities=velocities))) > CLOSES
+
+
+def test_signs_are_those_of_physics(books: Ledger) -> None:
+    """Damping, drag, friction and what implicit Euler takes of the inertia never give energy, but for what the contact
+    solver leaves."""
+    for flow in ("damping", "drag", "friction", "contact", "lost_inertia"):
+        assert (getattr(books, flow) <= 1e-8 * books.unit).all(), flow
+    assert (books.push_out >= 0.0).all() and (books.muscle_work >= books.muscles - 1e-12 * books.unit).all()
+
+
+def test_stored_energies_are_those_of_the_body(name: str, trajectory: Trajectory, books: Ledger) -> None:
+    """Against the solver's own sum, which the ledger never sees."""
+    body = slide(name).stepper.body
+    theirs = [body.mechanical_energy(x, v) for x, v in zip(trajectory.positions, trajectory.velocities, strict=True)]
+    assert books.stored == pytest.approx(theirs, rel=1e-10)
+
+
+def test_it_shares_no_code_with_the_solver() -> None:
+    """It imports NumPy and the record that it reads; that record imports nothing of bodies, muscles or contact."""
+    for path in (Path(module.__file__), Path(module.__file__).with_name("audit.py")):
+        assert imported(path) <= {"numpy", "egs_warp.locomotion.trajectory", "egs_warp.locomotion.ledger"}
+    rooms = {name.split(".")[1] for name in imported(Path(module.__file__).with_name("trajectory.py")) if "." in name}
+    assert rooms <= {"geometry", "io"}
+
+
+def imported(path: Path) -> set[str]:
+    """Modules beside the standard library's."""
+    nodes = ast.walk(ast.parse(path.read_text()))
+    names = {node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)}
+    nodes = ast.walk(ast.parse(path.read_text()))
+    names |= {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    return {name for name in names if name.split(".")[0] in ("numpy", "scipy", "warp", "egs_warp")}

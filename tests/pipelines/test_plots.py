@@ -1,0 +1,48 @@
+"""The plots of a run hold what the run did."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from egs_warp.locomotion.ledger import ledger
+from egs_warp.pipelines.plots import draw_plots
+from tests.support.flights import rigid_flight
+from tests.support.slides import slide
+
+
+def picture(path: Path) -> np.ndarray:
+    return np.asarray(Image.open(path).convert("RGB"), dtype=float)
+
+
+def test_the_same_run_gives_the_same_bytes_and_another_another_picture(tmp_path: Path) -> None:
+    t = slide("coupled").trajectory()
+    books = ledger(t)
+    planned = np.full((len(t.time), 3), np.nan)
+    planned[3:9] = [0.1, 0.0, 0.9]
+    runs = {
+        "a": (t, books),
+        "b": (t, books),
+        "other": (
+            replace(t, contact_force=2.0 * t.contact_force, activations=t.activations[:, ::-1], planned_com=planned),
+            replace(books, damping=2.0 * books.damping),
+        ),
+    }
+    for name, run in runs.items():
+        draw_plots(tmp_path / f"{name}.png", *run)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    changed = np.abs(picture(tmp_path / "other.png") - picture(tmp_path / "a.png")).max(axis=2) > 30.0
+    high, wide = changed.shape[0] // 3, changed.shape[1] // 2
+    # Flows, load, residual, centre of mass, muscles.
+    for row, column in ((0, 1), (1, 0), (1, 1), (2, 0), (2, 1)):
+        here = changed[row * high : (row + 1) * high, column * wide : (column + 1) * wide]
+        assert here.sum() > 200, (row, column)
+
+
+def test_a_flight_without_contact_or_pull_is_drawn(tmp_path: Path) -> None:
+    t = rigid_flight()
+    draw_plots(tmp_path / "plots.png", t, ledger(t))
+    assert picture(tmp_path / "plots.png").std() > 10.0

@@ -1,0 +1,202 @@
+"""The film of a finished run again: the same one, and others."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from egs_warp.cli import main
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.io.video import VideoWriter
+from egs_warp.pipelines.film import drawn_frames
+from egs_warp.pipelines.finished_run import FinishedRun
+from egs_warp.pipelines.render_run import Show, render_run
+from egs_warp.pipelines.shot import Shot, around, resized
+
+pytestmark = pytest.mark.xdist_group("page")
+
+
+@pytest.fixture(scope="module")
+def run(run_folder: Path) -> FinishedRun:
+    return FinishedRun.read(run_folder)
+
+
+def _png(path: Path) -> np.ndarray:
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert picture is not None
+    return picture
+
+
+def _pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
+    seen = points @ camera.rotation.T + camera.translation
+    assert (seen[:, 2] > 0).all()
+    return seen[:, :2] / seen[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+
+
+def test_without_flags_it_is_the_film_bit_for_bit(run_folder: Path, tmp_path: Path) -> None:
+    assert main(["render", str(run_folder), "--out", str(tmp_path / "again.mp4")]) == 0
+    assert (tmp_path / "again.mp4").read_bytes() == (run_folder / "jump.mp4").read_bytes()
+
+
+@pytest.mark.parametrize("camera", ["fixed", "follow", "orbit"])
+def test_every_camera_holds_the_whole_creature(camera: str, run: FinishedRun) -> None:
+    shot = Shot(camera, size=(160, 90))
+    steps = shot.steps(run.trajectory.time)
+    cameras = shot.cameras(run.creature.camera, run.trajectory, steps)
+    assert len(cameras) == len(steps) == 13
+    for one, step in zip(cameras, steps, strict=True):
+        pixels = _pixels(one, run.trajectory.positions[step])
+        assert (pixels > 0).all() and (pixels < [160, 90]).all()
+    moved = any(not np.allclose(one.centre, cameras[0].centre) for one in cameras)
+    assert moved == (camera != "fixed")
+
+
+def test_a_turn_about_it_keeps_height_and_distance(run: FinishedRun) -> None:
+    positions = run.trajectory.positions[:1]
+    middle = 0.5 * (positions[0].min(axis=0) + positions[0].max(axis=0))
+    cameras = around(run.creature.camera, positions, count=8)
+    arms = np.array([camera.centre - middle for camera in cameras])
+    np.testing.assert_allclose(np.linalg.norm(arms, axis=1), np.linalg.norm(arms[0]))
+    np.testing.assert_allclose(arms[:, 2], arms[0, 2])
+    np.testing.assert_allclose(arms[4, :2], -arms[0, :2], atol=1e-9)
+    np.testing.assert_allclose(cameras[3].rotation @ cameras[3].rotation.T, np.eye(3), atol=1e-12)
+
+
+def test_a_path_goes_through_its_keys_in_the_frame_of_the_capture(run: FinishedRun, tmp_path: Path) -> None:
+    t = replace(run.trajectory, body_axes=np.array([[0, 1.0, 0], [0, 0, 1], [1, 0, 0]]), metres_per_unit=0.5)
+    keys = [
+        {"time": 0.05, "eye": [4, 0, 2], "target": [0, 0, 1], "fov": 20},
+        {"time": 0.15, "eye": [0, 5, 2], "target": [0, 0.5, 1]},
+    ]
+    (tmp_path / "path.json").write_text(json.dumps({"keys": keys}))
+    shot = Shot(str(tmp_path / "path.json"))
+    cameras = shot.cameras(run.creature.camera, t, shot.steps(t.time))
+    for index, key in ((0, 0), (3, 0), (9, 1), (12, 1)):
+        eye = t.in_capture(cameras[index].centre)
+        np.testing.assert_allclose(eye, keys[key]["eye"], atol=0.05 if index in (3, 9) else 1e-9)
+        forward = cameras[index].rotation[2] @ t.body_axes
+        expected = np.subtract(keys[key]["target"], keys[key]["eye"])
+        np.testing.assert_allclose(forward, expected / np.linalg.norm(expected), atol=0.02)
+    assert cameras[0].fy == pytest.approx(0.5 * cameras[0].height / np.tan(np.radians(10)))
+
+
+def test_frames_a_second_and_size(run: FinishedRun, tmp_path: Path) -> None:
+    assert render_run(run, tmp_path / "slow", Shot(size=(48, 32), fps=120.0), quiet=True) == 25
+    assert _png(tmp_path / "slow" / "frame0024.png").shape == (32, 48, 3)
+    camera = run.creature.camera
+    assert resized(camera, camera.width, camera.height) is camera
+    wide = resized(camera, 3 * camera.width, 2 * camera.height)
+    points = run.trajectory.positions[0]
+    expected = 2.0 * _pixels(camera, points) + [0.5 * camera.width, 0.0]
+    np.testing.assert_allclose(_pixels(wide, points), expected)
+
+
+def test_transparent_over_a_colour_is_the_film_over_that_colour(run: FinishedRun, tmp_path: Path) -> None:
+    render_run(run, tmp_path / "clear", Shot(transparent=True, fps=5.0), quiet=True)
+    render_run(run, tmp_path / "blue", Shot(colour=(0.2, 0.4, 0.8), fps=5.0), quiet=True)
+    clear, blue = (_png(tmp_path / name / "frame0001.png").astype(float) for name in ("clear", "blue"))
+    assert clear.shape[2] == 4 and clear[0, 0, 3] == 0 and clear[..., 3].max() > 250
+    alpha = clear[..., 3:] / 255.0
+    laid = alpha * clear[..., :3] + (1.0 - alpha) * 255.0 * np.array([0.8, 0.4, 0.2])
+    assert np.abs(laid - blue).max() <= 2.0
+    assert render_run(run, tmp_path / "bare", Shot(transparent=True, fps=5.0), shadow=False, quiet=True) == 2
+    bare = _png(tmp_path / "bare" / "frame0001.png")
+    assert bare[..., 3].sum() < clear[..., 3].sum()
+
+
+def test_depth_is_in_millimetres_and_alpha_is_the_creatures(run: FinishedRun, tmp_path: Path) -> None:
+    shot = Shot(size=(64, 64), fps=5.0)
+    for show in (Show.DEPTH, Show.ALPHA):
+        render_run(run, tmp_path / show.value, shot, show=show, quiet=True)
+    depth, grey = _png(tmp_path / "depth" / "frame0000.png"), _png(tmp_path / "alpha" / "frame0000.png")[..., 0]
+    assert depth.dtype == np.uint16
+    np.testing.assert_array_equal(depth > 0, grey > 127.5)
+    camera = resized(run.creature.camera, 64, 64)
+    metres = (run.trajectory.positions[0] - camera.centre) @ camera.rotation[2]
+    seen = depth[depth > 0] / 1000.0
+    assert metres.min() - 0.1 < seen.min() and seen.max() < metres.max() + 0.1
+
+
+@pytest.mark.parametrize("ending", [".mov", ".webm"])
+def test_videos_keep_alpha(ending: str, run: FinishedRun, tmp_path: Path) -> None:
+    """Decoded again by ffmpeg; VP9's alpha by the library that made it."""
+    import subprocess
+
+    from egs_warp.io.video import ffmpeg_program
+
+    path = tmp_path / f"a{ending}"
+    shot = Shot(transparent=True, fps=5.0)
+    render_run(run, path, shot, quiet=True)
+    decoder = ["-c:v", "libvpx-vp9"] if ending == ".webm" else []
+    size = run.creature.camera.width
+    done = subprocess.run(
+        [ffmpeg_program(), "-loglevel", "error", *decoder, "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgba", "-"],
+        capture_output=True,
+        check=True,
+    )
+    frames = np.frombuffer(done.stdout, np.uint8).reshape(-1, size, size, 4).astype(int)
+    steps = shot.steps(run.trajectory.time)
+    cameras = shot.cameras(run.creature.camera, run.trajectory, steps)
+    drawn = [
+        frame.picture().astype(int) for frame in drawn_frames(run.deformer(), run.trajectory, steps, cameras, shot)
+    ]
+    assert len(frames) == len(drawn) == 2
+    for read, made in zip(frames, drawn, strict=True):
+        assert np.abs(read[..., 3] - made[..., 3]).mean() < 2.0
+        inside = made[..., 3] > 250
+        assert np.abs(read[inside, :3] - made[inside, :3]).mean() < 8.0
+
+
+def test_a_turntable_holds_one_frame(run: FinishedRun, tmp_path: Path) -> None:
+    assert render_run(run, tmp_path / "t", Shot(size=(32, 32), fps=2.0, colour=(1, 1, 1)), hold=-1, quiet=True) == 8
+    first, half = _png(tmp_path / "t" / "frame0000.png"), _png(tmp_path / "t" / "frame0004.png")
+    assert not np.array_equal(first, half)
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--size", "10"], "--size 10x10: give pixels from 16 to 4096, as 512 or 640x360"),
+        (["--size", "wide"], "--size wide: give pixels, as 512 or 640x360"),
+        (["--fps", "0"], "--fps 0.0: give a number of frames a second from 1 to 1000"),
+        (["--fps", "nan"], "--fps nan: give a number of frames a second"),
+        (["--camera", "sideways"], "--camera sideways: give fixed, follow, orbit or a path.json"),
+        (["--camera", "none.json"], "none.json: no such file"),
+        (["--camera", "{tmp}/bad.json"], "bad.json: key 0 needs time, eye [x, y, z] and target [x, y, z], finite"),
+        (["--camera", "{tmp}/back.json"], "back.json: the times of its keys do not grow"),
+        (["--camera", "{tmp}/up.json"], "up.json: its camera looks straight up or down"),
+        (["--camera", "{tmp}/fov.json"], "fov.json: fov of key 0 is 180; give degrees from 1 to 150"),
+        (["--background", "2,0,0"], "--background 2,0,0: give three numbers r,g,b from 0 to 1"),
+        (["--background", "nowhere.ply"], "nowhere.ply: no such file"),
+        (["--background", "transparent"], "--background transparent: H.264, depth and alpha have no transparency"),
+        (["--turntable", "99"], "--turntable 99: the run has 13 frames; give 0 to 12, or -1"),
+        (["--out", "a.avi"], "a.avi: give a name that ends in .mp4, .mov, .webm"),
+    ],
+)
+def test_bad_input_is_one_line(
+    flags: list[str], said: str, run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good = {"time": 0, "eye": [3, 0, 1], "target": [0, 0, 1]}
+    for name, keys in {
+        "bad": [{"time": 0, "eye": [1, 2]}],
+        "back": [good, good],
+        "up": [good | {"target": [3, 0, 5]}],
+        "fov": [good | {"fov": 180}],
+    }.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps({"keys": keys}))
+    flags = [flag.format(tmp=tmp_path) for flag in flags]
+    assert main(["render", str(run_folder), "--out", str(tmp_path / "a.mp4"), *flags]) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.startswith("egs-warp: ") and error.count("\n") == 1
+    assert not (tmp_path / "a.mp4").exists()
+
+
+def test_an_mp4_has_no_alpha(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"H.264 has no alpha; give a name that ends in .mov or .webm"):
+        VideoWriter(tmp_path / "a.mp4", 16, 16, alpha=True)

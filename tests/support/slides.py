@@ -1,0 +1,67 @@
+"""A coarse block, thrown: it lands, slides and turns while its muscles work, so that every term of a ledger counts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from egs_warp.fem.body import BodyState
+from egs_warp.locomotion.coupled_stepper import CoupledStepper
+from egs_warp.locomotion.objectives import SpinObjective, centre_of_mass_velocity, node_velocities
+from egs_warp.locomotion.recorder import Recorder
+from egs_warp.locomotion.stepper import LocomotionSettings, LocomotionStepper, StepReport
+from egs_warp.locomotion.trajectory import Trajectory
+from tests.support.creatures import coarse_creature
+from tests.support.meshes import block_mesh
+from tests.support.places import DT, FORWARD
+
+STEPPERS = {"two-stage": LocomotionStepper, "coupled": CoupledStepper}
+
+
+@dataclass(frozen=True)
+class Slide:
+    """What was simulated."""
+
+    stepper: LocomotionStepper | CoupledStepper
+    start: BodyState
+    reports: tuple[StepReport, ...]
+
+    def recorder(self, **given: Any) -> Recorder:
+        """A recorder that has seen nothing of it yet."""
+        stepper = self.stepper
+        gaps, _ = stepper.detector.gaps(self.start.positions)
+        drag = stepper.settings.drag
+        return Recorder(
+            stepper.body, stepper.muscles, stepper.geometry, self.start, float(gaps.min()), drag=drag, **given
+        )
+
+    def trajectory(self) -> Trajectory:
+        """All of it."""
+        recorder = self.recorder()
+        recorder.add(self.reports)
+        return recorder.trajectory()
+
+
+@cache
+def slide(name: str) -> Slide:
+    """24 steps by the stepper of this ``name``, in air that drags."""
+    made = coarse_creature(block_mesh(), forward=FORWARD)
+    body, muscles, geometry = made.stepper.body, made.stepper.muscles, made.stepper.geometry
+    stepper = STEPPERS[name](body, muscles, geometry, settings=LocomotionSettings(drag=0.3), device="cpu")
+    positions = made.start.positions + np.array([0.0, 0.0, 0.01])
+    arms = positions - body.centre_of_mass(positions)
+    start = BodyState(positions, np.array([0.8, 0.2, -0.5]) + np.cross([0.5, 0.3, 1.0], arms))
+    state, memory, reports = start, stepper.initial_memory(), []
+    for step in range(24):
+        wanted = np.array([0.0, 0.0, -0.12 * np.sin(6.0 * DT * (step + 1))])
+        objectives = [
+            centre_of_mass_velocity(body, wanted, 2.0),
+            SpinObjective(np.zeros(3), 5.0),
+            node_velocities(body, np.tile(wanted, (len(positions), 1)), 0.01),
+        ]
+        state, memory, done = stepper.advance(state, memory, objectives, DT)
+        reports += done
+    return Slide(stepper, start, tuple(reports))
