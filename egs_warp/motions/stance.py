@@ -24,25 +24,23 @@ CALM_TIME = 0.3
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of a motion's objectives; speeds are compared in sqrt(g H)."""
+    """Weights of a motion's objectives; speeds are compared in sqrt(g H).
 
-    com: float = 2.0
+    What is asked for is what happens, since contact forces come as they are planned: balance goes before effort.
+    """
+
+    com: float = 1000.0
     """Of the centre of mass, along the ground."""
-    up: float = 2.0
+    up: float = 300.0
     """Of the centre of mass, up."""
-    spin: float = 5.0
+    spin: float = 1000.0
     pose: float = 0.02
-    airborne: float = 0.08
+    airborne: float = 0.5
     """Of the pose in the air, where nothing else can be steered and the feet have to get to their place. It crumples a
     body if it is large, and one so slender that it was made stiffer to stand (``SoftBody.stiffening``) buckles under
     less, by the square."""
-    landing: float = 1.0
+    landing: float = 0.1
     """Share of ``com``, ``up`` and ``spin`` that is asked for at touch-down, where the ground's push comes first."""
-
-
-CLOSE = Weights(com=1000.0, up=300.0, spin=1000.0, airborne=0.5, landing=0.1)
-"""For a step whose contact forces come as they are planned (``CoupledStepper``): what is asked for is what happens,
-so balance goes before effort."""
 
 
 @dataclass(frozen=True)
