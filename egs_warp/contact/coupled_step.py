@@ -24,6 +24,9 @@ _PUSH_OUT = 0.2
 """Of the depth beyond the tolerance, a step."""
 _ADDED = 0.6
 """Of the tolerance: points that would end deeper join at once."""
+_SINKS = 0.3
+"""Of the tolerance: what is deep already may go deeper by so much in a step, by next to nothing beyond the tolerance."""
+_CREEPS = 0.02
 _SINGULAR = 1e-7
 """Of the mean of the Delassus operator's diagonal: more points than the cage can resolve leave it singular."""
 
@@ -113,7 +116,8 @@ class CoupledSolver:
             gaps, _ = self.detector.gaps(problem.end_positions(velocities))
             contacts = response.contacts
             # What is deep already is held where it is only once it would go deeper.
-            sinking = np.where(gaps < start_gaps - 0.5 * _ADDED * self.penetration_tolerance, gaps, 0.0)
+            allowed = np.where(gaps < -self.penetration_tolerance, _CREEPS, _SINKS) * self.penetration_tolerance
+            sinking = np.where(gaps < start_gaps - allowed, gaps, 0.0)
             added = self.points.deeper(contacts.points, sinking, _ADDED * self.penetration_tolerance)
             if not result.converged or len(added) == 0 or number == _ROUNDS - 1:
                 break

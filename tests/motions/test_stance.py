@@ -21,7 +21,7 @@ def test_the_nearest_acceleration_that_does_not_tip(
     """The ground's force on a body that neither turns nor tips points through its centre of mass, from inside the
     footprint.
     """
-    pose = PoseFamily(place.body, place.ground, place.standing, place.touching)
+    pose = PoseFamily(place.body, place.ground, place.standing, place.touching, place.friction)
     positions = place.standing + np.array([0.05, -0.03, 0.1]) * (place.standing[:, 2:] > 1e-9)
     seen = pose.measure(BodyState(positions, np.zeros_like(positions)), None)
     com = place.ground.local(place.body.centre_of_mass(positions))
@@ -42,7 +42,7 @@ def test_the_nearest_acceleration_that_does_not_tip(
 
 
 def test_the_usual_margin_stays_inside_the_feet_and_a_falling_body_may_be_pushed_either_way(place: Place) -> None:
-    pose = PoseFamily(place.body, place.ground, place.standing, place.touching)
+    pose = PoseFamily(place.body, place.ground, place.standing, place.touching, place.friction)
     still = np.zeros_like(place.standing)
     seen = pose.measure(BodyState(place.standing, still), None)
     hard = pose.balanced_acceleration(seen, np.array([100.0, -100.0]), 0.0, GRAVITY)
