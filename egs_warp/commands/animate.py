@@ -133,6 +133,7 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
         notes.append(note)
         say(note)
     with run_folder(chosen.out, overwrite=chosen.overwrite) as run:
+        run.begin_with(lambda: write_config(run.file(NAME), chosen, chosen.parser))
         report = animate(
             capture.cloud,
             run,
@@ -143,7 +144,6 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
             notes=tuple(notes),
             **asked,
         )
-        write_config(run.file(NAME), chosen, chosen.parser)
         run.finish()
     return report, f", {NAME}"
 
@@ -170,6 +170,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
     given = read_scene(chosen)
     with run_folder(chosen.out, overwrite=chosen.overwrite) as run:
+        run.begin_with(lambda: write_config(run.file(NAME), chosen, chosen.parser))
         scene = prepare_scene(
             given.cloud,
             given.object,
@@ -196,7 +197,6 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
             notes=(*given.notes, *scene.notes),
             **asked,
         )
-        write_config(run.file(NAME), chosen, chosen.parser)
         run.finish()
     return report, ", ".join(["", NAME, "object.ply", "background.ply", "plane.json", *pictures])
 
