@@ -53,8 +53,7 @@ def _segment(chosen: argparse.Namespace) -> int:
     from egs_warp.io.run_folder import check_out
     from egs_warp.io.video import write_png
     from egs_warp.pipelines.pictures import picture_cameras, segmentation_picture
-    from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene
-    from egs_warp.training.photo_colours import photographs_in_colours_of
+    from egs_warp.pipelines.prepare_scene import SceneOptions
 
     if not chosen.object:
         raise UserError("segment: give --object: a mask, a point, a box or a pixel")
@@ -62,15 +61,7 @@ def _segment(chosen: argparse.Namespace) -> int:
     given = read_scene(chosen)
     known = read_planes(chosen.plane) if chosen.plane and Path(chosen.plane).is_file() else []
     folder = writable_folder(chosen.out)
-    scene = prepare_scene(
-        given.cloud,
-        given.object,
-        cameras=given.cameras,
-        photographs=photographs_in_colours_of(given.cloud, given.posed),
-        up=given.up,
-        plane=given.plane,
-        options=SceneOptions(clearing=clearing_of(chosen), inpaint=False),
-    )
+    scene = given.prepared(SceneOptions(clearing=clearing_of(chosen), inpaint=False))
     for note in (*given.notes, *scene.notes):
         say(note)
     scene.write(folder, known)
