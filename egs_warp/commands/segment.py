@@ -12,9 +12,6 @@ from egs_warp.commands.scene_flags import add_scene_flags, say
 if TYPE_CHECKING:
     from egs_warp.segmentation.clearance import Clearing
 
-METHODS = {"finetune": "FINETUNE", "split": "SPLIT", "remove": "REMOVE", "none": "NONE"}
-
-
 EXAMPLES = (
     "room.ply --object 0,0,0.5 --out out/segment",
     "room.ply --object masks --cameras cameras.json --out out/segment",
@@ -33,7 +30,7 @@ def add_straddling_flag(parser: argparse._ActionsContainer) -> None:
     """Add the flag that ``clearing_of`` reads."""
     parser.add_argument(
         "--straddling",
-        choices=METHODS,
+        choices=("finetune", "split", "remove", "none"),
         help="Gaussians across the plane: finetune them clear of it (default, needs PyTorch), split, remove, none",
     )
 
@@ -42,7 +39,7 @@ def clearing_of(chosen: argparse.Namespace) -> Clearing | None:
     """What ``--straddling`` asks for; None without it."""
     from egs_warp.segmentation.clearance import Clearing
 
-    return Clearing[METHODS[chosen.straddling]] if chosen.straddling else None
+    return Clearing(chosen.straddling) if chosen.straddling else None
 
 
 def _segment(chosen: argparse.Namespace) -> int:
