@@ -18,7 +18,7 @@ def write_ply_sequence(
 ) -> list[Path]:
     """Write ``frame0001.ply``, ``frame0002.ply``, ... into ``folder``, made where missing; return their paths.
 
-    ``clouds`` may be a generator: one frame is held at a time. ``compressed`` files are a tenth as large and end in
+    ``clouds`` may be a generator: one frame is held at a time. ``compressed`` files are a quarter as large and end in
     ``.compressed.ply``. Files of an earlier, longer sequence stay. Raises ``UserError`` if it cannot be written.
     """
     target = writable_folder(folder)
