@@ -20,15 +20,11 @@ _Y_UP = BodyFrame(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 def chosen_frames(run: FinishedRun, *, frame: int | None, every: int) -> np.ndarray:
     """Indices of frames at 60 Hz: one, or ``every`` so many. Raises ``UserError`` for one that is not there."""
-    count = len(run.steps)
     if every < 1:
         raise ArgumentError("every", "give a whole number of at least 1", value=every)
     if frame is None:
-        return np.arange(0, count, every)
-    if not -count <= frame < count:
-        advice = f"the run has {count} frames; give 0 to {count - 1}, or -1 for the last"
-        raise ArgumentError("frame", advice, value=frame)
-    return np.array([frame % count])
+        return np.arange(0, len(run.steps), every)
+    return np.array([run.frame_number(frame, asked_by="frame")])
 
 
 def export_splats(
