@@ -248,12 +248,19 @@ class Page {
     this.curves.draw(player.place);
   }
 
+  /** A slow machine waits for its splats to be sorted: as they lay some pictures ago, the ground would hide the body. */
+  private get waits(): boolean {
+    return this.player.playing && this.pace > SLOW && this.stages.some((stage) => stage.sorting);
+  }
+
   private tick(now: number): void {
-    const elapsed = this.before === 0 ? 0 : (now - this.before) / 1000;
-    this.before = now;
-    this.player.advance(elapsed);
-    this.keepUp(elapsed);
-    for (const stage of this.stages) stage.draw();
+    if (!this.waits) {
+      const elapsed = this.before === 0 ? 0 : (now - this.before) / 1000;
+      this.before = now;
+      this.player.advance(elapsed);
+      this.keepUp(elapsed);
+      for (const stage of this.stages) stage.draw();
+    }
     requestAnimationFrame((next) => this.tick(next));
   }
 }
