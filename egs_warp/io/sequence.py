@@ -33,6 +33,19 @@ def write_ply_sequence(
     return paths
 
 
+def frame_paths(folder: Path | str, numbers: Iterable[int], ending: str, *, alone: bool = True) -> list[Path]:
+    """``frame0000`` + ``ending`` and so on in ``folder``, made where missing, one for each of ``numbers``.
+
+    ``alone``: raises ``UserError`` where it holds other frames of this ending, which players would show between them.
+    """
+    paths = [Path(folder) / f"frame{number:04d}{ending}" for number in numbers]
+    writable_folder(folder)
+    there = {path for path in Path(folder).iterdir() if re.fullmatch(rf"frame\d{{4,}}{re.escape(ending)}", path.name)}
+    if alone and (others := sorted(there - set(paths))):
+        raise UserError(f"{folder}: it has other frames ({others[0].name}, ...); choose another folder")
+    return paths
+
+
 _NUMBERED = re.compile(
     r"(?P<prefix>.*?)(?P<number>\d{1,12})(?P<ending>(\.compressed)?\.(ply|spz|splat|sog|glb))", re.IGNORECASE
 )

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.frames import box_corners
-from egs_warp.io.atomic import writable_folder
+from egs_warp.io.sequence import frame_paths
 from egs_warp.io.video import VideoWriter, write_png
 from egs_warp.pipelines.film import Frame, drawn_frames
 from egs_warp.pipelines.finished_run import FinishedRun
@@ -45,7 +45,8 @@ def render_run(
     """Write a video (.mp4, .mov, .webm), or a folder of PNGs where ``out`` has no ending; returns how many frames.
 
     ``hold``: this frame at 60 Hz alone, and the camera goes around it once. The same arguments give the same pictures.
-    Raises ``UserError`` for a frame that the run does not have, and a name or shot that does not fit the other.
+    Raises ``UserError`` for a frame that the run does not have, a name or shot that does not fit the other, and a
+    folder that holds other frames.
     """
     folder = out.suffix == ""
     if shot.transparent and (show is not Show.COLOUR or (not folder and out.suffix.lower() == ".mp4")):
@@ -62,21 +63,21 @@ def render_run(
     frames = drawn_frames(run.deformer(), t, steps, cameras, shot, scene=run.scene, shadow=shadow)
     corners = t.positions[steps] if hold is None else t.positions[steps[:1]]
     near, far = _depths(corners.reshape(-1, 3), cameras) if show is Show.DEPTH else (0.0, 1.0)
+    pictures = frame_paths(out, range(len(steps)), ".png") if folder else []
     with contextlib.ExitStack() as stack:
-        if folder:
-            place, video = writable_folder(out), None
-        else:
+        video = None
+        if not folder:
             width, height = cameras[0].width, cameras[0].height
             writer = VideoWriter(out, width, height, frames_per_second=shot.fps, alpha=shot.transparent)
-            place, video = out, stack.enter_context(writer)
+            video = stack.enter_context(writer)
         bar = stack.enter_context(tqdm(total=len(steps), desc="render", unit="frame", disable=quiet))
         for index, frame in enumerate(frames):
             if video is not None:
                 video.write(_picture(frame, show, near, far))
             elif show is Show.DEPTH:
-                write_png(place / f"frame{index:04d}.png", _millimetres(frame))
+                write_png(pictures[index], _millimetres(frame))
             else:
-                write_png(place / f"frame{index:04d}.png", _picture(frame, show, near, far))
+                write_png(pictures[index], _picture(frame, show, near, far))
             bar.update()
     return len(steps)
 

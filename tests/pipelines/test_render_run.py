@@ -87,6 +87,8 @@ def test_a_path_goes_through_its_keys_in_the_frame_of_the_capture(run: FinishedR
 def test_frames_a_second_and_size(run: FinishedRun, tmp_path: Path) -> None:
     assert render_run(run, tmp_path / "slow", Shot(size=(48, 32), fps=120.0), quiet=True) == 25
     assert _png(tmp_path / "slow" / "frame0024.png").shape == (32, 48, 3)
+    with pytest.raises(UserError, match=r"slow: it has other frames \(frame0013\.png, \.\.\.\); choose another folder"):
+        render_run(run, tmp_path / "slow", Shot(size=(48, 32)), quiet=True)
     camera = run.creature.camera
     assert resized(camera, camera.width, camera.height) is camera
     wide = resized(camera, 3 * camera.width, 2 * camera.height)
