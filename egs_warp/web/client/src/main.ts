@@ -254,13 +254,15 @@ class Page {
   }
 
   private tick(now: number): void {
-    if (!this.waits) {
-      const elapsed = this.before === 0 ? 0 : (now - this.before) / 1000;
-      this.before = now;
-      this.player.advance(elapsed);
-      this.keepUp(elapsed);
-      for (const stage of this.stages) stage.draw();
+    if (this.waits) {
+      requestAnimationFrame((next) => this.tick(next));
+      return;
     }
+    const elapsed = this.before === 0 ? 0 : (now - this.before) / 1000;
+    this.before = now;
+    this.player.advance(elapsed);
+    this.keepUp(elapsed);
+    for (const stage of this.stages) stage.draw();
     requestAnimationFrame((next) => this.tick(next));
   }
 }
