@@ -228,7 +228,10 @@ def judge(rows: list[Row]) -> tuple[dict[str, bool | None], dict[str, str]]:
     differences = [d for row in cuda for d in row["difference"].values()] + [
         row["difference"] for row in rows if row["kind"] == "cpu"
     ]
-    aims["same_picture"] = all(map(_same, differences))
+    if differences:
+        aims["same_picture"] = all(map(_same, differences))
+    else:
+        why["same_picture"] = "no other renderer is installed"
     cpu = [row for row in rows if row["kind"] == "cpu"]
     if not cpu:
         why["cpu_vs_twin"] = why["cpu_two_threads"] = "measured with --device cpu"
@@ -308,7 +311,7 @@ def plot_roofline(rows: list[Row], axes: Any) -> None:
 
 
 def against_gsplat(rows: list[Row]) -> Row | None:
-    """The real aim, beside the ones judged: faster than gsplat in every cell."""
+    """Our time over gsplat's, cell by cell, and what the aims make of it; None where it is not installed."""
     ratios = {
         f"{row['gaussians']} {row['width']}x{row['height']} {label}": row[label]["ours"] / _best(row[label], "gsplat")
         for row in rows

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.performance import Performance, simulate
     from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene
     from egs_warp.pipelines.report import Report
+    from egs_warp.pipelines.shot import Shot
     from egs_warp.pipelines.train_capture import TrainResult, train
     from egs_warp.render.autograd import render_torch
     from egs_warp.render.rasteriser import render_gaussians
@@ -71,6 +72,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "pipelines.performance": ("Performance", "simulate"),
     "pipelines.prepare_scene": ("PreparedScene", "SceneOptions", "prepare_scene"),
     "pipelines.report": ("Report",),
+    "pipelines.shot": ("Shot",),
     "pipelines.train_capture": ("TrainResult", "train"),
     "render.autograd": ("render_torch",),
     "render.rasteriser": ("render_gaussians",),
@@ -102,6 +104,7 @@ __all__ = [
     "Scene",
     "SceneOptions",
     "Script",
+    "Shot",
     "Strategy",
     "TetMesh",
     "TrainResult",

@@ -10,11 +10,18 @@ import numpy as np
 import pytest
 
 from egs_warp.assets import pawn
-from egs_warp.cli import main
+from egs_warp.cli import _parsers, main
+from egs_warp.commands.camera_flags import TRANSPARENT
+from egs_warp.commands.config import _WORDS
 from egs_warp.commands.flags import parse_plane, parse_up
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.inpainting.inpainters import OpenCvMethod
 from egs_warp.io import write_ply
+from egs_warp.io.writing import WRITERS
+from egs_warp.pipelines.render_run import Show
+from egs_warp.pipelines.shot import CAMERAS
+from egs_warp.segmentation.clearance import Clearing
 
 
 @pytest.mark.parametrize(
@@ -120,6 +127,19 @@ def test_a_plot_needs_the_name_of_a_picture(tmp_path: Path, name: str, capsys: p
     assert main(["muscles", str(tmp_path / "nothing.ply"), "--plot", str(tmp_path / name)]) == 2
     error = capsys.readouterr().err
     assert f"{name}: not the name of a picture; let it end in one of .png, .jpg" in error and error.count("\n") == 1
+
+
+def test_choices_of_flags_are_those_of_the_library() -> None:
+    """They are written down a second time, for a wrong flag is told before anything heavy is imported."""
+
+    def choices(command: str, flag: str) -> set[str]:
+        (action,) = [action for action in _parsers()[1][command]._actions if flag in action.option_strings]
+        return set(action.choices or ())
+
+    assert choices("convert", "--to") == set(WRITERS) == choices("export", "--to") - {"usd", "bundle"}
+    assert choices("render", "--show") == {show.value for show in Show}
+    assert choices("segment", "--straddling") == {method.value for method in Clearing}
+    assert {"patch", TRANSPARENT, *CAMERAS, *(method.value for method in OpenCvMethod)} == set(_WORDS)
 
 
 def test_axes_and_planes_are_read() -> None:

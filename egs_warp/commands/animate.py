@@ -125,14 +125,13 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
     capture = read_capture(chosen.capture, device=chosen.device)
     background = read_capture(behind, device=chosen.device).cloud if behind is not None else None
-    notes = list(capture.notes)
-    if capture.infinite_opacities:
-        notes.append(f"{capture.infinite_opacities} infinite opacities were read as 0 or 1")
+    notes = capture.notes
     if plane is None and up is None:
         up, note = guessed_up(capture)
-        notes.append(note)
+        notes = (*notes, note)
         say(note)
     with run_folder(chosen.out, overwrite=chosen.overwrite) as run:
+        run.begin_with(lambda: write_config(run.file(NAME), chosen, chosen.parser))
         report = animate(
             capture.cloud,
             run,
@@ -140,10 +139,9 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
             plane=plane,
             background=background,
             view_from=view_from,
-            notes=tuple(notes),
+            notes=notes,
             **asked,
         )
-        write_config(run.file(NAME), chosen, chosen.parser)
         run.finish()
     return report, f", {NAME}"
 
@@ -154,8 +152,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
     from egs_warp.io.run_folder import run_folder
     from egs_warp.io.video import ffmpeg_program
     from egs_warp.pipelines.animate import animate
-    from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene, viewing_direction
-    from egs_warp.training.photo_colours import photographs_in_colours_of
+    from egs_warp.pipelines.prepare_scene import SceneOptions, viewing_direction
 
     shot, behind = shot_of(chosen)
     if behind is not None:
@@ -169,17 +166,10 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
     inpainter = chosen_inpainter(chosen)
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
     given = read_scene(chosen)
+    options = SceneOptions(clearing=clearing_of(chosen), inpaint=not chosen.no_inpaint, inpainter=inpainter)
     with run_folder(chosen.out, overwrite=chosen.overwrite) as run:
-        scene = prepare_scene(
-            given.cloud,
-            given.object,
-            cameras=given.cameras,
-            photographs=photographs_in_colours_of(given.cloud, given.posed),
-            up=given.up,
-            plane=given.plane,
-            options=SceneOptions(clearing=clearing_of(chosen), inpaint=not chosen.no_inpaint, inpainter=inpainter),
-            progress=lambda stage: say(f"{stage} ..."),
-        )
+        run.begin_with(lambda: write_config(run.file(NAME), chosen, chosen.parser))
+        scene = given.prepared(options, progress=lambda stage: say(f"{stage} ..."))
         # Whatever goes wrong later, the minutes that these took are not lost.
         for name in ("object.ply", "background.ply", "plane.json"):
             run.file(name)
@@ -196,7 +186,6 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
             notes=(*given.notes, *scene.notes),
             **asked,
         )
-        write_config(run.file(NAME), chosen, chosen.parser)
         run.finish()
     return report, ", ".join(["", NAME, "object.ply", "background.ply", "plane.json", *pictures])
 

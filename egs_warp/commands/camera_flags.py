@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.shot import Shot
 
 TRANSPARENT = "transparent"
+COLOURS = "give three numbers r,g,b from 0 to 1, or #rrggbb"
 
 
 def add_camera_flags(parser: argparse._ActionsContainer, *, size: str) -> None:
@@ -57,5 +58,5 @@ def parse_colour(text: str) -> tuple[float, float, float] | None:
     except ValueError:
         return None
     if not all(0.0 <= value <= 1.0 for value in (red, green, blue)):
-        raise UserError(f"--background {text}: give three numbers r,g,b from 0 to 1, or #rrggbb")
+        raise UserError(f"--background {text}: {COLOURS}")
     return red, green, blue

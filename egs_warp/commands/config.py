@@ -10,13 +10,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from egs_warp.commands.camera_flags import TRANSPARENT
 from egs_warp.errors import UserError
 
 NAME = "run.yaml"
 _CHECKSUM = "capture_sha256"
 _PATHS = ("capture", "object", "plane", "cameras", "background", "terrain", "muscles", "inpainter", "camera")
 """Flags that may name files: in the file these are relative to its own folder."""
-_WORDS = ("fixed", "follow", "orbit", "patch", "telea", "ns", "transparent")
+_WORDS = ("fixed", "follow", "orbit", "patch", "telea", "ns", TRANSPARENT)
 """Values of such flags that are no files."""
 _IN_MOTION = re.compile(r"\S+\.(?:json|csv)", re.IGNORECASE)
 _NEVER = ("help", "out", "overwrite", "config", "trust")

@@ -6,12 +6,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from egs_warp.commands.flags import Commands, named_path
+from egs_warp.commands.flags import SPLAT_FILES, Commands, named_path
 from egs_warp.commands.scene_flags import say
 from egs_warp.errors import UserError
-
-_KINDS = ("ply", "compressed-ply", "spz", "sog", "splat", "glb")
-
 
 EXAMPLES = (
     "scan.ply scan.spz",
@@ -32,7 +29,7 @@ def add_parser(commands: Commands) -> None:
     convert.add_argument(
         "out", type=named_path, help="by its ending .ply, .compressed.ply, .spz, .sog, .splat, .glb; with --to a folder"
     )
-    convert.add_argument("--to", choices=_KINDS, help="write each of the numbered captures as this")
+    convert.add_argument("--to", choices=SPLAT_FILES, help="write each of the numbered captures as this")
     convert.add_argument("--degree", type=int, choices=(0, 1, 2, 3), help="bands of colour to keep (all)")
     convert.set_defaults(run=_convert)
 

@@ -5,11 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from egs_warp.commands.flags import Commands
+from egs_warp.commands.flags import SPLAT_FILES, Commands
 from egs_warp.errors import UserError
-
-_KINDS = ("ply", "compressed-ply", "spz", "sog", "splat", "glb", "usd", "bundle")
-
 
 EXAMPLES = (
     "out/jump --to ply --out frames --every 2",
@@ -26,7 +23,7 @@ def add_parser(commands: Commands) -> None:
     export.add_argument(
         "--to",
         required=True,
-        choices=_KINDS,
+        choices=(*SPLAT_FILES, "usd", "bundle"),
         help="numbered splat files, one USD stage, or one .npz",
     )
     export.add_argument(

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 Commands: TypeAlias = "argparse._SubParsersAction[Any]"
 """What a command adds its parser to."""
 
+SPLAT_FILES = ("ply", "compressed-ply", "spz", "sog", "splat", "glb")
+"""Names of ``egs_warp.io.writing.WRITERS``, which is slow to import."""
 _AXES = {"x": 0, "y": 1, "z": 2}
 _FLAGS = {"muscles_file": "--muscles", "solids": "--terrain"}
 """Of arguments whose flags are called otherwise."""

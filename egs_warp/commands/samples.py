@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 
 from egs_warp.commands.flags import Commands, named_path
 
@@ -35,6 +36,9 @@ def _samples(chosen: argparse.Namespace) -> int:
     write_ply(capture, pawn(gaussian_count=_GAUSSIANS).cloud)
     write_ply(whole, made.whole()[0])
     print(f"wrote {capture}, an object alone, and {whole}, the object in a scene; z is up; now try")
-    print(f"  egs-warp animate {capture} --up z --size 256 --out {folder / 'jump'}")
-    print(f"  egs-warp animate {whole} --up z --object 0,0,0.5 --size 256 --out {folder / 'scene'}")
+    for flags in (
+        [str(capture), "--up", "z", "--size", "256", "--out", str(folder / "jump")],
+        [str(whole), "--up", "z", "--object", "0,0,0.5", "--size", "256", "--out", str(folder / "scene")],
+    ):
+        print(f"  egs-warp animate {shlex.join(flags)}")
     return 0

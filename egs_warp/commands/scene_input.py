@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +21,9 @@ from egs_warp.io.cameras import PosedImage, read_cameras
 from egs_warp.io.capture import read_capture
 from egs_warp.io.planes import read_planes
 from egs_warp.segmentation.object_mask import ObjectSpec
+
+if TYPE_CHECKING:
+    from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,22 @@ class SceneInput:
         """The capture's own."""
         return [one.camera for one in self.posed]
 
+    def prepared(self, options: SceneOptions, *, progress: Callable[[str], None] = lambda stage: None) -> PreparedScene:
+        """Taken apart, fine-tuned against the photos beside the cameras where there are any: ``prepare_scene``."""
+        from egs_warp.pipelines.prepare_scene import prepare_scene
+        from egs_warp.training.photo_colours import photographs_in_colours_of
+
+        return prepare_scene(
+            self.cloud,
+            self.object,
+            cameras=self.cameras,
+            photographs=photographs_in_colours_of(self.cloud, self.posed),
+            up=self.up,
+            plane=self.plane,
+            options=options,
+            progress=progress,
+        )
+
 
 def plane_of(text: str) -> Plane:
     """The first plane of a file, or one of four numbers. Raises ``UserError`` otherwise."""
@@ -60,10 +80,7 @@ def read_scene(chosen: argparse.Namespace) -> SceneInput:
     plane = plane_of(chosen.plane) if chosen.plane is not None else None
     capture = read_capture(chosen.capture, device=chosen.device)
     posed = read_cameras(chosen.cameras) if chosen.cameras else []
-    notes = list(capture.notes)
-    if capture.infinite_opacities:
-        notes.append(f"{capture.infinite_opacities} infinite opacities were read as 0 or 1")
     spec = read_object(chosen.object, capture.cloud, posed, view=chosen.view) if chosen.object is not None else None
     if up is None and capture.up is not None:
         up = np.asarray(capture.up, dtype=float)
-    return SceneInput(capture.cloud, posed, spec, up, plane, tuple(notes))
+    return SceneInput(capture.cloud, posed, spec, up, plane, capture.notes)

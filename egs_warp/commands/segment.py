@@ -12,9 +12,6 @@ from egs_warp.commands.scene_flags import add_scene_flags, say
 if TYPE_CHECKING:
     from egs_warp.segmentation.clearance import Clearing
 
-METHODS = {"finetune": "FINETUNE", "split": "SPLIT", "remove": "REMOVE", "none": "NONE"}
-
-
 EXAMPLES = (
     "room.ply --object 0,0,0.5 --out out/segment",
     "room.ply --object masks --cameras cameras.json --out out/segment",
@@ -33,7 +30,7 @@ def add_straddling_flag(parser: argparse._ActionsContainer) -> None:
     """Add the flag that ``clearing_of`` reads."""
     parser.add_argument(
         "--straddling",
-        choices=METHODS,
+        choices=("finetune", "split", "remove", "none"),
         help="Gaussians across the plane: finetune them clear of it (default, needs PyTorch), split, remove, none",
     )
 
@@ -42,7 +39,7 @@ def clearing_of(chosen: argparse.Namespace) -> Clearing | None:
     """What ``--straddling`` asks for; None without it."""
     from egs_warp.segmentation.clearance import Clearing
 
-    return Clearing[METHODS[chosen.straddling]] if chosen.straddling else None
+    return Clearing(chosen.straddling) if chosen.straddling else None
 
 
 def _segment(chosen: argparse.Namespace) -> int:
@@ -53,8 +50,7 @@ def _segment(chosen: argparse.Namespace) -> int:
     from egs_warp.io.run_folder import check_out
     from egs_warp.io.video import write_png
     from egs_warp.pipelines.pictures import picture_cameras, segmentation_picture
-    from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene
-    from egs_warp.training.photo_colours import photographs_in_colours_of
+    from egs_warp.pipelines.prepare_scene import SceneOptions
 
     if not chosen.object:
         raise UserError("segment: give --object: a mask, a point, a box or a pixel")
@@ -62,15 +58,7 @@ def _segment(chosen: argparse.Namespace) -> int:
     given = read_scene(chosen)
     known = read_planes(chosen.plane) if chosen.plane and Path(chosen.plane).is_file() else []
     folder = writable_folder(chosen.out)
-    scene = prepare_scene(
-        given.cloud,
-        given.object,
-        cameras=given.cameras,
-        photographs=photographs_in_colours_of(given.cloud, given.posed),
-        up=given.up,
-        plane=given.plane,
-        options=SceneOptions(clearing=clearing_of(chosen), inpaint=False),
-    )
+    scene = given.prepared(SceneOptions(clearing=clearing_of(chosen), inpaint=False))
     for note in (*given.notes, *scene.notes):
         say(note)
     scene.write(folder, known)

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from egs_warp.commands.camera_flags import COLOURS, parse_colour
 from egs_warp.commands.flags import Commands, named_path
 from egs_warp.errors import UserError
 
@@ -42,7 +43,8 @@ def add_parser(commands: Commands) -> None:
     train.add_argument("--max-side", type=int, help="photos are reduced to this many pixels (cpu 360, cuda 1600)")
     train.add_argument("--sh-degree", type=int, default=3, help="how colours depend on the view, 0 to 3 (3)")
     train.add_argument(
-        "--background", help="r,g,b from 0 to 1 behind the capture (white for photos with alpha, else their border's)"
+        "--background",
+        help="r,g,b from 0 to 1 or #rrggbb behind the capture (white for photos with alpha, else their border's)",
     )
     train.add_argument("--seed", type=int, default=0, help="of the first cloud and the order of photos (0)")
     train.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
@@ -50,7 +52,9 @@ def add_parser(commands: Commands) -> None:
 
 
 def _train(chosen: argparse.Namespace) -> int:
-    background = _colour(chosen.background) if chosen.background else None
+    background = parse_colour(chosen.background) if chosen.background is not None else None
+    if background is None and chosen.background is not None:
+        raise UserError(f"--background {chosen.background}: {COLOURS}")
     for flag, value, least in (
         ("--iterations", chosen.iterations, 1),
         ("--gaussians", chosen.gaussians, 100),
@@ -149,16 +153,6 @@ class _Progress:
         )
         end = "\n" if last or not self._terminal else ""
         print(f"\r{text}\x1b[K" if self._terminal else text, end=end, file=sys.stderr, flush=True)
-
-
-def _colour(text: str) -> tuple[float, float, float]:
-    try:
-        red, green, blue = (float(part) for part in text.split(","))
-    except ValueError as error:
-        raise UserError(f"--background {text}: give three numbers r,g,b from 0 to 1") from error
-    if not all(0.0 <= value <= 1.0 for value in (red, green, blue)):
-        raise UserError(f"--background {text}: give three numbers r,g,b from 0 to 1")
-    return red, green, blue
 
 
 def _write_sheet(path: Path, result: TrainResult) -> None:

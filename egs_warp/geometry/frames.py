@@ -1,4 +1,4 @@
-"""Orthonormal directions and rotations."""
+"""Orthonormal directions, rotations, boxes."""
 
 from __future__ import annotations
 
@@ -17,3 +17,8 @@ def best_turn(masses: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.n
     """(3, 3) rotation that best carries the arms ``before`` (n, 3) to those ``after``, by ``masses`` (n,) (Kabsch)."""
     u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", masses, after, before))
     return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+
+
+def box_corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """(8, 3) of the box from the corner ``low`` (3,) to ``high`` (3,)."""
+    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])

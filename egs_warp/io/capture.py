@@ -58,6 +58,10 @@ def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
     check_finite(raw, source)
     raw = without_outliers(raw, source)
     infinite = np.isinf(raw.opacity_logits)
+    infinite_count = int(np.count_nonzero(infinite))
+    notes = raw.notes
+    if infinite_count:
+        notes = (*notes, f"{infinite_count} infinite opacities were read as 0 or 1")
     cloud = GaussianCloud.from_numpy(
         raw.means,
         raw.rotations,
@@ -66,7 +70,7 @@ def read_capture(path: Path | str, *, device: str | None = None) -> Capture:
         raw.sh,
         device=device,
     )
-    return Capture(cloud, source, raw.format, int(np.count_nonzero(infinite)), raw.up, raw.antialiased, raw.notes)
+    return Capture(cloud, source, raw.format, infinite_count, raw.up, raw.antialiased, notes)
 
 
 def _decode(source: Path) -> RawCapture:

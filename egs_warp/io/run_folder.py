@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -31,12 +31,20 @@ class RunFolder:
         self.path = path
         self._overwrite = overwrite
         self._names: list[str] = []
+        self._begin: Callable[[], object] | None = None
+
+    def begin_with(self, begin: Callable[[], object]) -> None:
+        """Have ``begin`` write its files before the first other one: an interrupted run has them, too."""
+        self._begin = begin
 
     def file(self, name: str) -> Path:
         """Where the run's file ``name`` goes. Before the first one, an earlier run is moved aside, if that was allowed.
 
         Raises ``UserError`` for a file of this name that is no run's, unless files may be overwritten.
         """
+        begin, self._begin = self._begin, None
+        if begin is not None:
+            begin()
         if not self._names:
             self._move_aside(_known(self.path))
         if name not in self._names:

@@ -18,7 +18,7 @@ def write_ply_sequence(
 ) -> list[Path]:
     """Write ``frame0001.ply``, ``frame0002.ply``, ... into ``folder``, made where missing; return their paths.
 
-    ``clouds`` may be a generator: one frame is held at a time. ``compressed`` files are a tenth as large and end in
+    ``clouds`` may be a generator: one frame is held at a time. ``compressed`` files are a quarter as large and end in
     ``.compressed.ply``. Files of an earlier, longer sequence stay. Raises ``UserError`` if it cannot be written.
     """
     target = writable_folder(folder)
@@ -30,6 +30,19 @@ def write_ply_sequence(
         else:
             write_ply(path, cloud)
         paths.append(path)
+    return paths
+
+
+def frame_paths(folder: Path | str, numbers: Iterable[int], ending: str, *, alone: bool = True) -> list[Path]:
+    """``frame0000`` + ``ending`` and so on in ``folder``, made where missing, one for each of ``numbers``.
+
+    ``alone``: raises ``UserError`` where it holds other frames of this ending, which players would show between them.
+    """
+    paths = [Path(folder) / f"frame{number:04d}{ending}" for number in numbers]
+    writable_folder(folder)
+    there = {path for path in Path(folder).iterdir() if re.fullmatch(rf"frame\d{{4,}}{re.escape(ending)}", path.name)}
+    if alone and (others := sorted(there - set(paths))):
+        raise UserError(f"{folder}: it has other frames ({others[0].name}, ...); choose another folder")
     return paths
 
 

@@ -130,16 +130,8 @@ class VideoWriter:
         rate = () if codec == "prores_ks" else ("-crf", str(quality))
         self._command_tail = [
             # Nothing but a pipe and a file: names may look like addresses or playlists.
-            *(
-                "-protocol_whitelist",
-                "file,pipe",
-                "-f",
-                "rawvideo",
-                "-pix_fmt",
-                "rgba" if alpha else "rgb24",
-                "-s",
-                f"{width + width % 2}x{height + height % 2}",
-            ),
+            *("-protocol_whitelist", "file,pipe", "-f", "rawvideo", "-pix_fmt", "rgba" if alpha else "rgb24"),
+            *("-s", f"{width + width % 2}x{height + height % 2}"),
             *("-r", f"{frames_per_second:g}", "-i", "pipe:0", "-an"),
             *("-vf", "scale=out_color_matrix=bt709:out_range=tv", "-c:v", codec, "-pix_fmt", pixels),
             *(*rate, *more, "-color_range", "tv", *_BT709),
@@ -150,19 +142,19 @@ class VideoWriter:
         with contextlib.ExitStack() as files:
             temporary = files.enter_context(atomic_write(self._path))
             self._log = files.enter_context(tempfile.TemporaryFile())
+            self._process = subprocess.Popen(
+                [
+                    *(program, "-y", "-loglevel", "error"),
+                    *self._command_tail,
+                    *("-f", self._format, str(temporary)),
+                ],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=self._log,
+                # Ctrl-C reaches the writer, who ends it.
+                start_new_session=True,
+            )
             self._files = files.pop_all()
-        self._process = subprocess.Popen(
-            [
-                *(program, "-y", "-loglevel", "error"),
-                *self._command_tail,
-                *("-f", self._format, str(temporary)),
-            ],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=self._log,
-            # Ctrl-C reaches the writer, who ends it.
-            start_new_session=True,
-        )
         return self
 
     def write(self, frame: np.ndarray) -> None:

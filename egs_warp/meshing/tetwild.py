@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import sys
+import tempfile
 import types
 from collections.abc import Callable
+from contextlib import chdir
 from typing import Any, Protocol
 
 import numpy as np
@@ -40,16 +42,18 @@ def tetwild(field: SampledField, target_nodes: int) -> TetMesh | None:
     tetrahedralize = _tetrahedralize()
     edge_length = 0.05 * (600.0 / target_nodes) ** 0.5
     try:
-        nodes, tets = tetrahedralize(
-            vertices,
-            faces,
-            edge_length_fac=edge_length,
-            coarsen=True,
-            epsilon=5e-3,
-            stop_energy=10.0,
-            num_opt_iter=40,
-            num_threads=1,
-        )
+        # It leaves a file in the folder where it runs, and takes no name for it.
+        with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
+            nodes, tets = tetrahedralize(
+                vertices,
+                faces,
+                edge_length_fac=edge_length,
+                coarsen=True,
+                epsilon=5e-3,
+                stop_energy=10.0,
+                num_opt_iter=40,
+                num_threads=1,
+            )
         # The envelope lets the bottom wander; what it moved is put back into the plane.
         diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
         nodes[np.abs(nodes[:, 2]) < 6e-3 * diagonal, 2] = 0.0

@@ -40,9 +40,8 @@ from egs_warp.pipelines.report import (
     Report,
     stage_times,
 )
-from egs_warp.pipelines.shot import Shot
+from egs_warp.pipelines.shot import LARGEST_SIDE, SMALLEST_SIDE, Shot
 
-LARGEST_SIZE = 4096
 LARGEST_FRICTION = 10.0
 
 
@@ -79,8 +78,9 @@ class AnimateOptions:
             raise ArgumentError("heading_degrees", f"give a number of degrees {span}", value=turn)
         if self.frames is not None and self.frames < 1:
             raise ArgumentError("frames", "give a whole number of at least 1", value=self.frames)
-        if not 16 <= self.size <= LARGEST_SIZE:
-            raise ArgumentError("size", f"give a number of pixels from 16 to {LARGEST_SIZE}", value=self.size)
+        if not SMALLEST_SIDE <= self.size <= LARGEST_SIDE:
+            advice = f"give a number of pixels from {SMALLEST_SIDE} to {LARGEST_SIDE}"
+            raise ArgumentError("size", advice, value=self.size)
         if not 0.0 <= self.friction <= LARGEST_FRICTION:
             advice = f"give a Coulomb coefficient from 0 to {LARGEST_FRICTION:g}"
             raise ArgumentError("friction", advice, value=self.friction)

@@ -22,7 +22,7 @@ from egs_warp.io.video import VideoWriter, contact_sheet, write_png
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.performance import Performance
-from egs_warp.pipelines.shot import Shot, resized
+from egs_warp.pipelines.shot import Shot, nearest_steps, resized
 from egs_warp.render.backdrop import Behind, CapturedScene, Floor, PlainColour
 from egs_warp.render.compositing import RenderedImage
 from egs_warp.render.rasteriser import render_gaussians
@@ -84,7 +84,7 @@ def draw_film(
     """
     creature, simulation = performance.creature, performance.simulation
     trajectory, shot = simulation.trajectory, shot or Shot()
-    steps = simulation.frames if shot.fps == FRAME_RATE else shot.steps(trajectory.time)
+    steps = simulation.frames if shot.fps == FRAME_RATE else nearest_steps(trajectory.time, shot.fps)
     camera = resized(performance.camera(size, view_from), *(shot.size or (size, size)))
     cameras = shot.cameras(camera, trajectory, steps)
     # The whole motion is known, so what it will bend is split before the first frame, and nothing can pop.
@@ -139,10 +139,11 @@ def drawn_frames(
     """A picture for each of ``steps`` (n,) of the trajectory through each of the n ``cameras``; what does not change
     from one to the next is made once. ``scene`` lies in the body's frame.
     """
+    path = np.einsum("n,fni->fi", trajectory.node_mass, trajectory.positions) / trajectory.node_mass.sum()
     behind: Behind | None = None
     for index, (step, camera) in enumerate(zip(steps, cameras, strict=True)):
         if behind is None or camera is not cameras[index - 1]:
-            behind = _behind(trajectory, camera, scene, shot, shadow=shadow)
+            behind = _behind(path, trajectory.height, camera, scene, shot, shadow=shadow)
         marks = [time.perf_counter()]
         deformed = deformer.deform(trajectory.positions[step])
         marks.append(time.perf_counter())
@@ -167,9 +168,10 @@ def _over_white(image: np.ndarray) -> np.ndarray:
     return np.rint(alpha * image[..., :3] + 255.0 * (1.0 - alpha)).astype(np.uint8)
 
 
-def _behind(trajectory: Trajectory, camera: Camera, scene: GaussianCloud | None, shot: Shot, *, shadow: bool) -> Behind:
-    height = trajectory.height
-    path = np.einsum("n,fni->fi", trajectory.node_mass, trajectory.positions) / trajectory.node_mass.sum()
+def _behind(
+    path: np.ndarray, height: float, camera: Camera, scene: GaussianCloud | None, shot: Shot, *, shadow: bool
+) -> Behind:
+    """``path`` (F+1, 3) is that of the centre of mass of a body ``height`` tall."""
     com = path.mean(axis=0)
     centre = com * [1.0, 1.0, 0.0]
     reach = 2.2 * (height + float(np.linalg.norm(np.ptp(path, axis=0))))

@@ -13,7 +13,7 @@ import numpy as np
 from egs_warp.deformation.deformer import Deformer
 from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.deformation.rigid import in_body_frame
-from egs_warp.errors import UserError
+from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh
@@ -23,6 +23,7 @@ from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines import drawn
 from egs_warp.pipelines.drawn import DrawnCreature
+from egs_warp.pipelines.shot import nearest_steps
 
 PARTS = "trajectory.parts"
 """Folder that takes the steps of a run as they are done; it goes when ``trajectory.npz`` is there."""
@@ -86,9 +87,17 @@ class FinishedRun:
     @cached_property
     def steps(self) -> np.ndarray:
         """(n,) the step that is nearest to each frame at 60 Hz."""
-        time = self.trajectory.time
-        frames = np.arange(round(FRAME_RATE * (time[-1] - time[0])) + 1) / FRAME_RATE + time[0]
-        return np.searchsorted(0.5 * (time[1:] + time[:-1]), frames)
+        return nearest_steps(self.trajectory.time, FRAME_RATE)
+
+    def frame_number(self, frame: int, *, asked_by: str) -> int:
+        """From 0, of ``frame``, which may count from the end. Raises ``ArgumentError`` about the argument ``asked_by``
+        for one that is not there.
+        """
+        count = len(self.steps)
+        if not -count <= frame < count:
+            advice = f"the run has {count} frames; give 0 to {count - 1}, or -1 for the last"
+            raise ArgumentError(asked_by, advice, value=frame)
+        return frame % count
 
     @cached_property
     def mesh(self) -> TetMesh:

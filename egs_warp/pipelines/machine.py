@@ -93,7 +93,7 @@ class Machine:
 
 
 def inspect_machine() -> Machine:
-    """Look at everything; call ``use_device`` before. Nothing is installed, compiled or written but a probe."""
+    """Look at everything; call ``use_device`` before. Nothing is installed, compiled or written."""
     driver, toolkit = wp.get_cuda_driver_version(), wp.get_cuda_toolkit_version()
     devices = tuple(_device_facts(device) for device in wp.get_devices())
     cache = Path(wp.config.kernel_cache_dir or ".")

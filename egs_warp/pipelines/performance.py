@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.frames import box_corners
 from egs_warp.locomotion.rollout import FRAME_RATE, Simulation, roll_out
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.script import Script
@@ -46,7 +47,7 @@ class Performance:
         low, high = local.min(axis=0), local.max(axis=0)
         low[2] = min(low[2], 0.0)
         middle = 0.5 * (low + high)
-        corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+        corners = box_corners(low, high)
         direction = np.array(FILMED_FROM)
         if view_from is not None:
             direction = ground.axes @ (self.creature.frame.axes @ np.asarray(view_from, float))

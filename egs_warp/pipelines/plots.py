@@ -10,6 +10,7 @@ import numpy as np
 from egs_warp.io.atomic import atomic_write
 from egs_warp.locomotion.ledger import Ledger
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.pipelines.report import AUDIT_LIMITS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -88,7 +89,7 @@ def _draw_load(axes: Axes, t: Trajectory) -> None:
 def _draw_residual(axes: Axes, t: Trajectory, ledger: Ledger) -> None:
     residual = np.abs(ledger.residual)
     axes.stairs(np.maximum(residual, 1e-17), t.time, label="what a step misses", baseline=1e-17)
-    axes.axhline(1e-6, color="k", linestyle=":", label="bound")
+    axes.axhline(AUDIT_LIMITS["energy_residual"], color="k", linestyle=":", label="bound")
     axes.set_yscale("log")
     axes.set_title(f"Ledger: closes to {residual.max(initial=0.0):.1e} of m g H")
     axes.legend(fontsize="small")

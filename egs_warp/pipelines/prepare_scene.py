@@ -26,6 +26,13 @@ if TYPE_CHECKING:
     from egs_warp.inpainting.inpainters import Inpainter
     from egs_warp.training.finetune import TrainingView
 
+_CLEARED = {
+    Clearing.NONE: "left as they are",
+    Clearing.REMOVE: "left out",
+    Clearing.FINETUNE: "fine-tuned clear of it",
+    Clearing.SPLIT: "split at it",
+}
+
 
 @dataclass(frozen=True)
 class SceneOptions:
@@ -132,7 +139,7 @@ def take_apart(
     notes = (
         f"the object has {untouched.count} of {cloud.count} Gaussians; {int(found.buried_mask.sum())} under it and "
         f"{int(found.floater_mask.sum())} floaters beside it were dropped",
-        f"{int((np.abs(heights) < reach).sum())} of the object's Gaussians straddled the plane: {method.value}"
+        f"{int((np.abs(heights) < reach).sum())} of the object's Gaussians straddled the plane: {_CLEARED[method]}"
         + (f" against {len(photographs)} photographs" if photographs and method is Clearing.FINETUNE else ""),
     )
     return thing, cloud.subset(found.background_mask), notes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Sequence
 from enum import Enum
 from pathlib import Path
 
@@ -10,11 +11,13 @@ import numpy as np
 from tqdm import tqdm
 
 from egs_warp.errors import ArgumentError, UserError
-from egs_warp.io.atomic import writable_folder
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.frames import box_corners
+from egs_warp.io.sequence import frame_paths
 from egs_warp.io.video import VideoWriter, write_png
 from egs_warp.pipelines.film import Frame, drawn_frames
 from egs_warp.pipelines.finished_run import FinishedRun
-from egs_warp.pipelines.shot import Shot, around, resized, turntable
+from egs_warp.pipelines.shot import Shot, around, nearest_steps, resized, turntable
 
 _MILLIMETRES = 1000.0
 
@@ -42,7 +45,8 @@ def render_run(
     """Write a video (.mp4, .mov, .webm), or a folder of PNGs where ``out`` has no ending; returns how many frames.
 
     ``hold``: this frame at 60 Hz alone, and the camera goes around it once. The same arguments give the same pictures.
-    Raises ``UserError`` for a frame that the run does not have, and a name or shot that does not fit the other.
+    Raises ``UserError`` for a frame that the run does not have, a name or shot that does not fit the other, and a
+    folder that holds other frames.
     """
     folder = out.suffix == ""
     if shot.transparent and (show is not Show.COLOUR or (not folder and out.suffix.lower() == ".mp4")):
@@ -50,33 +54,30 @@ def render_run(
         raise ArgumentError("background", f"H.264, depth and alpha have no transparency; {advice}", value="transparent")
     t = run.trajectory
     if hold is None:
-        steps = shot.steps(t.time)
+        steps = nearest_steps(t.time, shot.fps)
         cameras = shot.cameras(run.creature.camera, t, steps)
     else:
-        count = len(run.steps)
-        if not -count <= hold < count:
-            raise ArgumentError("turntable", f"the run has {count} frames; give 0 to {count - 1}, or -1", value=hold)
-        steps = np.full(turntable(shot.fps), run.steps[hold])
+        steps = np.full(turntable(shot.fps), run.steps[run.frame_number(hold, asked_by="turntable")])
         base = resized(run.creature.camera, *(shot.size or (run.creature.camera.width, run.creature.camera.height)))
         cameras = around(base, t.positions[steps[:1]], count=len(steps))
     frames = drawn_frames(run.deformer(), t, steps, cameras, shot, scene=run.scene, shadow=shadow)
     corners = t.positions[steps] if hold is None else t.positions[steps[:1]]
     near, far = _depths(corners.reshape(-1, 3), cameras) if show is Show.DEPTH else (0.0, 1.0)
+    pictures = frame_paths(out, range(len(steps)), ".png") if folder else []
     with contextlib.ExitStack() as stack:
-        if folder:
-            place, video = writable_folder(out), None
-        else:
+        video = None
+        if not folder:
             width, height = cameras[0].width, cameras[0].height
             writer = VideoWriter(out, width, height, frames_per_second=shot.fps, alpha=shot.transparent)
-            place, video = out, stack.enter_context(writer)
+            video = stack.enter_context(writer)
         bar = stack.enter_context(tqdm(total=len(steps), desc="render", unit="frame", disable=quiet))
         for index, frame in enumerate(frames):
             if video is not None:
                 video.write(_picture(frame, show, near, far))
             elif show is Show.DEPTH:
-                write_png(place / f"frame{index:04d}.png", _millimetres(frame))
+                write_png(pictures[index], _millimetres(frame))
             else:
-                write_png(place / f"frame{index:04d}.png", _picture(frame, show, near, far))
+                write_png(pictures[index], _picture(frame, show, near, far))
             bar.update()
     return len(steps)
 
@@ -95,10 +96,9 @@ def _millimetres(frame: Frame) -> np.ndarray:
     return np.where(there, np.clip(np.rint(_MILLIMETRES * frame.image.depth.numpy()), 1, 65535), 0).astype(np.uint16)
 
 
-def _depths(points: np.ndarray, cameras: list) -> tuple[float, float]:
+def _depths(points: np.ndarray, cameras: Sequence[Camera]) -> tuple[float, float]:
     """Least and greatest z-depth of the nodes ``points`` (n, 3) in any of the cameras."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    corners = box_corners(points.min(axis=0), points.max(axis=0))
     depths = np.concatenate([(corners - camera.centre) @ camera.rotation[2] for camera in cameras])
     if depths.max() <= 0.0:
         raise UserError("camera: the creature is behind it all the time; turn it round")

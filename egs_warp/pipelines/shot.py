@@ -13,12 +13,14 @@ from scipy.ndimage import gaussian_filter1d
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.frames import box_corners
 from egs_warp.io.text import parse_json, read_text
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
 
 CAMERAS = ("fixed", "follow", "orbit")
-LARGEST_SIDE = 4096
+SMALLEST_SIDE, LARGEST_SIDE = 16, 4096
+"""Pixels of a film."""
 FASTEST = 1000.0
 _SMOOTH = 0.25
 """Seconds: standard deviation of the window over which a camera that follows is slow."""
@@ -46,9 +48,10 @@ class Shot:
     """Nothing behind the creature but its shadow."""
 
     def __post_init__(self) -> None:
-        if self.size is not None and not all(16 <= side <= LARGEST_SIDE for side in self.size):
+        if self.size is not None and not all(SMALLEST_SIDE <= side <= LARGEST_SIDE for side in self.size):
             text = "x".join(map(str, self.size))
-            raise ArgumentError("size", f"give pixels from 16 to {LARGEST_SIDE}, as 512 or 640x360", value=text)
+            advice = f"give pixels from {SMALLEST_SIDE} to {LARGEST_SIDE}, as 512 or 640x360"
+            raise ArgumentError("size", advice, value=text)
         if not 1.0 <= self.fps <= FASTEST:
             raise ArgumentError("fps", f"give a number of frames a second from 1 to {FASTEST:g}", value=self.fps)
         if self.camera not in CAMERAS and not self.camera.endswith(".json"):
@@ -64,11 +67,6 @@ class Shot:
         if self.camera not in CAMERAS:
             _keys(Path(self.camera))
 
-    def steps(self, time: np.ndarray) -> np.ndarray:
-        """(n,) the solver step that is nearest to each frame, of steps that end at ``time`` (F + 1,) s."""
-        frames = np.arange(round(self.fps * (time[-1] - time[0])) + 1) / self.fps + time[0]
-        return np.searchsorted(0.5 * (time[1:] + time[:-1]), frames)
-
     def cameras(self, camera: Camera, trajectory: Trajectory, steps: np.ndarray) -> list[Camera]:
         """One for each of ``steps`` (n,); ``camera`` is the film's own. Raises ``UserError`` for a bad file of keys."""
         base = resized(camera, *self.size) if self.size is not None else camera
@@ -79,6 +77,12 @@ class Shot:
         if self.camera == "orbit":
             return around(base, trajectory.positions[steps])
         return _through_keys(Path(self.camera), base, trajectory, steps)
+
+
+def nearest_steps(time: np.ndarray, fps: float) -> np.ndarray:
+    """(n,) the step that is nearest to each of ``fps`` frames a second, of steps that end at ``time`` (F + 1,) s."""
+    frames = np.arange(round(fps * (time[-1] - time[0])) + 1) / fps + time[0]
+    return np.searchsorted(0.5 * (time[1:] + time[:-1]), frames)
 
 
 def turntable(fps: float) -> int:
@@ -110,7 +114,7 @@ def around(camera: Camera, positions: np.ndarray, *, count: int | None = None) -
     low, high = points.min(axis=0), points.max(axis=0)
     middle = 0.5 * (low + high)
     count = count or len(positions)
-    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    corners = box_corners(low, high)
     forward = camera.rotation[2]
     distance = 0.5 * float(np.linalg.norm(high - low))
     for _ in range(200):

@@ -55,6 +55,8 @@ class ContactShadow:
         points = camera.centre + np.where(self.hit, self.depth, 0.0)[..., None] * rays
         self.flat = (points - centre) @ self._tangents.T
         """(H, W, 2) place on the plane, world units from the centre."""
+        self.fade = np.clip(1.6 - 1.6 * np.linalg.norm(self.flat, axis=-1) / reach, 0.0, 1.0)
+        """(H, W) 1 around the centre, 0 from ``reach`` on."""
         seen = np.zeros_like(self.depth) if depth is None else depth
         ground = np.where((seen > 0.0)[..., None], camera.centre + seen[..., None] * rays, points)
         self.lift = plane.heights(ground)
@@ -111,11 +113,10 @@ class Floor:
         self._shadow = ContactShadow(camera, plane, centre=centre, reach=reach)
         self._strength = 1.0 if shadow else 0.0
         flat = self._shadow.flat
-        fade = np.clip(1.6 - 1.6 * np.linalg.norm(flat, axis=-1) / reach, 0.0, 1.0) * self._shadow.hit
         distance = np.abs((flat / cell + 0.5) % 1.0 - 0.5) * cell
         line = np.clip(1.0 - distance / (1.2 * self._shadow.pixel[..., None]), 0.0, 1.0).max(axis=-1)
         colour = _FLOOR + line[..., None] * (_LINE - _FLOOR)
-        self._fade = fade.astype(np.float32)[..., None]
+        self._fade = (self._shadow.fade * self._shadow.hit).astype(np.float32)[..., None]
         self._bare = (_SKY + self._fade * (colour - _SKY)).astype(np.float32)
 
     def background(self, body: GaussianCloud, *, height: float) -> np.ndarray:
@@ -141,8 +142,7 @@ class PlainColour:
     ) -> None:
         """``centre`` (3,) and ``reach`` (world units) bound the shadow."""
         self._shadow = ContactShadow(camera, plane, centre=centre, reach=reach)
-        fade = np.clip(1.6 - 1.6 * np.linalg.norm(self._shadow.flat, axis=-1) / reach, 0.0, 1.0) * self._shadow.hit
-        self._fade = fade.astype(np.float32) * (1.0 if shadow else 0.0)
+        self._fade = (self._shadow.fade * self._shadow.hit).astype(np.float32) * (1.0 if shadow else 0.0)
         self._colour = np.asarray(colour, np.float32)
 
     def cover(self, body: GaussianCloud, *, height: float) -> np.ndarray:
@@ -183,8 +183,7 @@ class CapturedScene:
         kernel = 2 * (max(camera.width, camera.height) // 40) + 1
         on_plane = np.asarray(cv2.medianBlur(np.rint(255.0 * on_plane).astype(np.uint8), kernel), np.float64) / 255.0
         on_plane = cv2.GaussianBlur(on_plane, (0, 0), _SOFTENED * kernel)
-        fade = np.clip(1.6 - 1.6 * np.linalg.norm(self._shadow.flat, axis=-1) / reach, 0.0, 1.0)
-        strength = on_plane * fade * image.alpha.numpy() if shadow else np.zeros_like(fade)
+        strength = on_plane * self._shadow.fade * image.alpha.numpy() if shadow else np.zeros_like(on_plane)
         self._fade = strength.astype(np.float32)[..., None]
 
     def background(self, body: GaussianCloud, *, height: float) -> np.ndarray:

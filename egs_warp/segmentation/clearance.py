@@ -41,13 +41,13 @@ class Reach(enum.Enum):
 class Clearing(enum.Enum):
     """What happens to Gaussians of the object that straddle its plane."""
 
-    NONE = "mask only"
+    NONE = "none"
     """Nothing."""
     REMOVE = "remove"
     """They are left out."""
-    FINETUNE = "L_seg"
+    FINETUNE = "finetune"
     """They shrink and move until they are clear of it, while the object keeps its looks (Eq. 21)."""
-    SPLIT = "static split"
+    SPLIT = "split"
     """Each is replaced by the part of it above the plane."""
 
 

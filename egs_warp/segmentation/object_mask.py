@@ -295,7 +295,7 @@ def masks_from_selection(cloud: GaussianCloud, selection: np.ndarray, cameras: S
     from egs_warp.render.rasteriser import render_gaussians
 
     sh = np.zeros((cloud.count, 1, 3), np.float32)
-    sh[:, 0, :] = np.where(selection, 0.5, -0.5)[:, None] / 0.28209479177387814
+    sh[:, 0, :] = np.where(selection, 0.5, -0.5)[:, None] / SH_BAND_0
     painted = GaussianCloud.from_numpy(
         cloud.means.numpy(),
         cloud.rotations.numpy(),

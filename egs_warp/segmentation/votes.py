@@ -13,15 +13,13 @@ import warp as wp
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.launching import available_threads
 from egs_warp.render.backward import backward
 from egs_warp.render.compositing import composite
 from egs_warp.render.projection import project, view_from_camera
 from egs_warp.render.rasteriser import background_of, refusing_what_does_not_fit
 from egs_warp.render.tiles import build_tile_lists
-
-_SH_0 = 0.28209479177387814
 
 
 @dataclass(frozen=True)
@@ -107,7 +105,7 @@ def _votes_of_view(grey: GaussianCloud, masked: MaskedView) -> np.ndarray:
             want_pose=False,
             threads=threads,
         )
-    by_colour = gradients.sh.numpy()[:, 0, :2].astype(np.float64) / _SH_0
+    by_colour = gradients.sh.numpy()[:, 0, :2].astype(np.float64) / SH_BAND_0
     visible = np.diff(projected.slot_end.numpy(), prepend=0) > 0
     # -ln(alpha / opacity) = a u^2 + v w^2 integrates to pi / sqrt(a v).
     a, (v, log_opacity) = projected.ellipse.numpy()[visible, 2], projected.falloff.numpy()[visible].T

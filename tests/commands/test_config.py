@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from egs_warp import cli
 from egs_warp.assets import pawn
 from egs_warp.commands import COMMANDS
 from egs_warp.commands.config import with_config, write_config
+from egs_warp.errors import UserError
 from egs_warp.io import write_ply
 
 
@@ -30,6 +32,27 @@ def test_a_run_from_its_file_has_the_same_bits(tmp_path: Path, capsys: pytest.Ca
     assert cli.main([*again[:-1], str(tmp_path / "c"), "--frames", "2"]) == 0
     assert "is not the file that the run of" in capsys.readouterr().err
     assert yaml.safe_load((tmp_path / "c" / "run.yaml").read_text())["frames"] == 2
+
+
+def test_a_run_that_is_interrupted_has_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is there as soon as a step of the simulation is; bad input that shows before leaves nothing."""
+    write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=4000).cloud)
+    flags = ["animate", str(tmp_path / "pawn.ply"), "--up", "z", "--friction", "0.7", "--out", str(tmp_path / "a")]
+
+    def interrupted(*_: object, parts: Callable[[], Path], **__: object) -> None:
+        parts().mkdir()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("egs_warp.pipelines.animate.simulate", interrupted)
+    assert cli.main(flags) == 130
+    assert yaml.safe_load((tmp_path / "a" / "run.yaml").read_text())["friction"] == 0.7
+
+    def refused(*_: object, **__: object) -> None:
+        raise UserError("jump: this body cannot")
+
+    monkeypatch.setattr("egs_warp.pipelines.animate.simulate", refused)
+    assert cli.main([*flags[:-1], str(tmp_path / "b")]) == 2
+    assert list((tmp_path / "b").iterdir()) == []
 
 
 def _given(arguments: list[str]) -> dict:

@@ -14,7 +14,7 @@ from egs_warp.io import read_capture
 
 
 def test_the_two_commands_fit_the_two_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["samples", str(tmp_path / "new" / "samples")]) == 0
+    assert cli.main(["samples", str(tmp_path / "new" / "my samples")]) == 0
     said = capsys.readouterr().out
     commands = [shlex.split(line) for line in re.findall(r"^  egs-warp (.+)$", said, re.MULTILINE)]
     assert len(commands) == 2

@@ -173,4 +173,5 @@ def test_infinite_opacities_are_counted_and_made_finite(tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_bytes(data)
     capture = read_capture(tmp_path / "a.ply", device="cpu")
     assert capture.infinite_opacities == 2
+    assert capture.notes == ("2 infinite opacities were read as 0 or 1",)
     np.testing.assert_array_equal(capture.cloud.opacity_logits.numpy()[1:], [-16.0, 16.0])

@@ -37,6 +37,25 @@ def test_the_manifest_comes_last_and_holds_checksums(tmp_path: Path) -> None:
     assert sorted(os.listdir(tmp_path / "out")) == ["a.txt", "b.txt", MANIFEST]
 
 
+def test_what_a_run_begins_with_is_there_before_its_first_file(tmp_path: Path) -> None:
+    """Once, after an earlier run is moved aside; a run without files has none of it."""
+    finished(tmp_path, flags="1")
+    begun: list[list[str]] = []
+    with run_folder(tmp_path, overwrite=True) as run:
+
+        def begin() -> None:
+            run.file("flags.txt").write_text("2")
+            begun.append(sorted(os.listdir(tmp_path)))
+
+        run.begin_with(begin)
+        assert (tmp_path / "flags.txt").read_text() == "1"
+        run.file("a.txt")
+        run.file("b.txt")
+    assert len(begun) == 1 and "earlier-1" in begun[0]
+    assert list(manifest(tmp_path)["files"]) == ["flags.txt", "a.txt", "b.txt"]
+    assert (tmp_path / "earlier-1" / "flags.txt").read_text() == "1"
+
+
 def test_an_earlier_run_is_refused_or_moved_aside_whole(tmp_path: Path) -> None:
     finished(tmp_path, hop="1", report="1")
     (tmp_path / "mine.txt").write_text("mine")

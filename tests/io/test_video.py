@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import subprocess
 from pathlib import Path
 
 import cv2
@@ -50,6 +52,18 @@ def test_a_failed_video_leaves_the_old_one(tmp_path: Path) -> None:
         video.write(np.zeros((8, 16, 3), np.uint8))
     assert path.read_bytes() == b"good"
     assert os.listdir(tmp_path) == ["v.mp4"]
+
+
+def test_an_ffmpeg_that_does_not_start_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(*_: object, **__: object) -> None:
+        raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    ffmpeg = ffmpeg_program()
+    monkeypatch.setattr("egs_warp.io.video.ffmpeg_program", lambda: ffmpeg)
+    monkeypatch.setattr(subprocess, "Popen", failing)
+    with pytest.raises(UserError, match=r"v\.mp4: cannot be written \(Resource temporarily unavailable\)"):
+        VideoWriter(tmp_path / "v.mp4", 16, 16).__enter__()
+    assert os.listdir(tmp_path) == []
 
 
 def test_unwritable_places_are_named(tmp_path: Path) -> None:

@@ -191,8 +191,11 @@ def test_target_nodes() -> None:
         build_cage(thing.cloud, thing.plane, target_nodes=3)
 
 
-def test_tetwild() -> None:
-    """fTetWild itself, not the lattice it falls back to, keeps the same promises and fills the same solid."""
+def test_tetwild(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """fTetWild itself, not the lattice it falls back to, keeps the same promises, fills the same solid and leaves no
+    file behind.
+    """
+    monkeypatch.chdir(tmp_path)
     thing = pawn(gaussian_count=6000)
     cage = build_cage(thing.cloud, thing.plane, method=CageMethod.TETWILD)
     _check(cage, thing.plane)
@@ -200,6 +203,7 @@ def test_tetwild() -> None:
     lattice = build_cage(thing.cloud, thing.plane)
     assert cage.mesh.volumes().sum() == pytest.approx(lattice.mesh.volumes().sum(), rel=0.1)
     assert not np.array_equal(cage.mesh.tets, lattice.mesh.tets)
+    assert not list(tmp_path.iterdir())
 
 
 def test_where_tetwild_fails_the_lattice_stands_in(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,6 @@ from egs_warp.cli import main
 from egs_warp.pipelines.bundle import export_bundle
 from egs_warp.pipelines.finished_run import FinishedRun
 
-pytestmark = pytest.mark.xdist_group("page")
 READER = Path(__file__).parents[2] / "examples" / "read_bundle.py"
 
 

@@ -53,6 +53,17 @@ def test_a_sequence_is_numbered_at_sixty_hertz(run: FinishedRun, tmp_path: Path,
     assert names == [f"frame{k:04d}.compressed.ply" for k in (0, 4, 8, 12)]
     assert "frame0000.compressed.ply to frame0012.compressed.ply" in capsys.readouterr().out
     assert read_capture(tmp_path / "out" / names[0]).cloud.count == run.creature.splats.count
+    # The same again is written over; others would be shown in turns with these.
+    (tmp_path / "out" / "frames.compressed.ply").write_text("not one of them")
+    assert main(flags) == 0
+    capsys.readouterr()
+    assert main([*flags[:-1], "6"]) == 2
+    error = capsys.readouterr().err
+    assert (
+        "out: it has other frames (frame0004.compressed.ply, ...); choose another folder" in error
+        and error.count("\n") == 1
+    )
+    assert len(export_splats(run, tmp_path / "out", "compressed-ply", frame=5, quiet=True)) == 1
 
 
 def _glb(path: Path) -> tuple[dict, dict[str, np.ndarray]]:

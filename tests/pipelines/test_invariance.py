@@ -19,7 +19,7 @@ from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.io import read_capture
 from egs_warp.locomotion.rollout import Simulation
 from egs_warp.locomotion.stepper import LocomotionStepper
-from egs_warp.locomotion.trajectory import measure
+from egs_warp.locomotion.trajectory import Reached, measure
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import FILMED_FROM, Creature, first_place, make_creature
 from egs_warp.pipelines.performance import simulate
@@ -133,9 +133,18 @@ def test_trajectory_leads_back_to_the_capture(elsewhere: tuple[Lying, Creature, 
     assert trajectory.height / trajectory.metres_per_unit == pytest.approx(0.37, rel=0.05)
 
 
-def amplified(measured: str) -> pytest.MarkDecorator:
-    """Not met: rounding grows in a jump. ``measured`` says by how much; distances and heights in body heights."""
-    return pytest.mark.xfail(reason=f"rounding grows in a jump: {measured}", strict=False)
+LIMIT, KNOWN_MISS = 0.01, 0.06
+"""Of distance and height: what is wanted, and what rounding that grows in a jump costs today. Measured: the pawn in
+another unit and turned, distance +1.1 % and height -4.4 %; monkey -1.002 % and +0.39 %; plush dog -0.74 % and -1.76 %.
+"""
+
+
+def assert_goes_as_far(again: Reached, reached: Reached) -> None:
+    """Fails beyond ``KNOWN_MISS``; between it and ``LIMIT`` the test is an expected failure."""
+    misses = {name: getattr(again, name) / getattr(reached, name) - 1.0 for name in ("distance", "height")}
+    assert all(abs(miss) < KNOWN_MISS for miss in misses.values()), misses
+    if any(abs(miss) > LIMIT for miss in misses.values()):
+        pytest.xfail(f"rounding grows in a jump: {misses}")
 
 
 CHANGES = {
@@ -145,43 +154,21 @@ CHANGES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param("x0.37", marks=amplified("distance 0.5206 and 0.5264 (1.1 %), height 0.2116 and 0.2022 (4.4 %)")),
-        pytest.param("turned", marks=amplified("distance 0.5206 and 0.5267 (1.2 %), height 0.2116 and 0.2022 (4.4 %)")),
-    ],
-)
+@pytest.mark.parametrize("name", CHANGES)
 def test_jump_goes_as_far_in_any_unit_and_turned(thing: Lying, name: str) -> None:
-    """Distance and height within 1 %."""
     reached, again = (measure(jump(one)[1].trajectory) for one in (thing, CHANGES[name](thing)))
-    assert again.distance == pytest.approx(reached.distance, rel=0.01)
-    assert again.height == pytest.approx(reached.height, rel=0.01)
+    assert_goes_as_far(again, reached)
 
 
 @pytest.mark.slow
 @pytest.mark.data
-@pytest.mark.parametrize(
-    ("name", "up"),
-    [
-        pytest.param(
-            *("monkey.ply", (0, 1, 0)),
-            marks=amplified("distance 0.5347 and 0.5294 (1.002 %), height 0.1972 and 0.1980 (0.4 %)"),
-        ),
-        pytest.param(
-            "plush_dog.ply",
-            (0, -1, 0),
-            marks=amplified("distance 0.5263 and 0.5224 (0.7 %), height 0.2020 and 0.1984 (1.8 %)"),
-        ),
-    ],
-)
+@pytest.mark.parametrize(("name", "up"), [("monkey.ply", (0, 1, 0)), ("plush_dog.ply", (0, -1, 0))])
 def test_jump_of_real_captures_goes_as_far(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:
-    """Turned and in another unit, with nothing but up: distance and height within 1 %."""
+    """Turned and in another unit, with nothing but up."""
     cloud = read_capture(data_dir / "objects" / name).cloud
     lying = Lying(cloud, find_base_plane(cloud, np.array(up, float)))
     reached, again = (measure(jump(one, by_up=True)[1].trajectory) for one in (lying, lying.turned().scaled(0.37)))
-    assert again.distance == pytest.approx(reached.distance, rel=0.01)
-    assert again.height == pytest.approx(reached.height, rel=0.01)
+    assert_goes_as_far(again, reached)
 
 
 def test_front_is_where_the_face_is(monkeypatch: pytest.MonkeyPatch) -> None:

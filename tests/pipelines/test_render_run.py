@@ -17,9 +17,7 @@ from egs_warp.io.video import VideoWriter
 from egs_warp.pipelines.film import drawn_frames
 from egs_warp.pipelines.finished_run import FinishedRun
 from egs_warp.pipelines.render_run import Show, render_run
-from egs_warp.pipelines.shot import Shot, around, resized
-
-pytestmark = pytest.mark.xdist_group("page")
+from egs_warp.pipelines.shot import Shot, around, nearest_steps, resized
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +45,7 @@ def test_without_flags_it_is_the_film_bit_for_bit(run_folder: Path, tmp_path: Pa
 @pytest.mark.parametrize("camera", ["fixed", "follow", "orbit"])
 def test_every_camera_holds_the_whole_creature(camera: str, run: FinishedRun) -> None:
     shot = Shot(camera, size=(160, 90))
-    steps = shot.steps(run.trajectory.time)
+    steps = nearest_steps(run.trajectory.time, shot.fps)
     cameras = shot.cameras(run.creature.camera, run.trajectory, steps)
     assert len(cameras) == len(steps) == 13
     for one, step in zip(cameras, steps, strict=True):
@@ -76,7 +74,7 @@ def test_a_path_goes_through_its_keys_in_the_frame_of_the_capture(run: FinishedR
     ]
     (tmp_path / "path.json").write_text(json.dumps({"keys": keys}))
     shot = Shot(str(tmp_path / "path.json"))
-    cameras = shot.cameras(run.creature.camera, t, shot.steps(t.time))
+    cameras = shot.cameras(run.creature.camera, t, nearest_steps(t.time, shot.fps))
     for index, key in ((0, 0), (3, 0), (9, 1), (12, 1)):
         eye = t.in_capture(cameras[index].centre)
         np.testing.assert_allclose(eye, keys[key]["eye"], atol=0.05 if index in (3, 9) else 1e-9)
@@ -89,6 +87,8 @@ def test_a_path_goes_through_its_keys_in_the_frame_of_the_capture(run: FinishedR
 def test_frames_a_second_and_size(run: FinishedRun, tmp_path: Path) -> None:
     assert render_run(run, tmp_path / "slow", Shot(size=(48, 32), fps=120.0), quiet=True) == 25
     assert _png(tmp_path / "slow" / "frame0024.png").shape == (32, 48, 3)
+    with pytest.raises(UserError, match=r"slow: it has other frames \(frame0013\.png, \.\.\.\); choose another folder"):
+        render_run(run, tmp_path / "slow", Shot(size=(48, 32)), quiet=True)
     camera = run.creature.camera
     assert resized(camera, camera.width, camera.height) is camera
     wide = resized(camera, 3 * camera.width, 2 * camera.height)
@@ -141,7 +141,7 @@ def test_videos_keep_alpha(ending: str, run: FinishedRun, tmp_path: Path) -> Non
         check=True,
     )
     frames = np.frombuffer(done.stdout, np.uint8).reshape(-1, size, size, 4).astype(int)
-    steps = shot.steps(run.trajectory.time)
+    steps = nearest_steps(run.trajectory.time, shot.fps)
     cameras = shot.cameras(run.creature.camera, run.trajectory, steps)
     drawn = [
         frame.picture().astype(int) for frame in drawn_frames(run.deformer(), run.trajectory, steps, cameras, shot)

@@ -1,10 +1,12 @@
-"""Every reader of the package, with good files to begin from and what a file that is read must fulfil.
+"""Every reader of strangers' files, with good files to begin from and what a file that is read must fulfil.
 
 ``tests/support/damage.py`` makes inputs of them.
 """
 
 from __future__ import annotations
 
+import argparse
+import base64
 import gzip
 import io
 import json
@@ -16,11 +18,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from PIL import Image
 
+from egs_warp.commands.animate import add_parser
+from egs_warp.commands.config import with_config
 from egs_warp.commands.object_flag import read_mask
 from egs_warp.contact.terrain import read_terrain
 from egs_warp.errors import UserError
@@ -36,6 +40,7 @@ from egs_warp.io.ply import read_point_ply
 from egs_warp.motions.keyframes import read_keyframes
 from egs_warp.motions.script import motion
 from egs_warp.muscles.files import read_muscles
+from egs_warp.pipelines.shot import Shot
 from tests.support import onnx
 from tests.support.captures import ARRAYS, good_bytes, small_cloud, spz_of_streams
 from tests.support.meshes import block_mesh
@@ -156,6 +161,20 @@ def _keys(path: Path) -> None:
         assert np.isfinite([key.time, *key.value, key.weight]).all()
 
 
+def _camera_path(path: Path) -> None:
+    Shot(str(path)).check()
+
+
+class _Flags(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UserError(message)
+
+
+def _config(path: Path) -> None:
+    add_parser(commands := _Flags().add_subparsers())
+    assert f"--config={path}" in with_config(["--config", str(path)], commands.choices["animate"])
+
+
 def _photo(path: Path) -> None:
     photo = read_photo(
         PosedImage("a", Camera(24, 16, 30.0, 30.0, 12.0, 8.0, np.eye(3), np.zeros(3)), path), max_side=20
@@ -236,7 +255,10 @@ _MUSCLES = {
 }
 _SCRIPT = [{"motion": "hop", "repeat": 2, "distance": 0.5}, {"motion": "twist", "heading_degrees": 90}]
 _KEYS = [{"time": 0.5, "part": "head", "quantity": "position", "value": [0, 0, -0.1], "weight": 2.0}]
+_LOOK = {"eye": [4, 3, 1.0], "target": [0.5, 0, 0.5]}
 _CSV = b"time,part,quantity,x,y,z,weight\n0.5,head,position,0,0,-0.1,1\n1.0,head,position,0,0,0.1,\n"
+_PATH = {"keys": [{"time": 0.0, "eye": [3, -4, 1.5], "target": [0, 0, 0.5], "fov": 30}, {"time": 1, **_LOOK}]}
+_CONFIG = b"# egs-warp\ncapture: a.ply\nmotion: hop x3, twist 180\nfriction: 0.4\nno-shadow: true\nup: -y\nframes: 9\n"
 _COLMAP = {
     "cameras.txt": b"# cameras\n1 OPENCV 24 16 30 30 12 8 0.1 0 0 0\n",
     "images.txt": b"# images\n1 1 0 0 0 0 0 2 1 a.png\n1.0 2.0 -1 3.0 4.0 1\n",
@@ -245,9 +267,7 @@ _COLMAP = {
 _SEEN = struct.pack("<Q2dq", 1, 3.0, 4.0, 1)
 _COLMAP_BIN = {
     "cameras.bin": struct.pack("<QiiQQ4d", 1, 1, 1, 24, 16, 30.0, 30.0, 12.0, 8.0),
-    "images.bin": struct.pack("<Qi7di", 1, 1, 1, 0, 0, 0, 0, 0, 2, 1)
-    + b"a.png\0"
-    + struct.pack("<Q2dq", 1, 3.0, 4.0, 1),
+    "images.bin": struct.pack("<Qi7di", 1, 1, 1, 0, 0, 0, 0, 0, 2, 1) + b"a.png\0" + _SEEN,
     "points3D.bin": struct.pack("<QQ3d3Bd", 1, 1, 0.5, 0.5, 2.0, 255, 128, 0, 0.3) + struct.pack("<Q2i", 1, 1, 0),
 }
 
@@ -275,6 +295,14 @@ def _glb() -> bytes:
         return (Path(folder) / "a.glb").read_bytes()
 
 
+def _gltf() -> bytes:
+    data = _glb()
+    size = int.from_bytes(data[12:16], "little")
+    tree, binary = json.loads(data[20 : 20 + size]), data[28 + size :]
+    tree["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
+    return _json(tree)
+
+
 def _spz_of_streams() -> bytes:
     return spz_of_streams(gzip.decompress(good_bytes("a.spz")), 7, 9)
 
@@ -287,6 +315,7 @@ READERS: tuple[Reader, ...] = (
     Reader("spz inside gzip", "a.spz", lambda: gzip.decompress(good_bytes("a.spz")), _capture, wrap=gzip.compress),
     Reader("spz of streams", "a.spz", _spz_of_streams, _capture),
     Reader("glb", "a.glb", _glb, _capture),
+    Reader("gltf", "a.gltf", _gltf, _capture, json=True),
     Reader("splat", "a.splat", lambda: good_bytes("a.splat"), _capture),
     Reader("sog", "a.sog", lambda: good_bytes("a.sog"), _capture),
     Reader("sog meta", "a.sog", lambda: _sog()["meta.json"], _capture, wrap=_zip_with_meta, json=True),
@@ -310,6 +339,8 @@ READERS: tuple[Reader, ...] = (
     Reader("motion line", "line.txt", lambda: b"hop x3, twist 180, walk 2, jump 0.5 height=0.3", _line),
     Reader("key frames", "keys.json", lambda: _json(_KEYS), _keys, json=True),
     Reader("key frames csv", "keys.csv", lambda: _CSV, _keys),
+    Reader("camera path", "path.json", lambda: _json(_PATH), _camera_path, json=True),
+    Reader("run.yaml", "run.yaml", lambda: _CONFIG, _config),
     Reader("mask", "mask.png", lambda: _picture("PNG", "L"), read_mask),
     Reader("photo png", "a.png", lambda: _picture("PNG", "RGB"), _photo),
     Reader("photo jpeg", "a.jpg", lambda: _picture("JPEG", "RGB"), _photo),

@@ -54,7 +54,7 @@ def test_loss_and_gradients_equal_the_twins(cut_out: bool, weighted: bool, devic
     moved = {name: None if v is None else v.to(fast[0].device) for name, v in vars(target).items()}
     there = replace(target, **moved)
     got = PhotoLoss(0.2, str(fast[0].device), None)(fast[0], fast[1], fast[2], there, backdrop)
-    assert float(got) == pytest.approx(float(wanted), rel=1e-5)
+    assert got.item() == pytest.approx(wanted.item(), rel=1e-5)
     (3 * wanted).backward()
     (3 * got).backward()
     for a, b in zip(fast, plain, strict=True):

@@ -163,6 +163,20 @@ def test_play_advances_and_loops(chromium: Any, file: str):
     page.close()
 
 
+def test_a_slow_machine_waits_for_its_splats_to_be_sorted(chromium: Any, file: str):
+    """An old order would draw the ground over a body that has moved."""
+    page, _ = _opened(chromium, file)
+    page.evaluate("Object.defineProperty(egs.stages[0], 'sorting', { get: () => window.held })")
+    page.evaluate("() => { window.held = true; egs.player.playing = true; egs.pace = 0.001; }")
+    _wait(page, "egs.player.place > 0")
+    page.evaluate("() => { egs.pace = 1; window.at = egs.player.place; }")
+    page.wait_for_timeout(500)
+    assert page.evaluate("egs.player.playing && egs.player.place === window.at")
+    page.evaluate("window.held = false")
+    _wait(page, "egs.player.place !== window.at")
+    page.close()
+
+
 def test_each_layer_shows(chromium: Any, file: str):
     page, complaints = _opened(chromium, file)
     page.evaluate("egs.player.seek(8)")

@@ -14,6 +14,7 @@ from egs_warp.kernels.render.projection import (
     screen_covariance,
 )
 from egs_warp.kernels.render.spherical_harmonics import sh_direction_gradient, sh_sum, write_sh_gradient
+from egs_warp.kernels.render.tiles import first_slot_of
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -201,15 +202,6 @@ def offset_gradient(sh: wp.array2d[wp.vec3], g: wp.int32, offset: wp.vec3, by_co
     direction = offset / distance
     by_direction = sh_direction_gradient(sh, g, direction, by_colour)
     return (by_direction - wp.dot(direction, by_direction) * direction) / distance
-
-
-@wp.func
-def first_slot_of(slot_end: wp.array[wp.int64], g: wp.int32) -> wp.int32:
-    """Where the tiles of Gaussian ``g`` begin."""
-    slot = wp.int32(0)
-    if g > 0:
-        slot = wp.int32(slot_end[g - 1])
-    return slot
 
 
 @wp.kernel

@@ -11,6 +11,15 @@ from egs_warp.kernels.render.ellipse import TILE, tile_columns, tile_rows
 wp.set_module_options({"enable_backward": False})
 
 
+@wp.func
+def first_slot_of(slot_end: wp.array[wp.int64], g: wp.int32) -> wp.int32:
+    """Where the tiles of Gaussian ``g`` begin."""
+    slot = wp.int32(0)
+    if g > 0:
+        slot = wp.int32(slot_end[g - 1])
+    return slot
+
+
 @wp.kernel
 def count_tiles_kernel(
     first_chunk: wp.int32,
@@ -31,9 +40,7 @@ def count_tiles_kernel(
     columns = (width + TILE - 1) / TILE
     for rank in range(chunk_start[chunk], chunk_start[chunk + 1]):
         g = gaussian_from_rank[rank]
-        slot = wp.int32(0)
-        if g > 0:
-            slot = wp.int32(slot_end[g - 1])
+        slot = first_slot_of(slot_end, g)
         e = ellipse[g]
         f = falloff[g]
         rows = tile_rows(e, f, height)
@@ -63,9 +70,7 @@ def fill_tiles_kernel(
     chunk = wp.tid() + first_chunk
     for rank in range(chunk_start[chunk], chunk_start[chunk + 1]):
         g = gaussian_from_rank[rank]
-        slot = wp.int32(0)
-        if g > 0:
-            slot = wp.int32(slot_end[g - 1])
+        slot = first_slot_of(slot_end, g)
         end = wp.int32(slot_end[g])
         while slot < end:
             tile = tile_from_slot[slot]
@@ -100,9 +105,7 @@ def emit_tiles_kernel(
     # Written side by side by neighbouring threads, which the loop below cannot do.
     for i in range(g, pair_count, slot_end.shape[0]):
         slot_and_gaussian_out[i] = i
-    slot = wp.int32(0)
-    if g > 0:
-        slot = wp.int32(slot_end[g - 1])
+    slot = first_slot_of(slot_end, g)
     if slot == wp.int32(slot_end[g]):
         return
     columns = (width + TILE - 1) / TILE

@@ -248,7 +248,16 @@ class Page {
     this.curves.draw(player.place);
   }
 
+  /** A slow machine waits for its splats to be sorted: as they lay some pictures ago, the ground would hide the body. */
+  private get waits(): boolean {
+    return this.player.playing && this.pace > SLOW && this.stages.some((stage) => stage.sorting);
+  }
+
   private tick(now: number): void {
+    if (this.waits) {
+      requestAnimationFrame((next) => this.tick(next));
+      return;
+    }
     const elapsed = this.before === 0 ? 0 : (now - this.before) / 1000;
     this.before = now;
     this.player.advance(elapsed);

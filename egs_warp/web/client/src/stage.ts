@@ -172,6 +172,11 @@ export class Stage {
     this.resize();
   }
 
+  /** Whether the splats are still to be sorted for what was drawn last. */
+  get sorting(): boolean {
+    return this.spark.sorting;
+  }
+
   /** Draws where something has changed; true if it did. */
   draw(): boolean {
     this.controls.update();
