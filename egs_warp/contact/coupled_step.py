@@ -25,7 +25,8 @@ _PUSH_OUT = 0.2
 _ADDED = 0.6
 """Of the tolerance: points that would end deeper join at once."""
 _SINKS = 0.3
-"""Of the tolerance: what is deep already may go deeper by so much in a step, by next to nothing beyond the tolerance."""
+"""Of the tolerance: by how much what is deep already may go deeper in a step; by next to nothing beyond the tolerance.
+"""
 _CREEPS = 0.02
 _SINGULAR = 1e-7
 """Of the mean of the Delassus operator's diagonal: more points than the cage can resolve leave it singular."""

@@ -23,9 +23,10 @@ _ACTIVE = 1e-3
 """Multiplier, of the objective's value for a unit of the row, from which a bound is worth leaving."""
 _GAIN = 5e-3
 """Share of the objective by which a further piece has to lower it."""
-
 _BROKEN = 0.02
 """By which a start may break a row that its piece does not quite hold."""
+
+_LEAVES, _SLIPS, _STOPS, _LANDS = 0, 1, 2, 3
 
 FREE, STICK, SLIDE = 0, 1, 2
 
@@ -78,13 +79,13 @@ class ContactModes:
     """(n, 2) unit vectors along which those that slide do."""
 
     @classmethod
-    def of(cls, forces: np.ndarray, velocities: np.ndarray, friction: float) -> ContactModes:
-        """Those of ``forces`` (n, 3) and contact ``velocities`` (n, 3) that obey Coulomb's law."""
+    def of(cls, forces: np.ndarray, friction: float) -> ContactModes:
+        """Those of ``forces`` (n, 3) that obey Coulomb's law."""
         pull = np.linalg.norm(forces[:, 1:], axis=1)
         pressing = forces[:, 0] > 0.0
         sliding = pressing & (pull >= (1.0 - 1e-6) * friction * forces[:, 0])
         kind = np.where(sliding, SLIDE, np.where(pressing, STICK, FREE))
-        return cls(kind, _unit(np.where(sliding[:, None], -forces[:, 1:], velocities[:, 1:])))
+        return cls(kind, _unit(-forces[:, 1:]))
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,6 @@ class PieceSolution:
     x: np.ndarray
     """(m + 3n,)."""
     objective: float
-    modes: ContactModes
     onward: ContactModes | None
     """Those of the piece that lies beyond the bounds that hold the optimum back; None if none does."""
     nearest: ContactModes | None
@@ -147,8 +147,8 @@ def search_pieces(
 def solve_piece(
     program: ContactPieces, start: np.ndarray, modes: ContactModes, solver: QpSolver | str
 ) -> PieceSolution | None:
-    """Optimum of the activations in the piece of ``modes``; what ``start`` breaks of its bounds may stay broken as
-    much. None without a solution.
+    """Optimum of the activations in the piece of ``modes``; what ``start`` breaks of its bounds, up to ``_BROKEN``, may
+    stay broken as much. None without a solution.
     """
     m = program.activations
     offset, slope = _forces_of(program, modes)
@@ -176,7 +176,7 @@ def solve_piece(
     if len(active) > 1:
         most = active[[int(np.argmax(pushes[active]))]]
         nearest = _beyond(program, modes, x, contact[most], onward[most], pushes[most])
-    return PieceSolution(x, objective, modes, further, nearest)
+    return PieceSolution(x, objective, further, nearest)
 
 
 def _forces_of(program: ContactPieces, modes: ContactModes) -> tuple[np.ndarray, np.ndarray]:
@@ -196,9 +196,6 @@ def _forces_of(program: ContactPieces, modes: ContactModes) -> tuple[np.ndarray,
     right = -np.column_stack([program.offset[held], program.rows[held, :m]])
     solved = spread @ dense.solve(operator, right, overwrite_a=True, overwrite_b=True, check_finite=False)
     return solved[:, 0], solved[:, 1:]
-
-
-_LEAVES, _SLIPS, _STOPS, _LANDS = 0, 1, 2, 3
 
 
 def _bounds(

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
 from scipy.spatial import ConvexHull
 
-from egs_warp.contact.detection import ContactSet
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.geometry.frames import square_to
 
@@ -24,9 +22,6 @@ class Objective:
     target: np.ndarray
     """(k,) m/s."""
     weight: float
-    lifted: tuple[int, ...] = ()
-    """Nodes whose contacts ought to let go: the first guess of their state is that they separate. Stage 1 keeps last
-    step's activations, so it cannot foresee a foot that the muscles are about to lift."""
 
 
 def centre_of_mass_velocity(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
@@ -46,13 +41,6 @@ class SpinObjective:
     target: np.ndarray
     """(3,) kg m^2/s."""
     weight: float
-
-
-def lifted_contacts(contacts: ContactSet, objectives: Sequence[Objective | SpinObjective]) -> np.ndarray:
-    """(n,) bool: contacts on nodes that an objective lifts."""
-    lifted = [node for wish in objectives if isinstance(wish, Objective) for node in wish.lifted]
-    nearest = contacts.nodes[np.arange(contacts.count), np.argmax(contacts.weights, axis=1)]
-    return np.isin(nearest, lifted)
 
 
 def node_velocities(body: SoftBody, target: np.ndarray, weight: float) -> Objective:

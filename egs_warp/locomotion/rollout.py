@@ -12,10 +12,9 @@ import numpy as np
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.geometry.body_frame import BodyFrame
-from egs_warp.locomotion.coupled_stepper import CoupledStepper
 from egs_warp.locomotion.objectives import Objective, SpinObjective
 from egs_warp.locomotion.recorder import Recorder
-from egs_warp.locomotion.stepper import StepReport
+from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 
 FRAME_RATE = 60
@@ -48,7 +47,7 @@ def steps_per_frame(body: SoftBody) -> int:
     return int(np.ceil(1.0 / (FRAME_RATE * longest) - 1e-3))
 
 
-def settle(stepper: CoupledStepper) -> BodyState:
+def settle(stepper: LocomotionStepper) -> BodyState:
     """The body at rest on its ground: contact steps from rest, long ones, each begun without velocity.
 
     One that gives way is not followed to the ground: it is returned once a node has gone 0.2 H in one step, or its
@@ -71,7 +70,7 @@ def settle(stepper: CoupledStepper) -> BodyState:
 
 
 def roll_out(
-    stepper: CoupledStepper,
+    stepper: LocomotionStepper,
     geometry: ContactGeometry,
     start: BodyState,
     motion: Motion,

@@ -1,6 +1,4 @@
-"""The two-stage stepper: predict the contact states, optimise the muscles,
-correct with the full mechanics (Eq. 12, 13).
-"""
+"""The stepper: foresee the contact, choose the muscles, solve motion and contact together (Eq. 4, 9, 12, 13)."""
 
 from __future__ import annotations
 
@@ -9,45 +7,44 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import sparse
 
-from egs_warp.contact.corrector import ContactStepResult, contact_step
-from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet, independent_contacts
-from egs_warp.contact.penalty import Prediction, predict
+from egs_warp.contact.coupled_step import ContactResponse, CoupledResult, CoupledSolver
+from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet
+from egs_warp.contact.points import ContactPoints
 from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.fem.factorisation import Factorisation
-from egs_warp.fem.implicit_step import ImplicitStep, conserve_angular_momentum
-from egs_warp.locomotion.complementarity import SEPARATE, ContactLayout, states_from_prediction
-from egs_warp.locomotion.objectives import Objective, SpinObjective, lifted_contacts
-from egs_warp.locomotion.program import CostScales, contact_program, linear_response
+from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.step_problem import StepProblem
+from egs_warp.locomotion.contact_pieces import ContactPieces
+from egs_warp.locomotion.objectives import Objective, SpinObjective
 from egs_warp.locomotion.solvers import QpSolver
-from egs_warp.locomotion.strategies import SearchResult, Strategy, find_states
+from egs_warp.locomotion.step_cost import LinearStep, QuadraticCost, effort_cost, objectives_cost
+from egs_warp.locomotion.strategies import Foreseen, Strategy, search_program
+from egs_warp.locomotion.synergies import find_synergies
 from egs_warp.muscles.muscle_set import MuscleColumns, MuscleSet
 from egs_warp.muscles.tension import MuscleTension
 
 _ORDINARY_STRENGTH = 4.0
-"""Body weights, of the muscle that the weights of activations are given for."""
+_STEPS_A_UNIT = 19.0
+_FASTEST = 7.0
+"""Bounds of activations, in their bounds a sqrt(H / g): how fast a muscle is switched on and off."""
+_REGULAR = 1e-7
+_MOST_HALVINGS = 4
 
 
 @dataclass(frozen=True)
 class LocomotionSettings:
     """Numbers of the stepper; lengths are in body heights, forces in body weights, speeds in sqrt(g H)."""
 
-    directions: int = 4
-    """n_d, edges of the friction pyramid."""
-    contact_limit: int = 32
-    """Points of the corrector's contact set."""
-    qp_contact_limit: int = 32
-    """Of these, the most independent ones take part in the QP."""
-    contact_pivot_tolerance: float = 1e-3
     near: float = 0.01
     """A point takes part if the step may bring it this near to a plane."""
     penetration_tolerance: float = 5e-3
     push_out_cap: float = 0.05
     qp_limit: int = 3
-    """QPs a step at most; ``strategies.PATIENCE`` times as many where the contact states are in doubt."""
+    """QPs a step at most; ``strategies.PATIENCE`` times as many for the strategy ``relaxed`` in doubt."""
     qp_solver: QpSolver | str = QpSolver.OSQP
-    strategy: Strategy | str = Strategy.TWO_STAGE
+    strategy: Strategy | str = Strategy.PIECES
+    directions: int = 4
+    """n_d, edges of the friction pyramid of all strategies but ``pieces``, which has the cone."""
     activation_weight: float = 2e-4
     """For a step of sqrt(H / g) / 19 and a muscle of 4 body weights. Shorter steps change speeds by less, so they weigh
     activations less: by the square of their share. Stronger muscles weigh more, as their force."""
@@ -95,7 +92,7 @@ class StepReport:
     newton_iterations: int
     converged: bool
     added_spin: float
-    """rad/s, see ``conserve_angular_momentum``."""
+    """rad/s that implicit Euler would have eaten, see ``StepProblem``."""
     milliseconds: dict[str, float] = field(default_factory=dict)
 
 
@@ -114,27 +111,37 @@ class LocomotionStepper:
         self.body, self.muscles, self.geometry = body, muscles, geometry
         self.settings = settings or LocomotionSettings()
         self.detector = ContactDetector(geometry, device=device)
-        self._columns = MuscleColumns(muscles, device=device or "cpu")
-        self._factorisation = Factorisation(body)
-        self._gravity_force = body.node_mass[:, None] * body.gravity
+        self.points = ContactPoints(
+            geometry, near=self.settings.near * body.height, lower=0.1 * self.settings.near * body.height
+        )
+        self.time_unit = float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
         self.speed_scale = float(np.sqrt(np.linalg.norm(body.gravity) * body.height))
+        self._columns = MuscleColumns(muscles, device=device or "cpu")
+        self._factors = SparseFactors(body.assembly.upper_pattern)
+        self.solver = CoupledSolver(
+            self.detector,
+            self.points,
+            self._factors,
+            push_out_cap=self.settings.push_out_cap * self.speed_scale,
+            penetration_tolerance=self.settings.penetration_tolerance * body.height,
+        )
+        rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
+        problem = StepProblem(body, rest, self.time_unit / _STEPS_A_UNIT)
+        tangent = problem.tangent(self._factors, rest.velocities, None)
+        full = self._columns.sparse(rest.positions).toarray() * muscles.bounds
+        self.synergies = find_synergies(muscles, tangent.solve(full), body.node_mass)
 
     def initial_memory(self) -> StepMemory:
         """No contacts, muscles at rest."""
         return StepMemory(np.zeros(0, int), np.zeros((0, 3)), np.zeros(self.muscles.segment_count))
 
-    @staticmethod
-    def matched_forces(memory: StepMemory, points: np.ndarray) -> np.ndarray:
-        """(n, 3) last step's forces of ``points`` (n,), zero for new ones."""
-        forces = np.zeros((len(points), 3))
-        _, now, before = np.intersect1d(points, memory.points, return_indices=True)
-        forces[now] = memory.forces[before]
-        return forces
-
-    @staticmethod
-    def remember(result: ContactStepResult, activations: np.ndarray) -> StepMemory:
-        """What the next step wants to know."""
-        return StepMemory(result.contacts.points, result.forces, activations)
+    def passive_step(self, state: BodyState, memory: StepMemory, dt: float) -> CoupledResult:
+        """A step of ``dt`` s without muscles."""
+        problem = StepProblem(self.body, state, dt)
+        contacts = self._detect(problem, memory)
+        response = ContactResponse.of(problem.tangent(self._factors, state.velocities, None), contacts)
+        forces = self.points.matched(contacts.points, memory.points, memory.forces)
+        return self.solver.solve(response, None, velocities=state.velocities, forces=forces)
 
     def advance(
         self,
@@ -142,163 +149,186 @@ class LocomotionStepper:
         memory: StepMemory,
         objectives: Sequence[Objective | SpinObjective],
         dt: float,
-        *,
-        depth: int = 0,
     ) -> tuple[BodyState, StepMemory, list[StepReport]]:
-        """One step of ``dt``; a step that does not converge is done again as two halves, at most four times over."""
+        """One step of ``dt``; one that does not converge is done again in halves under the same activations, since what
+        is asked is asked for the whole of it.
+        """
         end, after, report = self.step(state, memory, objectives, dt)
-        if report.converged or depth == 4:
+        if report.converged:
             return end, after, [report]
-        middle, between, first = self.advance(state, memory, objectives, dt / 2, depth=depth + 1)
-        end, after, second = self.advance(middle, between, objectives, dt / 2, depth=depth + 1)
-        return end, after, first + second
+        return self._in_halves(state, memory, report.activations, dt, _MOST_HALVINGS)
+
+    def _in_halves(
+        self, state: BodyState, memory: StepMemory, activations: np.ndarray, dt: float, left: int
+    ) -> tuple[BodyState, StepMemory, list[StepReport]]:
+        reports: list[StepReport] = []
+        for _ in range(2):
+            end, after, report = self._held_step(state, memory, activations, 0.5 * dt)
+            done = [report]
+            if not report.converged and left > 1:
+                end, after, done = self._in_halves(state, memory, activations, 0.5 * dt, left - 1)
+            state, memory = end, after
+            reports += done
+        return state, memory, reports
+
+    def _held_step(
+        self, state: BodyState, memory: StepMemory, activations: np.ndarray, dt: float
+    ) -> tuple[BodyState, StepMemory, StepReport]:
+        """A step of ``dt`` s under given ``activations`` (M,) metres."""
+        clock = _Clock()
+        problem = StepProblem(self.body, state, dt, self.settings.drag)
+        tension = MuscleTension.of(self.muscles, activations)
+        response, foreseen, forces = self._foresee(problem, self._detect(problem, memory), memory, tension)
+        clock.lap("foresee")
+        result = self.solver.solve(response, tension, velocities=foreseen, forces=forces)
+        clock.lap("solve")
+        return self._finish(problem, _Plan(activations, foreseen, forces, 0, 0), result, clock)
 
     def step(
         self, state: BodyState, memory: StepMemory, objectives: Sequence[Objective | SpinObjective], dt: float
     ) -> tuple[BodyState, StepMemory, StepReport]:
-        """Predict, optimise, correct, audit."""
+        """Detect, foresee, program, solve, report."""
         clock = _Clock()
-        step = ImplicitStep(self.body, state, dt, self._factorisation, drag=self.settings.drag)
-        points = self.choose_contacts(step, memory)
+        problem = StepProblem(self.body, state, dt, self.settings.drag)
+        contacts = self._detect(problem, memory)
         clock.lap("detect")
-        contacts = self.detector.contact_set(points, state.positions)
         before = MuscleTension.of(self.muscles, memory.activations)
-        prediction = predict(
-            step,
-            contacts,
-            self._gravity_force,
-            state.velocities,
-            tension=before,
-            normal_forces=self.matched_forces(memory, points)[:, 0],
-            friction=self.geometry.friction,
-            push_out_cap=self.settings.push_out_cap * self.speed_scale,
+        response, foreseen, forces = self._foresee(problem, contacts, memory, before)
+        clock.lap("foresee")
+        plan = self._program(response, foreseen, forces, memory, objectives, clock)
+        result = self.solver.solve(
+            response,
+            MuscleTension.of(self.muscles, plan.activations),
+            velocities=plan.velocities,
+            forces=plan.forces,
         )
-        clock.lap("predict")
-        columns = self._columns.sparse(step.end_positions(prediction.velocities))
-        plan = self._optimise(step, before, columns, contacts, prediction, memory, objectives, clock)
-        result = contact_step(
-            step,
-            self.detector,
-            points,
-            self._gravity_force,
-            tension=MuscleTension.of(self.muscles, plan.activations),
-            start_velocities=plan.velocities,
-            start_forces=plan.forces,
-            push_out_cap=self.settings.push_out_cap * self.speed_scale,
-            penetration_tolerance=self.settings.penetration_tolerance * self.body.height,
+        clock.lap("solve")
+        return self._finish(problem, plan, result, clock)
+
+    def _detect(self, problem: StepProblem, memory: StepMemory) -> ContactSet:
+        ballistic = problem.state.velocities + problem.dt * self.body.gravity
+        gaps, _ = self.detector.gaps(problem.end_positions(ballistic))
+        return self.detector.contact_set(
+            self.points.choose(memory.points, memory.forces[:, 0] > 0.0, gaps), problem.state.positions
         )
-        clock.lap("correct")
-        return self._finish(step, state, plan, result, clock)
 
-    def choose_contacts(self, step: ImplicitStep, memory: StepMemory) -> np.ndarray:
-        """(n,) points that the step may bring to a plane, well-conditioned, last step's first.
-
-        See docs/concepts/contact.md.
+    def _foresee(
+        self, problem: StepProblem, contacts: ContactSet, memory: StepMemory, tension: MuscleTension
+    ) -> tuple[ContactResponse, np.ndarray, np.ndarray]:
+        """Response of the contacts; velocities (N, 3) and contact forces (n, 3) that last step's activations would
+        bring.
         """
-        ballistic = step.state.velocities + step.dt * self.body.gravity
-        gaps, _ = self.detector.gaps(step.end_positions(ballistic))
-        candidates = self.detector.candidates(memory.points, gaps, self.settings.near * self.body.height)
-        if len(candidates) <= 1:
-            return candidates
-        contacts = self.detector.contact_set(candidates, step.state.positions)
-        normals = contacts.frame[0::3]
-        step.factor(np.zeros_like(step.state.velocities), projected=True)
-        compliance = normals @ step.factorisation.solve(normals.T.toarray())
-        kept = int(np.isin(candidates, memory.points).sum())
-        chosen = independent_contacts(
-            compliance, kept, self.settings.contact_limit, self.settings.contact_pivot_tolerance
+        start = problem.state.velocities
+        if not problem.feasible(start):
+            start = np.zeros_like(start)
+        tangent = problem.tangent(self._factors, start, tension)
+        response = ContactResponse.of(tangent, contacts)
+        free = start.ravel() - tangent.solve(problem.residual(start, tension).ravel())
+        shift = self.solver.shift(contacts, problem.dt)
+        forces = response.forces(
+            free, shift, self.geometry.friction, self.points.matched(contacts.points, memory.points, memory.forces)
         )
-        return candidates[chosen]
+        foreseen = (free + response.columns @ forces.ravel()).reshape(start.shape)
+        return response, foreseen if problem.feasible(foreseen) else start, forces
 
-    def _optimise(
+    def _program(
         self,
-        step: ImplicitStep,
-        before: MuscleTension,
-        columns: sparse.csc_matrix,
-        contacts: ContactSet,
-        prediction: Prediction,
+        response: ContactResponse,
+        foreseen: np.ndarray,
+        forces: np.ndarray,
         memory: StepMemory,
         objectives: Sequence[Objective | SpinObjective],
         clock: _Clock,
     ) -> _Plan:
-        body, settings = self.body, self.settings
-        all_contacts = contacts.count
-        contacts = contacts.head(settings.qp_contact_limit)
-        layout = ContactLayout(self.muscles.segment_count, contacts.count, settings.directions)
-        actuation = columns.toarray() * self.muscles.bounds
-        linear = linear_response(step, actuation, contacts, prediction.velocities, layout, before)
+        """Activations, and what the step's tangent makes of them."""
+        problem, settings, members = response.tangent.problem, self.settings, self.synergies.members
+        contacts, weight, m = response.contacts, self.body.weight, self.synergies.count
+        each = self._columns.sparse(problem.end_positions(foreseen)).toarray() * self.muscles.bounds
+        # Without muscles and contact, in their stiffness at last step's tension.
+        free = problem.residual(foreseen, None).ravel()
+        solved = response.tangent.solve(np.column_stack([problem.dt * (members.T @ each.T).T, free]))
+        torques = problem.dt * weight * (contacts.frame @ problem.turns).T
+        linear = LinearStep(
+            foreseen.ravel() - solved[:, -1],
+            np.hstack([solved[:, :-1], weight * response.columns]),
+            np.hstack([np.zeros((3, m)), torques]),
+        )
         clock.lap("linearise")
-        share = step.dt / (np.sqrt(body.height / np.linalg.norm(body.gravity)) / 19.0)
-        strength = self.muscles.max_forces / (_ORDINARY_STRENGTH * body.weight)
-        program = contact_program(
-            step,
-            linear,
-            contacts,
-            layout,
-            objectives,
-            memory.activations / self.muscles.bounds,
-            friction=self.geometry.friction,
-            push_out_cap=settings.push_out_cap * self.speed_scale,
-            scales=CostScales(
-                self.speed_scale,
-                settings.activation_weight * share**2 * strength,
-                settings.activation_change_weight * share * strength**2,
-            ),
+        previous = self.synergies.mean(memory.activations / self.muscles.bounds)
+        cost = (
+            objectives_cost(problem, linear, objectives, self.speed_scale)
+            + effort_cost(problem, linear, foreseen.ravel())
+            + self._activation_cost(problem.dt, previous, linear.columns.shape[1])
         )
-        states = states_from_prediction(
-            prediction.normal_forces[: contacts.count],
-            prediction.tangential_forces[: contacts.count],
-            prediction.tangential_velocities[: contacts.count],
-            self.geometry.friction,
-            settings.directions,
+        rows = np.hstack([contacts.frame @ solved[:, :-1], weight * response.delassus]) / self.speed_scale
+        shift = self.solver.shift(contacts, problem.dt)
+        offset = contacts.frame @ linear.base / self.speed_scale
+        offset[::3] += shift / self.speed_scale
+        reach = _FASTEST * problem.dt / self.time_unit
+        program = ContactPieces(
+            *(cost.P, cost.q, cost.constant, rows, offset, self.geometry.friction),
+            *(np.maximum(previous - reach, -1.0), np.minimum(previous + reach, 1.0)),
         )
-        states[lifted_contacts(contacts, objectives)] = SEPARATE
-        found = find_states(
+        clock.lap("program")
+        friction = self.geometry.friction
+        slip = (contacts.frame @ foreseen.ravel()).reshape(-1, 3) / self.speed_scale
+        found = search_program(
             program,
             settings.strategy,
-            states,
-            memory.activations / self.muscles.bounds,
+            Foreseen(previous, forces / weight, slip),
+            directions=settings.directions,
             qp_limit=settings.qp_limit,
             solver=settings.qp_solver,
         )
         clock.lap("qp")
-        if found.y is None:
-            forces = np.column_stack([prediction.normal_forces, prediction.tangential_forces])
-            return _Plan(memory.activations, prediction.velocities, forces, found)
-        activations = np.clip(found.y[: layout.activations], -1.0, 1.0) * self.muscles.bounds
-        forces = np.zeros((all_contacts, 3))
-        forces[: contacts.count] = body.weight * program.contact_forces(found.y)
-        velocities = (linear.base + linear.response @ found.y).reshape(-1, 3)
-        if not np.isfinite(step.energy(velocities, self._gravity_force)):
-            velocities = prediction.velocities
-        return _Plan(activations, velocities, forces, found)
+        if found.x is None:
+            return _Plan(memory.activations, foreseen, forces, found.qp_count, found.infeasible)
+        activations = (members @ found.x[:m]) * self.muscles.bounds
+        moved = linear.base + solved[:, :-1] @ found.x[:m]
+        forces = response.forces(moved, shift, friction, weight * found.x[m:].reshape(-1, 3))
+        velocities = (moved + response.columns @ forces.ravel()).reshape(foreseen.shape)
+        clock.lap("contact")
+        if not problem.feasible(velocities):
+            velocities = foreseen
+        return _Plan(activations, velocities, forces, found.qp_count, found.infeasible)
+
+    def _activation_cost(self, dt: float, previous: np.ndarray, count: int) -> QuadraticCost:
+        """Of ``count`` unknowns that begin with the activations, how large they are and how they change from
+        ``previous`` (m,)."""
+        settings, members = self.settings, self.synergies.members
+        share = dt * _STEPS_A_UNIT / self.time_unit
+        strength = self.muscles.max_forces / (_ORDINARY_STRENGTH * self.body.weight)
+        size = settings.activation_weight * share**2 * (members.T @ strength)
+        change = settings.activation_change_weight * share * (members.T @ strength**2)
+        diagonal, q = np.zeros(count), np.zeros(count)
+        diagonal[: len(previous)] = 2.0 * (size + change) + _REGULAR
+        q[: len(previous)] = -2.0 * change * previous
+        return QuadraticCost(np.diag(diagonal), q, float(change @ previous**2))
 
     def _finish(
-        self, step: ImplicitStep, state: BodyState, plan: _Plan, result: ContactStepResult, clock: _Clock
+        self, problem: StepProblem, plan: _Plan, result: CoupledResult, clock: _Clock
     ) -> tuple[BodyState, StepMemory, StepReport]:
-        end = step.end_positions(result.velocities)
-        external = result.nodal_forces - self.settings.drag * self.body.node_mass[:, None] * result.velocities
-        velocities, spin = conserve_angular_momentum(self.body, state, end, result.velocities, external, step.dt)
+        end = problem.end_positions(result.velocities)
         gaps, _ = self.detector.gaps(end)
-        after = BodyState(end, velocities, state.time + step.dt)
-        memory = self.remember(result, plan.activations)
-        clock.lap("audit")
+        after = BodyState(end, result.velocities, problem.state.time + problem.dt)
+        internal = problem.internal_gradient(result.velocities, MuscleTension.of(self.muscles, plan.activations))
+        clock.lap("report")
         report = StepReport(
             state=after,
-            dt=step.dt,
+            dt=problem.dt,
             contacts=result.contacts,
             forces=result.forces,
-            end_gaps=result.contacts.end_gaps(step.dt, result.velocities),
+            end_gaps=result.contacts.end_gaps(problem.dt, result.velocities),
             min_gap=float(gaps.min()),
             activations=plan.activations,
-            qp_count=plan.search.qp_count,
-            qp_infeasible=plan.search.infeasible,
-            newton_iterations=step.newton_iterations,
+            qp_count=plan.qp_count,
+            qp_infeasible=plan.qp_infeasible,
+            newton_iterations=result.iterations,
             converged=result.converged,
-            added_spin=spin,
+            added_spin=float(np.linalg.norm(problem.spin(internal))),
             milliseconds=clock.milliseconds,
         )
-        return after, memory, report
+        return after, StepMemory(result.contacts.points, result.forces, plan.activations), report
 
 
 @dataclass(frozen=True)
@@ -306,13 +336,14 @@ class _Plan:
     activations: np.ndarray
     velocities: np.ndarray
     forces: np.ndarray
-    search: SearchResult
+    qp_count: int
+    qp_infeasible: int
 
 
+@dataclass
 class _Clock:
-    def __init__(self) -> None:
-        self.milliseconds: dict[str, float] = {}
-        self._last = time.perf_counter()
+    milliseconds: dict[str, float] = field(default_factory=dict)
+    _last: float = field(default_factory=time.perf_counter)
 
     def lap(self, name: str) -> None:
         now = time.perf_counter()

@@ -6,7 +6,7 @@ See docs/concepts/motions.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -271,9 +271,7 @@ class Walk:
             return part_nodes(self.body, part, np.zeros((len(sole), 3)), control.support)
         error = before[index] - self._soles[index] + self._standing[sole] - local[sole]
         velocity = (control.foot_share * error + after[index] - before[index]) / dt
-        wish = part_nodes(self.body, part, velocity @ self.ground.axes, control.swing)
-        rising = elapsed < 0.5 * self.gait.swing_time
-        return replace(wish, lifted=tuple(np.flatnonzero(self.feet[index].leg > 0.9))) if rising else wish
+        return part_nodes(self.body, part, velocity @ self.ground.axes, control.swing)
 
     def _pose(self, com: np.ndarray, targets: np.ndarray) -> np.ndarray:
         """(N, 3) the standing shape with its feet at ``targets`` (4, 3) and its centre of mass at ``com`` (3,)."""

@@ -16,9 +16,8 @@ from egs_warp.fem.body import DEFAULT_SAG, BodyState, SoftBody, make_body
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
-from egs_warp.locomotion.coupled_stepper import CoupledStepper
 from egs_warp.locomotion.rollout import FRAME_RATE, settle, steps_per_frame
-from egs_warp.locomotion.stepper import LocomotionSettings
+from egs_warp.locomotion.stepper import LocomotionSettings, LocomotionStepper
 from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame
 from egs_warp.meshing.cage import Cage, cage_of_body
 from egs_warp.motions.sequence import Place
@@ -48,7 +47,7 @@ class Creature:
     front: np.ndarray
     """(3,) unit, along the ground: where it shows most detail."""
     cage: Cage
-    stepper: CoupledStepper
+    stepper: LocomotionStepper
     """Body, muscles and contact."""
     start: BodyState
     """At rest on the ground."""
@@ -116,7 +115,7 @@ def make_creature(
         progress("body and muscles")
         body = make_body(cage.mesh, GROUND, up=against_gravity, sag=sag, device=device)
         muscles = body_muscles(body, muscles_file, frame)
-        stepper = CoupledStepper(body, muscles, geometry, settings=settings, device=device)
+        stepper = LocomotionStepper(body, muscles, geometry, settings=settings, device=device)
         progress("stand")
         start = settle(stepper)
         if sag < SMALLEST_SAG or _stands(stepper, start):
@@ -188,7 +187,7 @@ def body_muscles(body: SoftBody, file: Path | None, frame: BodyFrame) -> MuscleS
     )
 
 
-def _stands(stepper: CoupledStepper, start: BodyState) -> bool:
+def _stands(stepper: LocomotionStepper, start: BodyState) -> bool:
     body = stepper.body
     moved = body.centre_of_mass(start.positions) - body.centre_of_mass(body.mesh.nodes)
     turn = body.best_fit_rotation(start.positions)

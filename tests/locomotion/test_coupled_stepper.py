@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from egs_warp.locomotion.coupled_stepper import CoupledStepper
+from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.objectives import SpinObjective, centre_of_mass_velocity, node_velocities
 from tests.support.creatures import coarse_creature
 from tests.support.meshes import block_mesh
@@ -18,7 +18,7 @@ def test_a_body_bobs_as_asked() -> None:
     """Half a period of 2 % of the height: speed of the centre of mass to 5 % of its peak, load without reversals."""
     creature = coarse_creature(block_mesh(), forward=np.array([1.0, 0.0, 0.0]))
     body, state = creature.stepper.body, creature.start
-    stepper = CoupledStepper(body, creature.stepper.muscles, creature.stepper.geometry, device="cpu")
+    stepper = LocomotionStepper(body, creature.stepper.muscles, creature.stepper.geometry, device="cpu")
     memory, loads, misses = stepper.initial_memory(), [], []
     peak, rate = 0.02 * body.height * 6.0, 6.0
     for step in range(30):
@@ -45,7 +45,7 @@ def test_what_does_not_converge_is_done_again_in_halves_under_the_same_activatio
     """What is asked is asked for the whole step: halves that asked again would push twice."""
     creature = coarse_creature(block_mesh(), forward=np.array([1.0, 0.0, 0.0]))
     body = creature.stepper.body
-    stepper = CoupledStepper(body, creature.stepper.muscles, creature.stepper.geometry, device="cpu")
+    stepper = LocomotionStepper(body, creature.stepper.muscles, creature.stepper.geometry, device="cpu")
     stepper.solver = replace(stepper.solver, tolerance=0.0)
     lift = [centre_of_mass_velocity(body, np.array([0.0, 0.0, 0.05]), 2.0)]
     planned = stepper.step(creature.start, stepper.initial_memory(), lift, DT)[2]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from egs_warp.fem.body import BodyState
-from egs_warp.locomotion.coupled_stepper import CoupledStepper
+from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.objectives import SpinObjective, centre_of_mass_velocity, node_velocities
 from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.stepper import LocomotionSettings, LocomotionStepper, StepReport
@@ -18,14 +18,14 @@ from tests.support.creatures import coarse_creature
 from tests.support.meshes import block_mesh
 from tests.support.places import DT, FORWARD
 
-STEPPERS = {"two-stage": LocomotionStepper, "coupled": CoupledStepper}
+STEPPERS = {"two-stage": LocomotionStepper, "coupled": LocomotionStepper}
 
 
 @dataclass(frozen=True)
 class Slide:
     """What was simulated."""
 
-    stepper: LocomotionStepper | CoupledStepper
+    stepper: LocomotionStepper | LocomotionStepper
     start: BodyState
     reports: tuple[StepReport, ...]
 
