@@ -40,7 +40,7 @@ class LocomotionSettings:
     penetration_tolerance: float = 5e-3
     push_out_cap: float = 0.05
     qp_limit: int = 3
-    """QPs a step at most; ``strategies.PATIENCE`` times as many for the strategy ``relaxed`` in doubt."""
+    """QPs a step at most; in doubt ``strategies.PATIENCE`` times as many for all strategies but ``pieces``."""
     qp_solver: QpSolver | str = QpSolver.OSQP
     strategy: Strategy | str = Strategy.PIECES
     directions: int = 4
@@ -163,7 +163,7 @@ class LocomotionStepper:
     ) -> tuple[BodyState, StepMemory, list[StepReport]]:
         reports: list[StepReport] = []
         for _ in range(2):
-            end, after, report = self._held_step(state, memory, activations, 0.5 * dt)
+            end, after, report = self.held_step(state, memory, activations, 0.5 * dt)
             done = [report]
             if not report.converged and left > 1:
                 end, after, done = self._in_halves(state, memory, activations, 0.5 * dt, left - 1)
@@ -171,7 +171,7 @@ class LocomotionStepper:
             reports += done
         return state, memory, reports
 
-    def _held_step(
+    def held_step(
         self, state: BodyState, memory: StepMemory, activations: np.ndarray, dt: float
     ) -> tuple[BodyState, StepMemory, StepReport]:
         """A step of ``dt`` s under given ``activations`` (M,) metres."""

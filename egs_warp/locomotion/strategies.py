@@ -185,9 +185,8 @@ def search_program(
     qp_limit: int,
     solver: QpSolver | str = QpSolver.OSQP,
 ) -> PieceSearch:
-    """Activations and contact forces of a step's program by ``strategy`` (or its name), with at most ``qp_limit`` QPs,
-    ``PATIENCE`` times as many where ``RELAXED`` is in doubt; the friction pyramid of all but ``PIECES`` has
-    ``directions`` edges.
+    """Activations and contact forces of a step's program by ``strategy`` (or its name), with at most ``qp_limit`` QPs
+    (``PATIENCE`` times as many in doubt); all but ``PIECES`` have a friction pyramid of ``directions`` edges.
     """
     strategy, friction = Strategy(strategy), program.friction
     if strategy is Strategy.PIECES:

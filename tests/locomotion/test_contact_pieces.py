@@ -52,8 +52,7 @@ def under(program: ContactPieces, activations: np.ndarray) -> np.ndarray:
 
 def started(program: ContactPieces) -> tuple[np.ndarray, ContactModes]:
     start = under(program, np.zeros(2))
-    velocities = (program.rows @ start + program.offset).reshape(-1, 3)
-    return start, ContactModes.of(start[2:].reshape(-1, 3), velocities, FRICTION)
+    return start, ContactModes.of(start[2:].reshape(-1, 3), FRICTION)
 
 
 @pytest.mark.parametrize("solver", [QpSolver.OSQP, QpSolver.DAQP])

@@ -1,4 +1,4 @@
-"""The ledger closes for both steppers, and no longer where any of its terms, or of the file's numbers, is wrong."""
+"""The ledger closes, and no longer where any of its terms, or of the file's numbers, is wrong."""
 
 from __future__ import annotations
 
@@ -12,25 +12,17 @@ import pytest
 from egs_warp.locomotion import ledger as module
 from egs_warp.locomotion.ledger import FLOWS, STORED, Ledger, ledger
 from egs_warp.locomotion.trajectory import Trajectory
-from tests.support.slides import STEPPERS, slide
+from tests.support.slides import slide
 
 CLOSES = 1e-6
 """Of m g H, in every step."""
-IDLE = {
-    "two-stage": {"spin_inside"},
-    "coupled": {"spin_after", "push_out"},
-}
-"""Flows that this stepper, or the slide by it, does not have."""
-
-
-@pytest.fixture(params=list(STEPPERS), scope="module")
-def name(request: pytest.FixtureRequest) -> str:
-    return request.param
+IDLE = {"spin_after", "push_out"}
+"""Flows that the slide does not have."""
 
 
 @pytest.fixture(scope="module")
-def trajectory(name: str) -> Trajectory:
-    return slide(name).trajectory()
+def trajectory() -> Trajectory:
+    return slide().trajectory()
 
 
 @pytest.fixture(scope="module")
@@ -46,11 +38,11 @@ def test_every_step_closes(books: Ledger) -> None:
     assert len(books.residual) >= 24 and worst(books) < 1e-9
 
 
-def test_each_flow_counts(name: str, books: Ledger) -> None:
-    """A tenth more of any of them is beyond the bound; those that the stepper does not have are nothing."""
+def test_each_flow_counts(books: Ledger) -> None:
+    """A tenth more of any of them is beyond the bound; those that the slide does not have are nothing."""
     for flow in FLOWS:
         values = getattr(books, flow)
-        if flow in IDLE[name]:
+        if flow in IDLE:
             assert np.abs(values).max() < 1e-8 * books.unit, flow
         else:
             assert worst(replace(books, **{flow: 1.1 * values})) > CLOSES, flow
@@ -98,9 +90,9 @@ def test_signs_are_those_of_physics(books: Ledger) -> None:
     assert (books.push_out >= 0.0).all() and (books.muscle_work >= books.muscles - 1e-12 * books.unit).all()
 
 
-def test_stored_energies_are_those_of_the_body(name: str, trajectory: Trajectory, books: Ledger) -> None:
+def test_stored_energies_are_those_of_the_body(trajectory: Trajectory, books: Ledger) -> None:
     """Against the solver's own sum, which the ledger never sees."""
-    body = slide(name).stepper.body
+    body = slide().stepper.body
     theirs = [body.mechanical_energy(x, v) for x, v in zip(trajectory.positions, trajectory.velocities, strict=True)]
     assert books.stored == pytest.approx(theirs, rel=1e-10)
 
