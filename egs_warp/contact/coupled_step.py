@@ -104,8 +104,8 @@ class CoupledSolver:
         velocities: np.ndarray,
         forces: np.ndarray,
     ) -> CoupledResult:
-        """The step from a start of ``velocities`` (N, 3) and ``forces`` (n, 3); ``response`` is kept while it
-        serves.
+        """The step from a start of ``velocities`` (N, 3), which invert no element, and ``forces`` (n, 3); ``response``
+        is kept while it serves.
         """
         problem = response.tangent.problem
         iterations = tangents = 0

@@ -70,17 +70,6 @@ class ContactSet:
         """n."""
         return len(self.points)
 
-    def head(self, count: int) -> ContactSet:
-        """The first ``count`` contacts."""
-        return ContactSet(
-            self.points[:count],
-            self.nodes[:count],
-            self.weights[:count],
-            self.axes[:count],
-            self.gaps[:count],
-            self.frame[: 3 * count],
-        )
-
     def end_gaps(self, dt: float, velocities: np.ndarray) -> np.ndarray:
         """(n,) gap after a step of ``dt`` with nodal end velocities (N, 3)."""
         return self.gaps + dt * (self.frame @ velocities.ravel())[0::3]
@@ -164,7 +153,7 @@ def _hull_points(tet_from_point: np.ndarray, weights: np.ndarray, tet_count: int
 
 
 class ContactDetector:
-    """Finds and keeps a temporally stable contact set."""
+    """Gaps of all points, and the frames of those that take part."""
 
     def __init__(self, geometry: ContactGeometry, *, device: str | None = None) -> None:
         self.geometry = geometry
@@ -224,9 +213,9 @@ class ContactDetector:
         return ContactSet(points, nodes, weights, axes, gaps[points], frame)
 
 
-def push_out_speeds(gaps: np.ndarray, dt: float, cap: float, factor: float = 0.5, slop: float = 0.0) -> np.ndarray:
-    """(n,) constant of the normal measure c = N^T u' + min(phi, 0) b / dt + max(phi, 0) / dt, the push-out capped
-    (docs/concepts/contact.md).
+def push_out_speeds(gaps: np.ndarray, dt: float, cap: float, factor: float, slop: float) -> np.ndarray:
+    """(n,) constant of the normal measure c = N^T u' + max(phi, 0) / dt + min(phi + slop, 0) b / dt, the push-out
+    capped (docs/concepts/contact.md); b is ``factor``.
     """
     return np.maximum(gaps, 0.0) / dt + np.maximum(np.minimum(gaps + slop, 0.0) * factor / dt, -cap)
 

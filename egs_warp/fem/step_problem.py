@@ -75,6 +75,12 @@ class StepProblem:
         """Whether no element is inverted at the end of ``velocities`` (N, 3)."""
         return bool(self.body.assembly.determinants(self.end_positions(velocities)).min() > 0.0)
 
+    @property
+    def start(self) -> np.ndarray:
+        """(N, 3) m/s to solve the step from: those of its start, or rest where they would invert an element."""
+        velocities = self.state.velocities
+        return velocities if self.feasible(velocities) else np.zeros_like(velocities)
+
     def internal_gradient(self, velocities: np.ndarray, tension: MuscleTension | None) -> np.ndarray:
         """(N, 3) newtons, minus the forces of elasticity, damping and muscles at the end of ``velocities`` (N, 3)."""
         end = self.end_positions(velocities)

@@ -139,9 +139,9 @@ class LocomotionStepper:
         """A step of ``dt`` s without muscles."""
         problem = StepProblem(self.body, state, dt)
         contacts = self._detect(problem, memory)
-        response = ContactResponse.of(problem.tangent(self._factors, state.velocities, None), contacts)
+        response = ContactResponse.of(problem.tangent(self._factors, problem.start, None), contacts)
         forces = self.points.matched(contacts.points, memory.points, memory.forces)
-        return self.solver.solve(response, None, velocities=state.velocities, forces=forces)
+        return self.solver.solve(response, None, velocities=problem.start, forces=forces)
 
     def advance(
         self,
@@ -218,9 +218,7 @@ class LocomotionStepper:
         """Response of the contacts; velocities (N, 3) and contact forces (n, 3) that last step's activations would
         bring.
         """
-        start = problem.state.velocities
-        if not problem.feasible(start):
-            start = np.zeros_like(start)
+        start = problem.start
         tangent = problem.tangent(self._factors, start, tension)
         response = ContactResponse.of(tangent, contacts)
         free = start.ravel() - tangent.solve(problem.residual(start, tension).ravel())
