@@ -26,6 +26,9 @@ _GAIN = 5e-3
 _BROKEN = 0.02
 """By which a start may break a row that its piece does not quite hold."""
 
+_NOTHING = 1e-9
+"""Body weights: what rounding leaves of the force of a contact that is open."""
+
 _LEAVES, _SLIPS, _STOPS, _LANDS = 0, 1, 2, 3
 
 FREE, STICK, SLIDE = 0, 1, 2
@@ -80,9 +83,9 @@ class ContactModes:
 
     @classmethod
     def of(cls, forces: np.ndarray, friction: float) -> ContactModes:
-        """Those of ``forces`` (n, 3) that obey Coulomb's law."""
+        """Those of ``forces`` (n, 3) body weights that obey Coulomb's law."""
         pull = np.linalg.norm(forces[:, 1:], axis=1)
-        pressing = forces[:, 0] > 0.0
+        pressing = forces[:, 0] > _NOTHING
         sliding = pressing & (pull >= (1.0 - 1e-6) * friction * forces[:, 0])
         kind = np.where(sliding, SLIDE, np.where(pressing, STICK, FREE))
         return cls(kind, _unit(-forces[:, 1:]))
