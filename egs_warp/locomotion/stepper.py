@@ -96,6 +96,16 @@ class StepReport:
     milliseconds: dict[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class StepProgram:
+    """What is asked of a step, and what it is asked of."""
+
+    pieces: ContactPieces
+    foreseen: Foreseen
+    linear: LinearStep
+    """Of the activations of the synergies in their bounds, and of contact forces in body weights."""
+
+
 class LocomotionStepper:
     """Orchestrates the kernels and the QP for one body."""
 
@@ -178,7 +188,7 @@ class LocomotionStepper:
         clock = _Clock()
         problem = StepProblem(self.body, state, dt, self.settings.drag)
         tension = MuscleTension.of(self.muscles, activations)
-        response, foreseen, forces = self._foresee(problem, self._detect(problem, memory), memory, tension)
+        response, foreseen, forces = self.foresee(problem, self._detect(problem, memory), memory, tension)
         clock.lap("foresee")
         result = self.solver.solve(response, tension, velocities=foreseen, forces=forces)
         clock.lap("solve")
@@ -193,7 +203,7 @@ class LocomotionStepper:
         contacts = self._detect(problem, memory)
         clock.lap("detect")
         before = MuscleTension.of(self.muscles, memory.activations)
-        response, foreseen, forces = self._foresee(problem, contacts, memory, before)
+        response, foreseen, forces = self.foresee(problem, contacts, memory, before)
         clock.lap("foresee")
         plan = self._program(response, foreseen, forces, memory, objectives, clock)
         result = self.solver.solve(
@@ -212,7 +222,7 @@ class LocomotionStepper:
             self.points.choose(memory.points, memory.forces[:, 0] > 0.0, gaps), problem.state.positions
         )
 
-    def _foresee(
+    def foresee(
         self, problem: StepProblem, contacts: ContactSet, memory: StepMemory, tension: MuscleTension
     ) -> tuple[ContactResponse, np.ndarray, np.ndarray]:
         """Response of the contacts; velocities (N, 3) and contact forces (n, 3) that last step's activations would
@@ -239,7 +249,42 @@ class LocomotionStepper:
         clock: _Clock,
     ) -> _Plan:
         """Activations, and what the step's tangent makes of them."""
-        problem, settings, members = response.tangent.problem, self.settings, self.synergies.members
+        problem, settings, m = response.tangent.problem, self.settings, self.synergies.count
+        program = self.program(response, foreseen, forces, memory.activations, objectives)
+        clock.lap("program")
+        found = search_program(
+            program.pieces,
+            settings.strategy,
+            program.foreseen,
+            directions=settings.directions,
+            qp_limit=settings.qp_limit,
+            solver=settings.qp_solver,
+        )
+        clock.lap("qp")
+        if found.x is None:
+            return _Plan(memory.activations, foreseen, forces, found.qp_count, found.infeasible)
+        activations = (self.synergies.members @ found.x[:m]) * self.muscles.bounds
+        moved = program.linear.base + program.linear.columns[:, :m] @ found.x[:m]
+        shift = self.solver.shift(response.contacts, problem.dt)
+        forces = response.forces(moved, shift, self.geometry.friction, self.body.weight * found.x[m:].reshape(-1, 3))
+        velocities = (moved + response.columns @ forces.ravel()).reshape(foreseen.shape)
+        clock.lap("contact")
+        if not problem.feasible(velocities):
+            velocities = foreseen
+        return _Plan(activations, velocities, forces, found.qp_count, found.infeasible)
+
+    def program(
+        self,
+        response: ContactResponse,
+        foreseen: np.ndarray,
+        forces: np.ndarray,
+        activations: np.ndarray,
+        objectives: Sequence[Objective | SpinObjective],
+    ) -> StepProgram:
+        """What is asked of the step, linear about the ``foreseen`` velocities (N, 3) and contact ``forces`` (n, 3) that
+        last step's ``activations`` (M,) would bring.
+        """
+        problem, members = response.tangent.problem, self.synergies.members
         contacts, weight, m = response.contacts, self.body.weight, self.synergies.count
         each = self._columns.sparse(problem.end_positions(foreseen)).toarray() * self.muscles.bounds
         # Without muscles and contact, in their stiffness at last step's tension.
@@ -251,44 +296,22 @@ class LocomotionStepper:
             np.hstack([solved[:, :-1], weight * response.columns]),
             np.hstack([np.zeros((3, m)), torques]),
         )
-        clock.lap("linearise")
-        previous = self.synergies.mean(memory.activations / self.muscles.bounds)
+        previous = self.synergies.mean(activations / self.muscles.bounds)
         cost = (
             objectives_cost(problem, linear, objectives, self.speed_scale)
             + effort_cost(problem, linear, foreseen.ravel())
             + self._activation_cost(problem.dt, previous, linear.columns.shape[1])
         )
         rows = np.hstack([contacts.frame @ solved[:, :-1], weight * response.delassus]) / self.speed_scale
-        shift = self.solver.shift(contacts, problem.dt)
         offset = contacts.frame @ linear.base / self.speed_scale
-        offset[::3] += shift / self.speed_scale
+        offset[::3] += self.solver.shift(contacts, problem.dt) / self.speed_scale
         reach = _FASTEST * problem.dt / self.time_unit
-        program = ContactPieces(
+        pieces = ContactPieces(
             *(cost.P, cost.q, cost.constant, rows, offset, self.geometry.friction),
             *(np.maximum(previous - reach, -1.0), np.minimum(previous + reach, 1.0)),
         )
-        clock.lap("program")
-        friction = self.geometry.friction
         slip = (contacts.frame @ foreseen.ravel()).reshape(-1, 3) / self.speed_scale
-        found = search_program(
-            program,
-            settings.strategy,
-            Foreseen(previous, forces / weight, slip),
-            directions=settings.directions,
-            qp_limit=settings.qp_limit,
-            solver=settings.qp_solver,
-        )
-        clock.lap("qp")
-        if found.x is None:
-            return _Plan(memory.activations, foreseen, forces, found.qp_count, found.infeasible)
-        activations = (members @ found.x[:m]) * self.muscles.bounds
-        moved = linear.base + solved[:, :-1] @ found.x[:m]
-        forces = response.forces(moved, shift, friction, weight * found.x[m:].reshape(-1, 3))
-        velocities = (moved + response.columns @ forces.ravel()).reshape(foreseen.shape)
-        clock.lap("contact")
-        if not problem.feasible(velocities):
-            velocities = foreseen
-        return _Plan(activations, velocities, forces, found.qp_count, found.infeasible)
+        return StepProgram(pieces, Foreseen(previous, forces / weight, slip), linear)
 
     def _activation_cost(self, dt: float, previous: np.ndarray, count: int) -> QuadraticCost:
         """Of ``count`` unknowns that begin with the activations, how large they are and how they change from
