@@ -52,13 +52,14 @@ def _live(chosen: argparse.Namespace) -> int:
     from egs_warp.io import read_capture
     from egs_warp.web.feed import LiveFeed
     from egs_warp.web.page import page_text
-    from egs_warp.web.server import PageServer
+    from egs_warp.web.server import PageServer, check_port
 
     # What can be told at once, before any long work.
     page_text()
+    check_port(chosen.port)
     start(chosen.device)
-    session = _session(chosen)
     behind = read_capture(chosen.background, device=chosen.device).cloud if chosen.background is not None else None
+    session = _session(chosen)
     scene = session.creature.placed(behind) if behind is not None else None
     server = PageServer([], port=chosen.port, feed=LiveFeed(session, scene=scene))
     session.start()

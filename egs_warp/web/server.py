@@ -189,6 +189,11 @@ class _SameMachine:
         await self._app(scope, receive, send)
 
 
+def check_port(port: int) -> None:
+    """Raise the ``UserError`` of ``PageServer`` for a port that is taken, before any long work."""
+    _listening(port).close()
+
+
 def _listening(port: int) -> socket.socket:
     made = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:

@@ -144,7 +144,7 @@ class Session:
 
     def _live(self) -> None:
         while self._await_turn():
-            self._obey()
+            self.obey()
             if not self._held:
                 self.advance()
                 self._keep_time()
@@ -213,12 +213,18 @@ class Session:
         self._index += 1
         self._send(self._frame())
 
-    def _obey(self) -> None:
+    def obey(self) -> None:
+        """Do what the messages ask that came since."""
         with self._changed:
             messages = list(self._inbox)
             self._inbox.clear()
         for message in messages:
-            self._do(message)
+            try:
+                self._do(message)
+            # What goes wrong with one message must not end a session.
+            except Exception as error:
+                print(f"egs-warp: live: {type(error).__name__}: {error}", file=sys.stderr)
+                self._tell(f"that did not work: {str(error)[:200]}")
 
     def _do(self, message: Message) -> None:
         match message:
@@ -251,7 +257,7 @@ class Session:
 
     def _stand_up(self) -> None:
         self._end_take()
-        self._spring = None
+        self._spring = self._still_since = None
         still = np.zeros_like(self.state.velocities)
         self.state = BodyState(self.creature.start.positions.copy(), still, self.state.time)
         self.report = None

@@ -8,7 +8,7 @@ from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import Objective, SpinObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import Calm, PoseFamily, Weights
+from egs_warp.motions.stance import CALM, Calm, PoseFamily, Weights
 
 _RATE = 4.0
 """Over sqrt(H / g): how fast the centre of mass comes back over the feet."""
@@ -24,7 +24,8 @@ class Stand:
         self._time_unit = float(np.sqrt(place.body.height / self._gravity))
         self._height = self.pose.standing_height
         self._calm = Calm(place.body)
-        self._resting = False
+        # It begins as the motion before has ended, at rest.
+        self._resting = True
 
     @property
     def resting(self) -> bool:
@@ -34,7 +35,8 @@ class Stand:
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
         seen = self.pose.measure(state, report)
-        self._resting = self._calm.held(seen.velocity, state.time)
+        slow = bool(np.linalg.norm(seen.velocity) <= CALM * np.sqrt(self._gravity * self.body.height))
+        self._resting = self._calm.held(seen.velocity, state.time) or (self._resting and slow)
         rate = _RATE / self._time_unit
         goal = np.array([*(seen.base - self.pose.base_offset), self._height])
         acceleration = rate**2 * (goal - seen.com) - 2.0 * rate * seen.velocity

@@ -121,7 +121,7 @@ class Take:
         creature, reports, time = self.creature, self.reports, trajectory.time
         mesh, books = creature.cage.mesh, ledger(trajectory)
         starts = [int(np.searchsorted(time, entry.start_time - 1e-9)) for entry in begun]
-        spans = list(zip(starts, [*starts[1:], len(time) - 1], strict=True))
+        spans = list(zip(starts, [*starts, len(time) - 1][1:], strict=True))
         frames = np.arange(len(time))
         notes = ["the user pulled at it; momentum and energy of the audit do not know of that"] if self.pulled else []
         return Report(
