@@ -106,7 +106,7 @@ def _session(chosen: argparse.Namespace) -> Session:
             progress=lambda stage: bar.set_description_str(f"prepare: {stage}"),
         )
         bar.set_description_str("prepare: split")
-        drawn_as = drawn_creature(creature, split_for_life(creature))
+        drawn_as = drawn_creature(creature, split_for_life(creature), forward)
         bar.set_description_str("prepare: done")
     made = SessionOptions(
         source=Path(chosen.capture).name, takes=chosen.out, muscles_file=chosen.muscles, forward=forward

@@ -48,6 +48,8 @@ from egs_warp.web.takes import LONGEST_TAKE, Take, script_text
 
 _MOST_WAITING = 240
 """Frames for a page that is slow to take them; older ones are dropped."""
+_MOST_ASKED = 1000
+"""Messages that wait for a step to end."""
 _STILL = 2e-3
 """sqrt(g H): a body none of whose nodes moves faster, and that has nothing to do, is left at rest, without steps."""
 _STILL_TIME = 0.5
@@ -87,7 +89,7 @@ class Session:
         self._still_since: float | None = None
         self._watched = False
         self._index = 0
-        self._inbox: deque[Message] = deque()
+        self._inbox: deque[Message] = deque(maxlen=_MOST_ASKED)
         self._outbox: deque[Frame | dict[str, Any]] = deque()
         self._changed = threading.Condition()
         self._wake: Callable[[], object] = lambda: None

@@ -41,7 +41,11 @@ export function icon(name: Icon): string {
 export function button(name: Icon, title: string, pressed: () => void): HTMLButtonElement {
   const made = element("button", { type: "button", class: "icon", title, "aria-label": title });
   made.innerHTML = icon(name);
-  made.addEventListener("click", pressed);
+  made.addEventListener("click", (event) => {
+    pressed();
+    // Keys go to the page again, not to what was clicked last.
+    if (event.detail > 0) made.blur();
+  });
   return made;
 }
 

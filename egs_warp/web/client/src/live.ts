@@ -10,6 +10,8 @@ import type { Stage } from "./stage";
 type State = Extract<News, { type: "state" }>;
 /** Milliseconds for which a line is shown. */
 const SHOWN = 7000;
+/** Of a body that was told nothing else. */
+const ORDINARY_SAG = 0.05;
 /** Slower than this it is said. */
 const SLOWER = 0.95;
 const HELP: [string[], string][] = [
@@ -64,7 +66,7 @@ export class Live {
         source.send({ type: "set", friction }),
       ),
       // To the right it is stiffer, each way by the same factor.
-      sag: slide("Stiffness", [-Math.log(most), -Math.log(least)], "any", (value) => `sags ${(100 * Math.exp(-value)).toFixed(1)} %`, (value) =>
+      sag: slide("Stiffness", [-Math.log(most), -Math.log(least)], "any", (value) => `${(ORDINARY_SAG * Math.exp(value)).toFixed(1)}\u00d7`, (value) =>
         source.send({ type: "set", sag: Math.min(Math.max(Math.exp(-value), least), most) }),
       ),
     };

@@ -3,7 +3,8 @@
 import * as THREE from "three";
 import { Strokes } from "./strokes";
 
-const ACCENT = new THREE.Color(0x7fd1b8);
+/** As the shader writes it. */
+const ACCENT = new THREE.Color(0x7fd1b8).convertLinearToSRGB();
 const PULL = new THREE.Color(0xffc24a).toArray();
 
 export class Marks {
@@ -13,15 +14,10 @@ export class Marks {
   private readonly spring = new Strokes(2.5, 0.95, 16);
 
   constructor(private readonly height: number) {
-    const flat = (opacity: number): THREE.MeshBasicMaterial =>
-      new THREE.MeshBasicMaterial({ color: ACCENT, transparent: true, opacity, depthWrite: false, side: THREE.DoubleSide });
-    this.goal = new THREE.Mesh(new THREE.RingGeometry(0.1 * height, 0.14 * height, 48), flat(0.85));
-    const chevron = new THREE.Shape();
-    for (const [k, [x, y]] of [[0, 0.13], [0.17, 0], [0, -0.13], [0.05, 0]].entries()) {
-      if (k === 0) chevron.moveTo(x! * height, y! * height);
-      else chevron.lineTo(x! * height, y! * height);
-    }
-    this.facing = new THREE.Mesh(new THREE.ShapeGeometry(chevron), flat(0.7));
+    this.goal = new THREE.Mesh(new THREE.PlaneGeometry(0.32 * height, 0.32 * height), drawn("abs(length(p) - 0.72) - 0.16", 0.85));
+    // An arrow head: within a triangle, outside of the notch behind.
+    const head = "max(0.45 * (p.x - 0.8) + 0.89 * abs(p.y), 0.85 * (-0.2 - 0.625 * abs(p.y) - p.x))";
+    this.facing = new THREE.Mesh(new THREE.PlaneGeometry(0.26 * height, 0.26 * height), drawn(head, 0.75));
     for (const mark of [this.goal, this.facing]) {
       mark.renderOrder = -5;
       mark.position.z = 0.002 * height;
@@ -36,7 +32,7 @@ export class Marks {
     if (goal !== null) this.goal.position.set(goal[0], goal[1], this.goal.position.z);
   }
 
-  /** A chevron on the ground ahead of `middle`. */
+  /** An arrow on the ground ahead of `middle`. */
   showFacing(middle: THREE.Vector3, [x, y]: [number, number], reach: number): void {
     this.facing.visible = true;
     this.facing.position.set(middle.x + reach * x, middle.y + reach * y, this.facing.position.z);
@@ -60,4 +56,18 @@ export class Marks {
     const points = [...held.toArray(), ...hand.toArray(), ...ring];
     this.spring.set(points, Array.from({ length: points.length }, (_, k) => PULL[k % 3]!));
   }
+}
+
+/** Flat on the ground, smooth at its edge however few pixels there are: `distance` of p, each side of the square at 1, is
+ * negative inside. */
+function drawn(distance: string, opacity: number): THREE.ShaderMaterial {
+  return new THREE.ShaderMaterial({
+    uniforms: { colour: { value: ACCENT } },
+    vertexShader: `varying vec2 p; void main() { p = 2.0 * uv - 1.0; gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); }`,
+    fragmentShader: `varying vec2 p; uniform vec3 colour;
+      void main() { float d = ${distance}; gl_FragColor = vec4(colour, ${opacity} * clamp(0.5 - d / fwidth(d), 0.0, 1.0)); }`,
+    transparent: true,
+    depthWrite: false,
+    side: THREE.DoubleSide,
+  });
 }
