@@ -51,8 +51,9 @@ _MOST_WAITING = 240
 _MOST_ASKED = 1000
 """Messages that wait for a step to end."""
 _STILL = 2e-3
-"""sqrt(g H): a body none of whose nodes moves faster, and that has nothing to do, is left at rest, without steps."""
-_STILL_TIME = 0.5
+"""sqrt(g H): a body whose nodes move no faster, root mean square, and that has nothing to do, is left at rest, without
+steps."""
+_STILL_TIME = 0.3
 """Seconds for which that holds first."""
 
 
@@ -203,7 +204,9 @@ class Session:
             self._stand_up()
             return
         self.report = reports[-1]
-        if np.linalg.norm(self.state.velocities, axis=1).max() > _STILL * self.creature.stepper.speed_scale:
+        body, velocities = self.creature.body, self.state.velocities
+        speed = np.sqrt(body.node_mass @ (velocities**2).sum(axis=1) / body.mass)
+        if speed > _STILL * self.creature.stepper.speed_scale:
             self._still_since = None
         elif self._still_since is None:
             self._still_since = self.state.time
