@@ -5,7 +5,7 @@ import type { Frame } from "./packets";
 /** Frames that are kept to look back at. */
 const KEPT = 900;
 /** Seconds over which the solver's speed is averaged. */
-const MEMORY = 1.5;
+const MEMORY = 4;
 /** Seconds behind the newest frame: at least and at most. */
 const SHORTEST = 0.03;
 const LONGEST = 0.6;
@@ -59,8 +59,12 @@ export class LiveClock {
     if (newest === undefined || this.time >= newest.time) return false;
     const ahead = newest.time - this.time;
     const wanted = this.speed * this.delay();
-    // Faster with much ahead and slower with little: what is ahead stays as long as it has to be.
-    const speed = this.speed * Math.min(Math.max(ahead / Math.max(wanted, 1e-6), 0.15), 1.6);
+    // Slower with little ahead; with much hardly faster: in the air steps are quick, and what they gain bridges the slow
+    // ones on the ground.
+    const speed =
+      ahead < wanted
+        ? this.speed * Math.max(ahead / wanted, 0.15)
+        : this.speed * (1 + 0.3 * Math.min((ahead - wanted) / Math.max(this.speed, 1e-6), 1));
     this.shownSpeed += (speed - this.shownSpeed) * Math.min(1, 6 * elapsed);
     this.time = Math.min(this.time + Math.min(elapsed, 0.25) * this.shownSpeed, newest.time);
     this.find();
@@ -70,7 +74,7 @@ export class LiveClock {
   /** Seconds of ours that the picture is behind the newest frame: the longest pause between two, of late. */
   private delay(): number {
     let longest = 0;
-    for (let k = 1; k < this.arrivals.length; k++) {
+    for (let k = Math.max(1, this.arrivals.length - 12); k < this.arrivals.length; k++) {
       longest = Math.max(longest, this.arrivals[k]!.wall - this.arrivals[k - 1]!.wall);
     }
     return Math.min(Math.max(1.1 * longest, SHORTEST), LONGEST);
