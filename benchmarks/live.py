@@ -214,10 +214,10 @@ def _address(capture: Path, nodes: int, device: str, folder: Path) -> Iterator[s
 
 
 def _wait(page: Any, condition: str) -> None:
-    end = time.monotonic() + 300.0
+    end = time.monotonic() + 150.0
     while not page.evaluate(condition):
         if time.monotonic() > end:
-            raise TimeoutError(condition)
+            raise TimeoutError(f"{condition}: {page.evaluate('JSON.stringify([egs.live.state, egs.live.told])')}")
         page.wait_for_timeout(50)
 
 

@@ -9,6 +9,8 @@ const MEMORY = 4;
 /** Seconds behind the newest frame: at least and at most. */
 const SHORTEST = 0.03;
 const LONGEST = 0.6;
+/** The last of a motion is shown, however slowly it came. */
+const SLOWEST = 0.02;
 
 interface Arrival {
   wall: number;
@@ -42,7 +44,7 @@ export class LiveClock {
     this.arrivals.push({ wall, time: newest.time });
     while (this.arrivals.length > 2 && wall - this.arrivals[0]!.wall > MEMORY) this.arrivals.shift();
     const first = this.arrivals[0]!;
-    if (wall - first.wall > 0.2) this.speed = Math.min((newest.time - first.time) / (wall - first.wall), 1.05);
+    if (wall - first.wall > 0.2) this.speed = Math.min(Math.max((newest.time - first.time) / (wall - first.wall), SLOWEST), 1.05);
     else if (this.speed === 0 && before !== undefined) this.speed = 0.2;
     if (frames.length > KEPT + 60) frames.splice(0, frames.length - KEPT);
     this.find();
