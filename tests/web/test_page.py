@@ -127,15 +127,15 @@ def test_play_advances_and_loops(chromium: Any, file: str):
 
 def test_a_slow_machine_waits_for_its_splats_to_be_sorted(chromium: Any, file: str):
     """An old order would draw the ground over a body that has moved."""
-    page, _ = _opened(chromium, file)
+    page, _ = opened(chromium, file)
     page.evaluate("Object.defineProperty(egs.stages[0], 'sorting', { get: () => window.held })")
     page.evaluate("() => { window.held = true; egs.player.playing = true; egs.pace = 0.001; }")
-    _wait(page, "egs.player.place > 0")
+    wait_until(page, "egs.player.place > 0")
     page.evaluate("() => { egs.pace = 1; window.at = egs.player.place; }")
     page.wait_for_timeout(500)
     assert page.evaluate("egs.player.playing && egs.player.place === window.at")
     page.evaluate("window.held = false")
-    _wait(page, "egs.player.place !== window.at")
+    wait_until(page, "egs.player.place !== window.at")
     page.close()
 
 
