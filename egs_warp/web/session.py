@@ -19,9 +19,8 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.fem.body import DEFAULT_SAG, BodyState, make_body
 from egs_warp.geometry.body_frame import GROUND
-from egs_warp.locomotion.coupled_stepper import CoupledStepper
 from egs_warp.locomotion.rollout import FRAME_RATE, settle, steps_per_frame
-from egs_warp.locomotion.stepper import StepReport
+from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
 from egs_warp.motions.script import MOST_MOTIONS
 from egs_warp.motions.sequence import Place
 from egs_warp.pipelines.creature import Creature, body_muscles, first_place
@@ -383,7 +382,7 @@ def changed_creature(creature: Creature, *, friction: float, sag: float, muscles
     up = -body.gravity / np.linalg.norm(body.gravity)
     made = make_body(creature.cage.mesh, GROUND, up=up, sag=sag, device=device)
     muscles = body_muscles(made, muscles_file, creature.frame)
-    stepper = CoupledStepper(made, muscles, geometry, settings=creature.stepper.settings, device=device)
+    stepper = LocomotionStepper(made, muscles, geometry, settings=creature.stepper.settings, device=device)
     return replace(creature, stepper=stepper, start=settle(stepper))
 
 
