@@ -86,6 +86,7 @@ def make_creature(
     solids: tuple[Solid, ...] = (),
     gravity_up: np.ndarray | None = None,
     settings: LocomotionSettings | None = None,
+    nodes: int = 500,
     progress: Callable[[str], object] = lambda stage: None,
 ) -> Creature:
     """Give a capture (scene units) a body that stands on ``plane``, or on its own base, square to ``up`` (3,).
@@ -94,7 +95,7 @@ def make_creature(
     file lies. ``muscles_file``: see ``body_muscles``. ``solids`` are steps and walls beside the ground; ``gravity_up``
     (3,) is against gravity if the ground is a slope. ``settings`` of its stepper choose the strategy for the contact
     states and the QP solver. The body is as stiff as makes it sag by ``sag`` of its height; one that its weight would
-    bend out of shape is made stiffer. ``progress`` is told the name of each stage.
+    bend out of shape is made stiffer. ``nodes``: of its cage, about. ``progress`` is told the name of each stage.
     """
     normal = plane.normal if plane is not None else up
     if normal is None:
@@ -103,7 +104,7 @@ def make_creature(
     if gravity_up is not None:
         _check_slope(normal / np.linalg.norm(normal), gravity_up)
     progress("cage")
-    standing = stand(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit)
+    standing = stand(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit, nodes=nodes)
     progress("contact")
     device, frame, cage = str(cloud.device), standing.frame, standing.cage
     solids = tuple(Solid(tuple(frame.plane(face) for face in solid.faces)) for solid in solids)
@@ -142,10 +143,11 @@ def stand(
     up: np.ndarray | None = None,
     plane: Plane | None = None,
     metres_per_unit: float | None = None,
+    nodes: int = 500,
 ) -> Standing:
     """Find the body's own frame on ``plane``, or on its base square to ``up`` (3,), and make its cage there.
 
-    Without ``metres_per_unit`` the body is 1 m tall.
+    Without ``metres_per_unit`` the body is 1 m tall. The cage has about so many ``nodes``.
     """
     near, anchor = centred(cloud)
     if plane is None:
@@ -155,7 +157,7 @@ def stand(
         plane = plane.moved(-anchor)
     frame = find_body_frame(near, plane)
     gaussians = body_gaussians(near, frame)
-    cage = cage_of_body(gaussians)
+    cage = cage_of_body(gaussians, target_nodes=nodes)
     metres = 1.0 / cage.height(GROUND) if metres_per_unit is None else metres_per_unit / frame.scale
     return Standing(frame.moved(anchor).scaled(metres), gaussians.scaled(metres), cage.scaled(metres))
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from egs_warp.deformation.deformer import Deformer
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.pipelines.drawn import DrawnCreature
 from egs_warp.pipelines.finished_run import FinishedRun
 from egs_warp.web.packets import Frame, header, with_length
 
@@ -30,8 +33,7 @@ class Recording(FinishedRun):
 
     def header(self) -> bytes:
         """All that does not change from frame to frame."""
-        t, made = self.trajectory, self.creature
-        camera, report = made.camera, self.report
+        t, report = self.trajectory, self.report
         facts = {
             "title": self.title,
             "rate": FRAME_RATE,
@@ -39,38 +41,12 @@ class Recording(FinishedRun):
             "height": t.height,
             "weight": float(t.node_mass.sum() * np.linalg.norm(t.gravity)),
             "friction": t.friction,
-            "curves": [{"name": name, "title": title, "unit": unit} for name, title, unit in CURVES],
-            "fibres": [{"name": n, "kind": k} for n, k in zip(made.fibre_names, made.fibre_kinds, strict=True)],
-            "camera": {
-                "position": camera.centre.tolist(),
-                "forward": camera.rotation[2].tolist(),
-                "fov": float(np.degrees(2.0 * np.arctan(0.5 * camera.height / camera.fy))),
-            },
+            "curves": curve_facts(CURVES),
             "audit": report.get("audit", {}),
             "motion": report.get("motion", []),
             "notes": report.get("notes", []),
-            "degree": {"splats": made.splats.sh_degree, "scene": self.scene.sh_degree if self.scene else 0},
         }
-        mesh, deformer = self.mesh, self.deformer()
-        arrays = {
-            "rest": t.rest_positions.astype(np.float32),
-            "tets": t.tets.astype(np.int32),
-            "node_mass": t.node_mass.astype(np.float32),
-            "planes": t.planes.astype(np.float32),
-            "surface": mesh.boundary_faces().astype(np.int32),
-            "edges": _edges(mesh.boundary_faces()),
-            "muscle_end_starts": made.muscle_ends.indptr.astype(np.int32),
-            "muscle_end_nodes": made.muscle_ends.indices.astype(np.int32),
-            "muscle_end_weights": made.muscle_ends.data.astype(np.float32),
-            "muscle_segments": made.muscle_segments.astype(np.int32),
-            "fibre_from_segment": made.fibre_from_segment.astype(np.int32),
-            "mean_tets": deformer.plan.mean_tets.numpy(),
-            "arms": _arms(deformer),
-            **_splat_arrays("splats", made.splats),
-        }
-        if self.scene is not None:
-            arrays |= _splat_arrays("scene", self.scene)
-        return header(facts, arrays)
+        return creature_header(facts, self.creature, self.mesh, t.node_mass, t.planes, self.deformer(), self.scene)
 
     def frames(self) -> Iterator[Frame]:
         """At 60 Hz."""
@@ -89,6 +65,56 @@ class Recording(FinishedRun):
     def bytes(self) -> bytes:
         """The whole run in one piece."""
         return b"".join([self.header(), *(with_length(frame.packet()) for frame in self.frames())])
+
+
+def curve_facts(curves: Sequence[tuple[str, str, str]]) -> list[dict[str, str]]:
+    """``curves`` as a header tells them."""
+    return [{"name": name, "title": title, "unit": unit} for name, title, unit in curves]
+
+
+def creature_header(
+    facts: Mapping[str, Any],
+    made: DrawnCreature,
+    mesh: TetMesh,
+    node_mass: np.ndarray,
+    planes: np.ndarray,
+    deformer: Deformer,
+    scene: GaussianCloud | None,
+) -> bytes:
+    """The header of a creature that is drawn as ``made``: its ``facts`` with those of muscles and camera.
+
+    ``mesh`` is the rest cage; ``planes`` (P, 4) are rows n, d; ``deformer`` carries the splats; ``scene`` is behind.
+    """
+    camera = made.camera
+    facts = {
+        **facts,
+        "fibres": [{"name": n, "kind": k} for n, k in zip(made.fibre_names, made.fibre_kinds, strict=True)],
+        "camera": {
+            "position": camera.centre.tolist(),
+            "forward": camera.rotation[2].tolist(),
+            "fov": float(np.degrees(2.0 * np.arctan(0.5 * camera.height / camera.fy))),
+        },
+        "degree": {"splats": made.splats.sh_degree, "scene": scene.sh_degree if scene else 0},
+    }
+    arrays = {
+        "rest": mesh.nodes.astype(np.float32),
+        "tets": mesh.tets.astype(np.int32),
+        "node_mass": node_mass.astype(np.float32),
+        "planes": planes.astype(np.float32),
+        "surface": mesh.boundary_faces().astype(np.int32),
+        "edges": _edges(mesh.boundary_faces()),
+        "muscle_end_starts": made.muscle_ends.indptr.astype(np.int32),
+        "muscle_end_nodes": made.muscle_ends.indices.astype(np.int32),
+        "muscle_end_weights": made.muscle_ends.data.astype(np.float32),
+        "muscle_segments": made.muscle_segments.astype(np.int32),
+        "fibre_from_segment": made.fibre_from_segment.astype(np.int32),
+        "mean_tets": deformer.plan.mean_tets.numpy(),
+        "arms": _arms(deformer),
+        **_splat_arrays("splats", made.splats),
+    }
+    if scene is not None:
+        arrays |= _splat_arrays("scene", scene)
+    return header(facts, arrays)
 
 
 def _edges(faces: np.ndarray) -> np.ndarray:

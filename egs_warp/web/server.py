@@ -8,7 +8,7 @@ import json
 import os
 import secrets
 import socket
-from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from collections.abc import AsyncGenerator, Callable, Coroutine, Sequence
 from typing import Protocol
 from urllib.parse import urlsplit
 
@@ -46,8 +46,8 @@ class FrameFeed(Protocol):
         """All that does not change (``packets.header``)."""
         ...
 
-    def packets(self) -> AsyncIterator[bytes]:
-        """Frames (``Frame.packet``) as they are made."""
+    def packets(self) -> AsyncGenerator[bytes | str]:
+        """Frames (``Frame.packet``) as they are made, and news beside them, as JSON."""
         ...
 
     def receive(self, message: dict[str, object]) -> None:
@@ -147,8 +147,9 @@ async def _first_to_end(*ways: Coroutine[None, None, None]) -> None:
 
 
 async def _speak(page: WebSocket, feed: FrameFeed) -> None:
-    async for packet in feed.packets():
-        await page.send_bytes(packet)
+    async with contextlib.aclosing(feed.packets()) as packets:
+        async for packet in packets:
+            await (page.send_text(packet) if isinstance(packet, str) else page.send_bytes(packet))
     await page.close(1000, "the run is over")
 
 
@@ -186,6 +187,11 @@ class _SameMachine:
                 await PlainTextResponse("not from here", 403, headers=_HEADERS)(scope, receive, send)
             return
         await self._app(scope, receive, send)
+
+
+def check_port(port: int) -> None:
+    """Raise the ``UserError`` of ``PageServer`` for a port that is taken, before any long work."""
+    _listening(port).close()
 
 
 def _listening(port: int) -> socket.socket:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncGenerator, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -23,7 +23,7 @@ class RecordedFeed:
         """See ``FrameFeed``."""
         return self._recording.header()
 
-    async def packets(self) -> AsyncIterator[bytes]:
+    async def packets(self) -> AsyncGenerator[bytes | str]:
         """See ``FrameFeed``."""
         while True:
             for frame in self._recording.frames():

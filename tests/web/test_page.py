@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import base64
 import io
-import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,29 +22,13 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io import write_ply
 from egs_warp.render.rasteriser import render_gaussians
-from egs_warp.web.page import PAGE, export_page
+from egs_warp.web.page import export_page
 from egs_warp.web.recording import Recording
-from tests.support.pages import RecordedFeed, served
+from tests.support.chromium import BROWSER, NEEDED, opened, wait_until
+from tests.support.pages import served
 
-_BROWSER = os.environ.get("EGS_WARP_BROWSER") or next(
-    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-)
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(not PAGE.is_file(), reason="the page is not built; make web builds it"),
-    pytest.mark.skipif(_BROWSER is None, reason="no Chromium; install it, or set EGS_WARP_BROWSER"),
-]
+pytestmark = NEEDED
 _BACKGROUND = (0x14 / 255.0, 0x16 / 255.0, 0x1A / 255.0)
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
-    playwright = pytest.importorskip("playwright.sync_api")
-    with playwright.sync_playwright() as started:
-        arguments = ["--enable-unsafe-swiftshader", "--use-angle=swiftshader", "--no-sandbox"]
-        browser = started.chromium.launch(executable_path=_BROWSER, args=arguments)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")
@@ -59,26 +41,6 @@ def file(recording: Recording, tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("page") / "page.html"
     export_page(path, [recording])
     return path.as_uri()
-
-
-def _opened(chromium: Any, address: str, width: int = 480, height: int = 480) -> tuple[Any, list[str]]:
-    """The page once it stands, and what the browser complains of."""
-    page = chromium.new_page(viewport={"width": width, "height": height})
-    complaints: list[str] = []
-    page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
-    page.on("pageerror", lambda error: complaints.append(str(error)))
-    page.goto(address)
-    _wait(page, "window.egs !== undefined")
-    return page, complaints
-
-
-def _wait(page: Any, condition: str) -> None:
-    """Until the JavaScript ``condition`` holds; Playwright's own waiting is what the page's security policy forbids."""
-    for _ in range(1200):
-        if page.evaluate(condition):
-            return
-        page.wait_for_timeout(50)
-    raise AssertionError(condition)
 
 
 def _picture(page: Any, stage: int = 0) -> np.ndarray:
@@ -124,7 +86,7 @@ def _psnr_on_body(ours: np.ndarray, theirs: np.ndarray) -> float:
 def test_canvas_is_like_our_own_picture_of_the_same_frame_and_camera(
     chromium: Any, file: str, recording: Recording, preset: str
 ):
-    page, complaints = _opened(chromium, file)
+    page, complaints = opened(chromium, file)
     page.evaluate("(name) => { egs.setLayer('ground', false); egs.stages[0].preset(name); }", preset)
     for frame in (0, 12):
         page.evaluate("(frame) => egs.player.seek(frame)", frame)
@@ -135,18 +97,18 @@ def test_canvas_is_like_our_own_picture_of_the_same_frame_and_camera(
 
 def test_motion_is_seen(chromium: Any, file: str, recording: Recording):
     """The teeth of the comparison: another frame, and splats that stay, are far off."""
-    page, _ = _opened(chromium, file)
+    page, _ = opened(chromium, file)
     page.evaluate("egs.setLayer('ground', false); egs.player.seek(12)")
     assert _psnr_on_body(_own_picture(recording, page, 0), _picture(page)) < 35.0
     page.close()
 
 
 def test_play_advances_and_loops(chromium: Any, file: str):
-    page, complaints = _opened(chromium, file)
+    page, complaints = opened(chromium, file)
     page.click("button.play")
-    _wait(page, "egs.player.place > 3")
-    _wait(page, "egs.player.place > 9")
-    _wait(page, "egs.player.place < 6")
+    wait_until(page, "egs.player.place > 3")
+    wait_until(page, "egs.player.place > 9")
+    wait_until(page, "egs.player.place < 6")
     page.keyboard.press(" ")
     stopped = page.evaluate("egs.player.place")
     page.wait_for_timeout(200)
@@ -157,7 +119,7 @@ def test_play_advances_and_loops(chromium: Any, file: str):
     page.select_option(".speed", "2")
     page.evaluate("egs.player.seek(0)")
     page.click("button.play")
-    _wait(page, "!egs.player.playing && egs.player.place === 12")
+    wait_until(page, "!egs.player.playing && egs.player.place === 12")
     assert page.text_content(".clock") == "0.20 / 0.20 s"
     assert complaints == []
     page.close()
@@ -165,20 +127,20 @@ def test_play_advances_and_loops(chromium: Any, file: str):
 
 def test_a_slow_machine_waits_for_its_splats_to_be_sorted(chromium: Any, file: str):
     """An old order would draw the ground over a body that has moved."""
-    page, _ = _opened(chromium, file)
+    page, _ = opened(chromium, file)
     page.evaluate("Object.defineProperty(egs.stages[0], 'sorting', { get: () => window.held })")
     page.evaluate("() => { window.held = true; egs.player.playing = true; egs.pace = 0.001; }")
-    _wait(page, "egs.player.place > 0")
+    wait_until(page, "egs.player.place > 0")
     page.evaluate("() => { egs.pace = 1; window.at = egs.player.place; }")
     page.wait_for_timeout(500)
     assert page.evaluate("egs.player.playing && egs.player.place === window.at")
     page.evaluate("window.held = false")
-    _wait(page, "egs.player.place !== window.at")
+    wait_until(page, "egs.player.place !== window.at")
     page.close()
 
 
 def test_each_layer_shows(chromium: Any, file: str):
-    page, complaints = _opened(chromium, file)
+    page, complaints = opened(chromium, file)
     page.evaluate("egs.player.seek(8)")
     page.click("[title=Layers]")
     before = _picture(page)
@@ -192,7 +154,7 @@ def test_each_layer_shows(chromium: Any, file: str):
 
 
 def test_curves_move_with_the_time_line(chromium: Any, file: str):
-    page, complaints = _opened(chromium, file)
+    page, complaints = opened(chromium, file)
     page.click("[title^=Curves]")
     said = []
     for frame in (0, 12):
@@ -206,7 +168,7 @@ def test_curves_move_with_the_time_line(chromium: Any, file: str):
 
 
 def test_orbit_turns_the_camera(chromium: Any, file: str):
-    page, _ = _opened(chromium, file)
+    page, _ = opened(chromium, file)
     before = page.evaluate("egs.stages[0].camera.position.toArray()")
     page.mouse.move(240, 200)
     page.mouse.down()
@@ -219,7 +181,7 @@ def test_orbit_turns_the_camera(chromium: Any, file: str):
 
 
 def test_screenshot_and_video_are_files(chromium: Any, file: str, tmp_path: Path):
-    page, complaints = _opened(chromium, file)
+    page, complaints = opened(chromium, file)
     with page.expect_download() as picture:
         page.keyboard.press("s")
     assert picture.value.suggested_filename == "pawn-jump-0.png"
@@ -237,7 +199,7 @@ def test_screenshot_and_video_are_files(chromium: Any, file: str, tmp_path: Path
 
 
 def test_a_phone_shows_creature_and_controls(chromium: Any, file: str):
-    page, complaints = _opened(chromium, file, 360, 740)
+    page, complaints = opened(chromium, file, 360, 740)
     assert page.evaluate("document.documentElement.scrollWidth") <= 360
     for part in (".dock", ".tools", ".play", ".line"):
         box = page.locator(part).bounding_box()
@@ -253,29 +215,12 @@ def test_a_phone_shows_creature_and_controls(chromium: Any, file: str):
 
 def test_two_runs_side_by_side_share_time_and_camera(chromium: Any, recording: Recording):
     with served(recording, recording) as server:
-        page, complaints = _opened(chromium, server.address, 800, 400)
+        page, complaints = opened(chromium, server.address, 800, 400)
         page.evaluate("egs.setLayer('ground', false); egs.stages[0].preset('side'); egs.player.seek(6)")
         first, second = _picture(page, 0), _picture(page, 1)
         assert first.shape == second.shape
         assert np.abs(first - second).max() < 0.02
         assert complaints == []
-        page.close()
-
-
-def test_frames_of_a_socket_are_shown_and_a_lost_connection_is_taken_up_again(chromium: Any, recording: Recording):
-    with served(feed=RecordedFeed(recording)) as server:
-        page, complaints = _opened(chromium, server.address)
-        _wait(page, "egs.player.place > 3")
-        assert complaints == []
-        port, token = server.port, server.token
-        address = server.address
-    _wait(page, "document.body.classList.contains('lost')")
-    assert page.locator("canvas.view").is_visible()
-    with served(feed=RecordedFeed(recording), port=port, token=token) as server:
-        assert server.address == address
-        count = page.evaluate("egs.stages[0].source.frames.length")
-        _wait(page, f"egs.stages[0].source.frames.length > {count + 3}")
-        assert not page.evaluate("document.body.classList.contains('lost')")
         page.close()
 
 
@@ -293,7 +238,7 @@ def test_a_browser_without_webgl2_is_told(file: str):
     script = f"""
 from playwright.sync_api import sync_playwright
 with sync_playwright() as started:
-    browser = started.chromium.launch(executable_path={_BROWSER!r}, args=["--disable-3d-apis", "--no-sandbox"])
+    browser = started.chromium.launch(executable_path={BROWSER!r}, args=["--disable-3d-apis", "--no-sandbox"])
     page = browser.new_page()
     page.goto({file!r})
     page.wait_for_selector("[role=alert]:has-text('WebGL2')")
@@ -326,7 +271,7 @@ def on_a_floor(run_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> st
 
 
 def test_a_scene_behind_lies_on_the_ground_and_takes_the_shadow(chromium: Any, on_a_floor: str):
-    page, complaints = _opened(chromium, on_a_floor)
+    page, complaints = opened(chromium, on_a_floor)
     assert not page.evaluate("document.getElementById('layer-ground').checked")
     page.evaluate("egs.stages[0].preset('top'); egs.setLayer('splats', false)")
     picture = _picture(page)

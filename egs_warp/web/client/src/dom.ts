@@ -19,6 +19,16 @@ const ICONS = {
   camera: '<path d="M4 8h3l2-3h6l2 3h3v11H4z" stroke-linejoin="round"/><circle cx="12" cy="13" r="3.4"/>',
   view: '<path d="M12 3l8 4.5v9L12 21l-8-4.5v-9zM12 12l8-4.5M12 12v9M12 12L4 7.5" stroke-linejoin="round"/>',
   record: '<circle cx="12" cy="12" r="8.5"/><circle cx="12" cy="12" r="4" fill="currentColor" stroke="none"/>',
+  step: '<path d="M5 4.5v15l10-7.5z" fill="currentColor" stroke="none"/><path d="M18.5 5v14" stroke-width="2.4"/>',
+  forward: '<path d="M12 20V5M6 10.5L12 4.5l6 6" stroke-linejoin="round"/>',
+  left: '<path d="M9 4L4.5 8.5 9 13M5 8.5h8a6 6 0 0 1 0 12H9" stroke-linejoin="round"/>',
+  right: '<path d="M15 4l4.5 4.5L15 13M19 8.5h-8a6 6 0 0 0 0 12h4" stroke-linejoin="round"/>',
+  jump: '<path d="M5 20h14M12 16V4M7.5 8.5L12 4l4.5 4.5" stroke-linejoin="round"/>',
+  leap: '<path d="M4 19c2-14 13-16 16-3M16.5 13.5L20 16.5l1.5-4.5" stroke-linejoin="round"/>',
+  sliders: '<path d="M4 7h9M18 7h2M4 17h2M11 17h9"/><circle cx="15.5" cy="7" r="2.3"/><circle cx="8.5" cy="17" r="2.3"/>',
+  script: '<path d="M6 3.5h9l4 4V20.5H6zM9.5 11h6M9.5 14.5h6" stroke-linejoin="round"/>',
+  stand: '<path d="M12 21V9M8 21h8"/><circle cx="12" cy="5.5" r="2.5"/><path d="M7 13l5-3 5 3" stroke-linejoin="round"/>',
+  help: '<circle cx="12" cy="12" r="8.5"/><path d="M9.5 9.5a2.5 2.5 0 1 1 3.5 2.3c-.7.3-1 .8-1 1.7M12 16.5v.01" stroke-linecap="round"/>',
   curves: '<path d="M3 20V4M3 20h18M6 15c3 0 3-8 6-8s3 6 9 4"/>',
 } as const;
 
@@ -31,7 +41,11 @@ export function icon(name: Icon): string {
 export function button(name: Icon, title: string, pressed: () => void): HTMLButtonElement {
   const made = element("button", { type: "button", class: "icon", title, "aria-label": title });
   made.innerHTML = icon(name);
-  made.addEventListener("click", pressed);
+  made.addEventListener("click", (event) => {
+    pressed();
+    // Keys go to the page again, not to what was clicked last.
+    if (event.detail > 0) made.blur();
+  });
   return made;
 }
 

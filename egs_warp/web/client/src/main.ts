@@ -3,14 +3,16 @@
 import { Curves } from "./curves";
 import { button, element, icon, save } from "./dom";
 import { FilmRecorder } from "./film";
+import { Live } from "./live";
 import { Player } from "./player";
-import { fromAddress, fromElement, fromSocket, type FrameSource } from "./source";
+import { fromAddress, fromElement, fromSocket, LiveSource, type FrameSource } from "./source";
 import { Stage, type Preset, type Tick } from "./stage";
 import "./style.css";
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2];
-/** Seconds a picture from which fewer pixels are drawn. */
+/** Seconds a picture from which fewer pixels are drawn: of a run, and of a creature that lives. */
 const SLOW = 1 / 15;
+const SLOW_LIFE = 1 / 25;
 const LAYERS: { name: Tick; title: string; on: boolean; key: string }[] = [
   { name: "splats", title: "Creature", on: true, key: "1" },
   { name: "scene", title: "Scene", on: true, key: "2" },
@@ -36,10 +38,16 @@ async function findRuns(): Promise<FrameSource[]> {
     const address = new URL("live", location.href);
     address.protocol = address.protocol.replace("http", "ws");
     address.search = "";
-    return [await fromSocket(address.href, (connected) => document.body.classList.toggle("lost", !connected))];
+    return [await fromSocket(address.href, lost)];
   }
   const count = Number(asked.get("runs") ?? "1");
   return Promise.all(Array.from({ length: count }, (_, k) => fromAddress(`run/${k}`)));
+}
+
+/** Says why nothing comes; undefined: it comes again. */
+function lost(reason: string | undefined): void {
+  document.body.classList.toggle("lost", reason !== undefined);
+  document.body.dataset.lost = reason ?? "";
 }
 
 function webgl2(): boolean {
@@ -53,6 +61,8 @@ function tell(message: string): void {
 class Page {
   readonly stages: Stage[] = [];
   readonly player: Player;
+  /** Of a creature that lives. */
+  readonly live: Live | undefined;
   private readonly curves: Curves;
   private readonly film = new FilmRecorder();
   private readonly playButton: HTMLButtonElement;
@@ -74,8 +84,8 @@ class Page {
       views.append(element("figure", {}, canvas, element("figcaption", {}, source.header.facts.title)));
       const stage = new Stage(canvas, source);
       this.stages.push(stage);
-      source.onFrame = () => this.update();
     }
+    if (first instanceof LiveSource) this.live = new Live(first, this.stages[0] as Stage);
     for (const stage of this.stages) {
       stage.controls.addEventListener("change", () => {
         for (const other of this.stages) if (other !== stage) other.copyView(stage);
@@ -84,13 +94,14 @@ class Page {
     this.curves = new Curves(first, (place) => this.player.seek(place));
     this.playButton = button("play", "Play (space)", () => this.player.toggle());
     this.playButton.classList.add("play");
-    root.append(this.tools(), this.curves.panel, this.dock());
+    root.append(this.tools(), this.curves.panel, ...(this.live?.parts() ?? [this.dock()]));
     this.curves.panel.hidden = true;
     new ResizeObserver(() => {
       for (const stage of this.stages) stage.resize();
-      this.curves.draw(this.player.place);
+      this.curves.draw(this.place);
     }).observe(views);
     document.addEventListener("keydown", (event) => this.pressed(event));
+    if (this.live !== undefined) this.setFollow(true);
     for (const { name, on } of LAYERS) for (const stage of this.stages) stage.tick(name, on && this.shown(name, stage));
     this.update();
     requestAnimationFrame((now) => this.tick(now));
@@ -107,6 +118,17 @@ class Page {
   private shown(name: Tick, stage: Stage): boolean {
     // A captured scene has a ground of its own.
     return name !== "ground" || !stage.hasScene;
+  }
+
+  /** Frames, with a fraction between two of them: what is shown. */
+  get place(): number {
+    return this.live?.clock.place ?? this.player.place;
+  }
+
+  private setFollow(on: boolean): void {
+    const box = document.getElementById("follow");
+    if (box instanceof HTMLInputElement) box.checked = on;
+    for (const stage of this.stages) stage.follow = on;
   }
 
   private tools(): HTMLElement {
@@ -128,22 +150,21 @@ class Page {
       views.append(made);
     }
     const follow = element("input", { type: "checkbox", id: "follow" });
-    follow.addEventListener("change", () => {
-      for (const stage of this.stages) stage.follow = follow.checked;
-    });
+    follow.addEventListener("change", () => this.setFollow(follow.checked));
     views.append(element("label", {}, follow, element("span", {}, "Follow the creature")));
     const toggle = (opened: HTMLElement, other: HTMLElement) => () => {
       opened.hidden = !opened.hidden;
       other.hidden = true;
     };
-    const record = button("record", "Record a video of the whole run", () => this.record(record));
+    const what = this.live === undefined ? "Record a video of the whole run" : "Record a video of what is seen";
+    const record = button("record", what, () => this.record(record));
     return element(
       "nav",
       { class: "tools", "aria-label": "View" },
       button("layers", "Layers", toggle(layers, views)),
       button("view", "Camera", toggle(views, layers)),
       button("curves", "Curves (c)", () => this.toggleCurves()),
-      button("camera", "Screenshot (s)", () => void this.screenshot()),
+      button("camera", this.live === undefined ? "Screenshot (s)" : "Screenshot", () => void this.screenshot()),
       record,
       layers,
       views,
@@ -169,7 +190,7 @@ class Page {
 
   private toggleCurves(): void {
     this.curves.panel.hidden = !this.curves.panel.hidden;
-    this.curves.draw(this.player.place);
+    this.curves.draw(this.place);
   }
 
   private async screenshot(): Promise<void> {
@@ -177,7 +198,7 @@ class Page {
     for (const stage of this.stages) {
       stage.sharpen(1);
       await stage.settle();
-      save(await stage.picture(), `${this.fileName()}-${Math.round(this.player.place)}.png`);
+      save(await stage.picture(), `${this.fileName()}-${Math.round(this.place)}.png`);
     }
   }
 
@@ -191,10 +212,13 @@ class Page {
       return;
     }
     const { loop } = this.player;
-    this.player.seek(0);
-    this.player.loop = false;
+    if (this.live === undefined) {
+      this.player.seek(0);
+      this.player.loop = false;
+    }
     this.film.start(stage.canvas, (blob, ending) => save(blob, `${this.fileName()}.${ending}`));
     pressed.classList.add("on");
+    if (this.live !== undefined) return;
     this.player.playing = true;
     const watch = setInterval(() => {
       if (this.player.playing && this.film.recording) return;
@@ -211,13 +235,18 @@ class Page {
   }
 
   private pressed(event: KeyboardEvent): void {
-    if (event.target instanceof HTMLSelectElement || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.target instanceof HTMLSelectElement || (this.live && event.target instanceof HTMLInputElement) || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (this.live?.keyDown(event)) {
+      event.preventDefault();
+      return;
+    }
     const layer = LAYERS.find(({ key }) => key === event.key);
     if (layer !== undefined) this.setLayer(layer.name, !(this.boxes.get(layer.name)?.checked ?? false));
+    else if (event.key === "c") this.toggleCurves();
+    else if (this.live !== undefined) return;
     else if (event.key === " ") this.player.toggle();
     else if (event.key === "ArrowRight") this.player.step(1);
     else if (event.key === "ArrowLeft") this.player.step(-1);
-    else if (event.key === "c") this.toggleCurves();
     else if (event.key === "s") void this.screenshot();
     else if (event.key === "l") document.getElementById("loop")?.click();
     else return;
@@ -227,25 +256,28 @@ class Page {
   /** A machine that is slow plays with fewer pixels, as long as it plays. */
   private keepUp(elapsed: number): void {
     if (this.film.recording) return;
-    if (!this.player.playing) {
+    if (this.live === undefined ? !this.player.playing : !this.live.moving) {
       this.pace = 0;
       for (const stage of this.stages) stage.sharpen(1);
       return;
     }
     this.pace = this.pace === 0 ? 1 / 60 : this.pace + 0.05 * (Math.min(elapsed, 0.2) - this.pace);
-    if (this.pace > SLOW) for (const stage of this.stages) stage.sharpen(0.5);
+    if (this.pace <= (this.live === undefined ? SLOW : SLOW_LIFE)) return;
+    for (const stage of this.stages) stage.coarsen();
+    this.pace = 1 / 60;
   }
 
   /** Shows where the player stands. */
   private update(): void {
     const { player } = this;
-    for (const stage of this.stages) stage.show(player.place);
+    for (const stage of this.stages) stage.show(this.place);
+    this.curves.draw(this.place);
+    if (this.live !== undefined) return;
     this.slider.max = String(player.last);
     this.slider.value = String(player.place);
     this.slider.style.setProperty("--done", `${(100 * player.place) / Math.max(player.last, 1)}%`);
     this.clock.textContent = `${player.seconds.toFixed(2)} / ${(player.last / player.rate).toFixed(2)} s`;
     this.playButton.innerHTML = icon(player.playing ? "pause" : "play");
-    this.curves.draw(player.place);
   }
 
   /** A slow machine waits for its splats to be sorted: as they lay some pictures ago, the ground would hide the body. */
@@ -260,9 +292,11 @@ class Page {
     }
     const elapsed = this.before === 0 ? 0 : (now - this.before) / 1000;
     this.before = now;
-    this.player.advance(elapsed);
+    if (this.live === undefined) this.player.advance(elapsed);
+    else if (this.live.advance(elapsed)) this.update();
     this.keepUp(elapsed);
     for (const stage of this.stages) stage.draw();
+    this.live?.drawn();
     requestAnimationFrame((next) => this.tick(next));
   }
 }

@@ -37,8 +37,8 @@ export class Overlays {
   private readonly feet: THREE.Points;
   private readonly visible = new Set<Layer>();
   private readonly ends: Float32Array;
-  /** Of each frame. */
-  private readonly path: THREE.Vector3[] = [];
+  /** Centre of mass of each frame. */
+  private readonly path = new WeakMap<Frame, THREE.Vector3>();
 
   constructor(
     private readonly header: Header,
@@ -158,14 +158,19 @@ export class Overlays {
 
   private drawPath(frame: Frame, frames: Frame[]): void {
     const lines = new Lines();
-    const every = this.path;
-    for (const one of frames.slice(every.length)) every.push(this.centres(one));
+    const every = frames.map((one) => this.path.get(one) ?? this.remembered(one));
     for (let k = 0; k + 1 < every.length; k++) {
-      lines.add(every[k]!, every[k + 1]!, k < frame.index ? COLOURS.past : COLOURS.future);
+      lines.add(every[k]!, every[k + 1]!, frames[k]!.time < frame.time ? COLOURS.past : COLOURS.future);
     }
     const now = this.middle.position.copy(this.centres(frame));
     lines.add(now, now.clone().setZ(0), COLOURS.plumb);
     this.strokes.path.set(lines.points, lines.colours);
+  }
+
+  private remembered(frame: Frame): THREE.Vector3 {
+    const centre = this.centres(frame);
+    this.path.set(frame, centre);
+    return centre;
   }
 }
 

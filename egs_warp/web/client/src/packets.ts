@@ -20,6 +20,9 @@ export interface Facts {
   motion: { name: string; reached?: Record<string, number> }[];
   notes: string[];
   degree: { splats: number; scene: number };
+  /** Of a creature that lives: which session this is, and how far its sliders go. */
+  session?: string;
+  limits?: { friction: [number, number]; sag: [number, number] };
 }
 
 export type Numbers = Float32Array | Int32Array | Uint8Array;

@@ -8,15 +8,11 @@ export class Player {
   speed = 1;
   /** Frames, with a fraction between two of them. */
   place = 0;
-  /** Of a source that still grows: stay with its newest frame. */
-  following: boolean;
 
   constructor(
     private readonly sources: FrameSource[],
     private readonly changed: () => void,
-  ) {
-    this.following = sources.some((source) => source.open);
-  }
+  ) {}
 
   /** The longest of the runs side by side; a shorter one waits at its end. */
   get last(): number {
@@ -39,7 +35,6 @@ export class Player {
 
   seek(place: number): void {
     this.place = Math.min(Math.max(place, 0), this.last);
-    this.following = false;
     this.changed();
   }
 
@@ -49,14 +44,9 @@ export class Player {
     this.seek(Math.round(this.place) + frames);
   }
 
-  /** After `elapsed` seconds; true where the picture is another one. */
-  advance(elapsed: number): boolean {
-    if (this.following) {
-      const moved = this.place !== this.last;
-      this.place = this.last;
-      return moved;
-    }
-    if (!this.playing) return false;
+  /** After `elapsed` seconds. */
+  advance(elapsed: number): void {
+    if (!this.playing) return;
     // A tab that slept goes on where it was.
     this.place += Math.min(elapsed, 0.25) * this.rate * this.speed;
     if (this.place >= this.last) {
@@ -67,6 +57,5 @@ export class Player {
       }
     }
     this.changed();
-    return true;
   }
 }

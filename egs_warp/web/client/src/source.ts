@@ -34,34 +34,84 @@ export async function fromElement(element: HTMLElement): Promise<FrameSource> {
   return fromBytes(await new Response(unpacked).arrayBuffer());
 }
 
-/** A socket: the header comes first, then frames. A lost connection is taken up again. */
-export function fromSocket(address: string, onState: (connected: boolean) => void): Promise<FrameSource> {
+/** What a session says beside its frames. */
+export type News =
+  | { type: "state"; doing: string; queued: string | null; walks: boolean; goal: [number, number] | null; facing: [number, number]; paused: boolean; resting: boolean; recording: boolean; pulled: boolean; friction: number; sag: number; motions: number; step: number }
+  | { type: "told"; text: string }
+  | { type: "script"; text: string; motions: number }
+  | { type: "busy"; on: boolean }
+  | { type?: undefined; error: string };
+
+/** A session that lives: frames as they are made, news beside them, and a way to ask for something. */
+export class LiveSource implements FrameSource {
+  readonly frames: Frame[] = [];
+  open = true;
+  onFrame: (frame: Frame) => void = () => {};
+  onNews: (news: News) => void = () => {};
+  private early: News[] | undefined = [];
+
+  constructor(
+    readonly header: Header,
+    public socket: WebSocket,
+  ) {}
+
+  send(message: Record<string, unknown>): void {
+    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(message));
+  }
+
+  /** News that came before anybody listened are told then. */
+  listen(onNews: (news: News) => void): void {
+    this.onNews = onNews;
+    for (const news of this.early ?? []) onNews(news);
+    this.early = undefined;
+  }
+
+  take(data: ArrayBuffer | string): void {
+    if (typeof data === "string") {
+      const news = JSON.parse(data) as News;
+      if (this.early !== undefined) this.early.push(news);
+      this.onNews(news);
+      return;
+    }
+    const frame = readFrame(data, 0);
+    const last = this.frames.at(-1);
+    // Another beginning, or a moment that is known already.
+    if (last !== undefined && frame.time < last.time) this.frames.length = 0;
+    else if (last !== undefined && frame.time === last.time) this.frames.pop();
+    this.frames.push(frame);
+    this.onFrame(frame);
+  }
+}
+
+/** A socket: the header comes first, then frames and news. A lost connection is taken up again. */
+export function fromSocket(address: string, onState: (lost: string | undefined) => void): Promise<LiveSource> {
   return new Promise((resolve, reject) => {
-    let source: (FrameSource & { open: boolean }) | undefined;
+    let source: LiveSource | undefined;
     const connect = (): void => {
       const socket = new WebSocket(address);
       socket.binaryType = "arraybuffer";
       let first = true;
-      socket.onopen = () => onState(true);
-      socket.onmessage = ({ data }: MessageEvent<ArrayBuffer>) => {
+      socket.onmessage = ({ data }: MessageEvent<ArrayBuffer | string>) => {
         if (first) {
           first = false;
-          // The same header again after a lost connection: what is on the page stays.
-          if (source !== undefined) return;
-          source = { header: readHeader(data).header, frames: [], open: true, onFrame: () => {} };
+          const { header } = readHeader(data as ArrayBuffer);
+          // After a lost connection the same session goes on; another one has another creature.
+          if (source === undefined) source = new LiveSource(header, socket);
+          else if (source.header.facts.session !== header.facts.session) location.reload();
+          else source.socket = socket;
+          onState(undefined);
           return;
         }
-        if (source === undefined) return;
-        const frame = readFrame(data, 0);
-        source.frames.push(frame);
-        if (source.frames.length === 1) resolve(source);
-        source.onFrame(frame);
+        source?.take(data);
+        if (source?.frames.length === 1) resolve(source);
       };
       socket.onclose = ({ code, reason }) => {
-        onState(false);
         if (source === undefined) reject(new Error(reason || `no connection (${code})`));
         else if (code === 1000) source.open = false;
-        else setTimeout(connect, 500);
+        else {
+          onState(reason || "connection lost, trying again");
+          setTimeout(connect, 500);
+        }
       };
     };
     connect();

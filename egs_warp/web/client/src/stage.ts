@@ -112,6 +112,7 @@ export class Stage {
       this.controls.target.add(moved);
     }
     this.followed.copy(middle);
+    if (this.source.open) this.ground.centreOn(middle.x, middle.y);
     this.ground.cast(this.renderer, this.positions, middle);
     this.invalidate();
   }
@@ -165,6 +166,11 @@ export class Stage {
     this.invalidate();
   }
 
+  /** Draws fewer pixels, if there are not few already. */
+  coarsen(): void {
+    this.sharpen(Math.max(this.sharpness - 0.25, 0.5));
+  }
+
   /** Draws so many of the window's pixels along each side. */
   sharpen(share: number): void {
     if (share === this.sharpness) return;
@@ -206,6 +212,60 @@ export class Stage {
     return new Promise((resolve, reject) => {
       this.canvas.toBlob((blob) => (blob ? resolve(blob) : reject(new Error("no picture came"))), "image/png");
     });
+  }
+
+  /** Draws `mark`, too. */
+  add(mark: THREE.Object3D): void {
+    this.scene.add(mark);
+    this.invalidate();
+  }
+
+  /** From the eye through a place of the window. */
+  ray(clientX: number, clientY: number): THREE.Ray {
+    const box = this.canvas.getBoundingClientRect();
+    const place = new THREE.Vector2((2 * (clientX - box.left)) / box.width - 1, 1 - (2 * (clientY - box.top)) / box.height);
+    const caster = new THREE.Raycaster();
+    this.camera.updateMatrixWorld();
+    caster.setFromCamera(place, this.camera);
+    return caster.ray;
+  }
+
+  /** What of the body is seen at a place of the window: the point, and the node next to it. */
+  pick(clientX: number, clientY: number): { node: number; point: THREE.Vector3 } | undefined {
+    const ray = this.ray(clientX, clientY);
+    const surface = indicesOf(this.source.header, "surface");
+    const corner = (k: number): THREE.Vector3 => this.node(surface[k] as number);
+    const found = { distance: Infinity, node: -1, point: new THREE.Vector3() };
+    const hit = new THREE.Vector3();
+    for (let k = 0; k < surface.length; k += 3) {
+      const corners = [corner(k), corner(k + 1), corner(k + 2)] as const;
+      if (ray.intersectTriangle(...corners, false, hit) === null) continue;
+      const distance = hit.distanceTo(ray.origin);
+      if (distance >= found.distance) continue;
+      const apart = corners.map((one) => one.distanceTo(hit));
+      found.distance = distance;
+      found.node = surface[k + apart.indexOf(Math.min(...apart))] as number;
+      found.point.copy(hit);
+    }
+    return found.node < 0 ? undefined : { node: found.node, point: found.point };
+  }
+
+  /** Where a place of the window lies on the ground, if it does and is not too far. */
+  onGround(clientX: number, clientY: number): THREE.Vector3 | undefined {
+    const ground = new THREE.Plane(new THREE.Vector3(0, 0, 1), 0);
+    const point = this.ray(clientX, clientY).intersectPlane(ground, new THREE.Vector3());
+    if (point === null || point.distanceTo(this.middle) > 40 * this.source.header.facts.height) return undefined;
+    return point;
+  }
+
+  /** Where a node is now. */
+  node(index: number): THREE.Vector3 {
+    return new THREE.Vector3().fromArray(this.positions, 3 * index);
+  }
+
+  /** The centre of mass now. */
+  get middle(): THREE.Vector3 {
+    return this.followed.clone();
   }
 
   private centre(positions: Float32Array): THREE.Vector3 {

@@ -1,0 +1,225 @@
+"""How fast does a creature live? ``egs-warp live`` with a page in Chromium beside it, on this very machine.
+
+A built-in pawn of 20,000 Gaussians, with cages of about 250 and 541 nodes, is asked to jump and turn by keys, in a page
+of 640 x 360 pixels. While it moves: solver steps and pictures a second, bytes a frame, how fast its time goes beside
+ours, and the share of pictures that show no new moment (a stall). From rest: how long it takes from a key to the first
+pixel that differs by more than 4 of 255, over several jumps.
+
+Where Chromium has no GPU it draws in software, on the cores that the solver needs. Aims, for about 250 nodes:
+``solver_fps`` (10 steps a second or more; 60 on a GPU), ``page_fps`` (25 pictures; 60), ``latency`` (at most 150 ms in
+the median; 60 ms). Set EGS_WARP_BROWSER where Chromium is called otherwise.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from egs_warp.assets.pawn import pawn
+from egs_warp.io import write_ply
+from harness import Row, Table, flags, report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+GAUSSIANS = 20_000
+WINDOW = {"width": 640, "height": 360}
+ASKED_NODES = {250: 175, 541: 400}
+"""--nodes that gives the pawn a cage of about so many."""
+
+MOVE = """(seconds) => new Promise((resolve) => {
+    const stage = egs.stages[0], { source } = stage, { clock } = egs.live;
+    const seen = { drawn: 0, arrived: [], bytes: 0, shown: [] }, began = performance.now();
+    const now = () => (performance.now() - began) / 1000;
+    const draw = stage.draw.bind(stage), take = source.take.bind(source);
+    stage.draw = () => { const done = draw(); seen.drawn += done ? 1 : 0; return done; };
+    source.take = (data) => {
+        if (typeof data !== "string") { seen.arrived.push(now()); seen.bytes += data.byteLength; }
+        take(data);
+    };
+    const look = () => {
+        seen.shown.push([now(), clock.time]);
+        if (now() < seconds) requestAnimationFrame(look);
+        else { delete stage.draw; delete source.take; resolve(seen); }
+    };
+    look();
+})"""
+"""What arrives and what is drawn within some seconds."""
+WAIT_FOR_PIXEL = """() => {
+    const stage = egs.stages[0], { canvas } = stage, copy = document.createElement("canvas");
+    copy.width = canvas.width; copy.height = canvas.height;
+    const context = copy.getContext("2d", { willReadFrequently: true });
+    const pixels = () => {
+        context.drawImage(canvas, 0, 0);
+        return context.getImageData(0, 0, copy.width, copy.height).data;
+    };
+    window.latency = undefined;
+    window.watching = false;
+    let before, pressed;
+    document.addEventListener("keydown", (event) => { pressed = event.timeStamp; }, { once: true, capture: true });
+    const draw = stage.draw.bind(stage);
+    // As many pixels before as after.
+    stage.sharpen = () => {};
+    stage.draw = () => {
+        if (!draw()) return false;
+        const now = pixels();
+        window.watching = true;
+        if (pressed === undefined) before = now;
+        else if (now.some((value, k) => Math.abs(value - before[k]) > 4)) {
+            window.latency = performance.now() - pressed;
+            delete stage.draw;
+            delete stage.sharpen;
+        }
+        return true;
+    };
+    stage.invalidate();
+}"""
+"""Compares every picture after a key with the last one before it."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run, print, write."""
+    parser = flags(__doc__, quick="10 s of motion and 3 latencies", seed="not used: nothing here is random")
+    options = parser.parse_args(arguments)
+    seconds, presses = (10.0, 3) if options.quick else (30.0, 9)
+    browser = os.environ.get("EGS_WARP_BROWSER") or shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        parser.error("no Chromium; install it, or set EGS_WARP_BROWSER")
+    rows: list[Row] = []
+    table = Table(
+        nodes="5d",
+        steps_a_second=".1f",
+        ms_a_step=".0f",
+        pictures_a_second=".1f",
+        speed=".2f",
+        stalls=".0%",
+        bytes_a_frame="7.0f",
+        latency_ms=".0f",
+        worst_ms=".0f",
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        capture = Path(folder) / "pawn.ply"
+        write_ply(capture, pawn(gaussian_count=GAUSSIANS).cloud)
+        for nodes in ASKED_NODES:
+            with _address(capture, ASKED_NODES[nodes], options.device, Path(folder)) as address:
+                row = measured(address, browser, seconds, presses)
+            rows.append(row)
+            names = ("nodes", "solver_fps", "step_ms", "page_fps", "speed", "stalls", "frame_bytes")
+            latencies = row["latency_ms"]
+            table.row(*(row[name] for name in names), statistics.median(latencies), max(latencies))
+    small = rows[0]
+    on_gpu = options.device.startswith("cuda")
+    page_gpu = "SwiftShader" not in small["renderer"]
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        for row in rows:
+            wall, shown = zip(*row["shown"], strict=True)
+            axes.plot(wall, [moment - shown[0] for moment in shown], label=f"{row['nodes']} nodes")
+        axes.set(xlabel="seconds of ours", ylabel="seconds of the creature's, as shown")
+        axes.legend()
+
+    report(
+        options,
+        rows,
+        aims={
+            "solver_fps": small["solver_fps"] >= (60.0 if on_gpu else 10.0),
+            "page_fps": small["page_fps"] >= (60.0 if page_gpu else 25.0),
+            "latency": statistics.median(small["latency_ms"]) <= (60.0 if on_gpu else 150.0),
+        },
+        conditions={"renderer": small["renderer"], "load_average": os.getloadavg(), "cores": os.cpu_count()},
+        packages=("playwright",),
+        draw=draw,
+    )
+
+
+def measured(address: str, browser: str, seconds: float, presses: int) -> Row:
+    """The figures of the session at ``address``."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as started:
+        arguments = ["--enable-unsafe-swiftshader", "--no-sandbox"]
+        chromium = started.chromium.launch(executable_path=browser, args=arguments)
+        page = chromium.new_page(viewport=WINDOW)  # pyright: ignore[reportArgumentType]
+        page.goto(address)
+        _wait(page, "window.egs?.live?.state?.resting")
+        facts = page.evaluate(
+            """() => {
+                const gl = document.createElement("canvas").getContext("webgl2");
+                const { arrays } = egs.stages[0].source.header;
+                const name = gl.getExtension("WEBGL_debug_renderer_info");
+                return { nodes: arrays.get("rest").length / 3, splats: arrays.get("splats_means").length / 3,
+                         renderer: gl.getParameter(name ? name.UNMASKED_RENDERER_WEBGL : gl.RENDERER) };
+            }"""
+        )
+        page.evaluate("egs.live.source.send({ type: 'motion', text: 'hop x20 0.4 0.2' })")
+        _wait(page, "egs.live.state.doing === 'hop'")
+        page.wait_for_timeout(2000)
+        seen = page.evaluate(MOVE, seconds)
+        page.keyboard.press("Escape")
+        latencies = []
+        for press in range(presses):
+            _wait(page, "egs.live.state.resting && egs.live.clock.time >= egs.stages[0].source.frames.at(-1).time")
+            page.wait_for_timeout(1500)
+            page.evaluate(WAIT_FOR_PIXEL)
+            _wait(page, "window.watching")
+            page.keyboard.press("ArrowLeft" if press % 2 else "Space")
+            _wait(page, "window.latency !== undefined")
+            latencies.append(page.evaluate("window.latency"))
+        chromium.close()
+    arrived, shown = seen["arrived"], seen["shown"]
+    between = [after - before for before, after in zip(arrived, arrived[1:], strict=False)]
+    moments = [moment for _, moment in shown]
+    still = sum(before == after for before, after in zip(moments, moments[1:], strict=False))
+    return {
+        **facts,
+        "solver_fps": len(arrived) / seconds,
+        "step_ms": 1e3 * statistics.median(between),
+        "page_fps": seen["drawn"] / seconds,
+        "speed": (moments[-1] - moments[0]) / seconds,
+        "stalls": still / (len(moments) - 1),
+        "frame_bytes": seen["bytes"] / len(arrived),
+        "latency_ms": latencies,
+        "shown": shown,
+    }
+
+
+@contextmanager
+def _address(capture: Path, nodes: int, device: str, folder: Path) -> Iterator[str]:
+    """Of ``egs-warp live``, in a process of its own."""
+    command = [sys.executable, "-m", "egs_warp.cli", "live", str(capture), "--up", "z", "--no-browser"]
+    more = ["--nodes", str(nodes), "--device", device, "--out", str(folder / "takes")]
+    process = subprocess.Popen([*command, *more], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None and process.stderr is not None
+        for line in process.stdout:
+            if line.startswith("open "):
+                yield line.split()[1]
+                break
+        else:
+            raise RuntimeError(process.stderr.read())
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.wait(timeout=60)
+
+
+def _wait(page: Any, condition: str) -> None:
+    end = time.monotonic() + 150.0
+    while not page.evaluate(condition):
+        if time.monotonic() > end:
+            raise TimeoutError(f"{condition}: {page.evaluate('JSON.stringify([egs.live.state, egs.live.told])')}")
+        page.wait_for_timeout(50)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,114 @@
+"""``egs-warp live``: a creature in the browser that does what keys, clicks and sliders ask while it lives."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from egs_warp.commands.flags import Commands, guessed_up, named_path, parse_direction, parse_up
+from egs_warp.commands.scene_flags import say, start
+
+if TYPE_CHECKING:
+    from egs_warp.web.session import Session
+
+EXAMPLES = (
+    "pawn.ply --up z",
+    "scan.spz --nodes 150 --friction 0.5",
+    "out/scene/object.ply --plane out/scene/plane.json --background out/scene/background.ply",
+)
+
+
+def add_parser(commands: Commands) -> None:
+    """Add the command to the subparsers ``commands``."""
+    live = commands.add_parser("live", help="steer a creature in the browser while it lives")
+    live.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
+    live.add_argument(
+        "--out", type=named_path, default=Path("out/live"), help="folder for what is recorded: take-1, ... (out/live)"
+    )
+    live.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
+    body = live.add_argument_group("body and ground")
+    body.add_argument("--up", help="axis that points up: x, y, z or with a minus, as --up=-y; else it is guessed")
+    body.add_argument(
+        "--plane", help="nx,ny,nz,d of the ground n.x + d = 0 in the capture's units, or a plane.json; else it is found"
+    )
+    body.add_argument(
+        "--nodes", type=int, default=250, help="of the cage, about; fewer are faster, 500 are what animate takes (250)"
+    )
+    body.add_argument("--friction", type=float, default=0.8, help="Coulomb coefficient to begin with (0.8)")
+    body.add_argument("--metres-per-unit", type=float, help="true scale; else the body is 1 m tall")
+    body.add_argument("--muscles", type=named_path, help="JSON with fibres (docs/motions/muscles.md)")
+    body.add_argument("--forward", help="x,y,z or an axis: the way of motions; else along the feet")
+    page = live.add_argument_group("page")
+    page.add_argument("--background", type=Path, help="capture behind the creature, as background.ply of a run")
+    page.add_argument("--port", type=int, default=0, help="of this machine's own address (any that is free)")
+    page.add_argument("--no-browser", action="store_true", help="only print the address")
+    live.set_defaults(run=_live)
+
+
+def _live(chosen: argparse.Namespace) -> int:
+    import webbrowser
+
+    from egs_warp.io import read_capture
+    from egs_warp.web.feed import LiveFeed
+    from egs_warp.web.page import page_text
+    from egs_warp.web.server import PageServer, check_port
+
+    # What can be told at once, before any long work.
+    page_text()
+    check_port(chosen.port)
+    start(chosen.device)
+    behind = read_capture(chosen.background, device=chosen.device).cloud if chosen.background is not None else None
+    session = _session(chosen)
+    scene = session.creature.placed(behind) if behind is not None else None
+    server = PageServer([], port=chosen.port, feed=LiveFeed(session, scene=scene))
+    session.start()
+    print(f"open {server.address}\nend with Ctrl-C", flush=True)
+    if not chosen.no_browser:
+        webbrowser.open(server.address)
+    try:
+        server.serve()
+    finally:
+        session.stop()
+    return 0
+
+
+def _session(chosen: argparse.Namespace) -> Session:
+    from tqdm import tqdm
+
+    from egs_warp.commands.scene_input import plane_of
+    from egs_warp.io import read_capture
+    from egs_warp.io.run_folder import check_out
+    from egs_warp.pipelines.animate import AnimateOptions
+    from egs_warp.pipelines.creature import make_creature
+    from egs_warp.web.feed import drawn_creature
+    from egs_warp.web.rehearsal import split_for_life
+    from egs_warp.web.session import Session, SessionOptions
+
+    check_out(chosen.out)
+    options = AnimateOptions(friction=chosen.friction, metres_per_unit=chosen.metres_per_unit)
+    up = parse_up(chosen.up) if chosen.up is not None else None
+    plane = plane_of(chosen.plane) if chosen.plane is not None else None
+    forward = parse_direction("forward", chosen.forward) if chosen.forward is not None else None
+    capture = read_capture(chosen.capture, device=chosen.device)
+    if plane is None and up is None:
+        up, note = guessed_up(capture)
+        say(note)
+    with tqdm(desc="prepare", bar_format="{desc}, {elapsed}") as bar:
+        creature = make_creature(
+            capture.cloud,
+            up=up,
+            plane=plane,
+            metres_per_unit=options.metres_per_unit,
+            friction=options.friction,
+            muscles_file=chosen.muscles,
+            nodes=chosen.nodes,
+            progress=lambda stage: bar.set_description_str(f"prepare: {stage}"),
+        )
+        bar.set_description_str("prepare: split")
+        drawn_as = drawn_creature(creature, split_for_life(creature), forward)
+        bar.set_description_str("prepare: done")
+    made = SessionOptions(
+        source=Path(chosen.capture).name, takes=chosen.out, muscles_file=chosen.muscles, forward=forward
+    )
+    return Session(creature, drawn_as, made)

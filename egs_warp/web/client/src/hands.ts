@@ -1,0 +1,178 @@
+// What the user does, as what is asked of the session: keys, gamepad, buttons, and the pointer on creature and ground.
+
+import * as THREE from "three";
+import type { LiveSource } from "./source";
+import type { Stage } from "./stage";
+
+export type Action = "forward" | "back" | "left" | "right" | "jump" | "leap" | "hop";
+
+/** What each action asks for; forward walks where the body has feet for it. */
+export function motionOf(action: Action, walks: boolean): string {
+  return {
+    forward: walks ? "walk 2" : "hop 0.4 0.2",
+    back: "twist 180 0 0.25",
+    left: "twist 45 0 0.2",
+    right: "twist -45 0 0.2",
+    jump: "jump 0 0.25",
+    leap: "jump 0.6 0.3",
+    hop: "hop 0.4 0.2",
+  }[action];
+}
+
+const KEYS: Record<string, Action> = {
+  ArrowUp: "forward",
+  KeyW: "forward",
+  ArrowDown: "back",
+  KeyS: "back",
+  ArrowLeft: "left",
+  KeyA: "left",
+  ArrowRight: "right",
+  KeyD: "right",
+  Space: "jump",
+  KeyJ: "leap",
+  KeyH: "hop",
+};
+/** Buttons of a standard gamepad. */
+const PAD: [number, Action][] = [
+  [0, "jump"],
+  [1, "leap"],
+  [2, "hop"],
+  [12, "forward"],
+  [13, "back"],
+  [14, "left"],
+  [15, "right"],
+];
+const STICK = 0.6;
+/** Seconds after which what is held is done again and again. */
+const HELD = 0.45;
+
+export class Hands {
+  walks = false;
+  /** What comes next, as the session says. */
+  queued: string | null = null;
+  private held: { action: Action; source: string; since: number; again: boolean } | undefined;
+  private sent = 0;
+  private pad: Action | undefined;
+
+  constructor(private readonly source: LiveSource) {}
+
+  press(action: Action, source: string): void {
+    if (this.held?.action === action && this.held.source === source) return;
+    this.held = { action, source, since: performance.now() / 1000, again: false };
+    this.ask(action);
+  }
+
+  release(source: string): void {
+    if (this.held?.source !== source) return;
+    // What was asked for by holding on, beyond the first, is not to be done any more.
+    if (this.held.again) this.source.send({ type: "cancel" });
+    this.held = undefined;
+  }
+
+  releaseAll(): void {
+    if (this.held !== undefined) this.release(this.held.source);
+  }
+
+  /** A key that moves the creature; whether it is one. */
+  keyDown(event: KeyboardEvent): boolean {
+    const action = KEYS[event.code];
+    if (action === undefined) return false;
+    if (!event.repeat) this.press(action, event.code);
+    return true;
+  }
+
+  keyUp(event: KeyboardEvent): void {
+    this.release(event.code);
+  }
+
+  /** Repeats what is held, and looks at the gamepad. */
+  tick(): void {
+    this.lookAtPad();
+    const now = performance.now() / 1000;
+    const { held } = this;
+    if (held === undefined || now - held.since < HELD || this.queued !== null || now - this.sent < 0.3) return;
+    held.again = true;
+    this.ask(held.action);
+  }
+
+  private ask(action: Action): void {
+    this.sent = performance.now() / 1000;
+    this.source.send({ type: "motion", text: motionOf(action, this.walks) });
+  }
+
+  private lookAtPad(): void {
+    const pad = navigator.getGamepads?.().find((one) => one !== null && one.mapping === "standard");
+    if (!pad) return;
+    let action = PAD.find(([button]) => pad.buttons[button]?.pressed)?.[1];
+    const [x = 0, y = 0] = pad.axes;
+    if (action === undefined && Math.max(Math.abs(x), Math.abs(y)) > STICK) {
+      action = Math.abs(x) > Math.abs(y) ? (x < 0 ? "left" : "right") : y < 0 ? "forward" : "back";
+    }
+    if (action === this.pad) return;
+    this.release("pad");
+    if (action !== undefined) this.press(action, "pad");
+    this.pad = action;
+  }
+}
+
+/** The pointer: a drag that begins on the creature pulls at it, a click on the ground sends it there. */
+export class Pointer {
+  /** What is held, and where the hand is. */
+  pulled: { node: number; hand: THREE.Vector3 } | undefined;
+  private readonly plane = new THREE.Plane();
+  private began: { x: number; y: number; id: number } | undefined;
+  private last = 0;
+
+  constructor(
+    private readonly stage: Stage,
+    private readonly source: LiveSource,
+  ) {
+    const { canvas } = stage;
+    const around = canvas.parentElement as HTMLElement;
+    // Before the camera's own controls hear of it.
+    around.addEventListener("pointerdown", (event) => this.down(event), { capture: true });
+    canvas.addEventListener("pointermove", (event) => this.move(event));
+    for (const end of ["pointerup", "pointercancel"] as const) canvas.addEventListener(end, (event) => this.up(event));
+  }
+
+  private down(event: PointerEvent): void {
+    if (event.target !== this.stage.canvas || event.button !== 0 || !event.isPrimary) return;
+    this.began = { x: event.clientX, y: event.clientY, id: event.pointerId };
+    const hit = this.stage.pick(event.clientX, event.clientY);
+    if (hit === undefined) return;
+    this.stage.controls.enabled = false;
+    this.stage.canvas.setPointerCapture(event.pointerId);
+    this.pulled = { node: hit.node, hand: hit.point };
+    this.plane.setFromNormalAndCoplanarPoint(this.stage.camera.getWorldDirection(new THREE.Vector3()), hit.point);
+  }
+
+  private move(event: PointerEvent): void {
+    if (this.stage.controls.enabled) this.stage.canvas.classList.toggle("over", event.buttons === 0 && this.stage.pick(event.clientX, event.clientY) !== undefined);
+    if (this.pulled === undefined || this.began === undefined) return;
+    if (Math.hypot(event.clientX - this.began.x, event.clientY - this.began.y) < 4) return;
+    const hand = this.stage.ray(event.clientX, event.clientY).intersectPlane(this.plane, new THREE.Vector3());
+    if (hand === null) return;
+    this.pulled.hand.copy(hand);
+    this.stage.invalidate();
+    const now = performance.now();
+    if (now - this.last < 30) return;
+    this.last = now;
+    this.source.send({ type: "pull", node: this.pulled.node, x: hand.x, y: hand.y, z: hand.z });
+  }
+
+  private up(event: PointerEvent): void {
+    const { began, pulled } = this;
+    if (began === undefined || event.pointerId !== began.id) return;
+    this.began = undefined;
+    if (pulled !== undefined) {
+      this.pulled = undefined;
+      this.stage.controls.enabled = true;
+      this.stage.invalidate();
+      this.source.send({ type: "release" });
+      return;
+    }
+    if (event.type !== "pointerup" || Math.hypot(event.clientX - began.x, event.clientY - began.y) > 4) return;
+    const point = this.stage.onGround(event.clientX, event.clientY);
+    if (point !== undefined) this.source.send({ type: "go", x: point.x, y: point.y });
+  }
+}

@@ -1,0 +1,73 @@
+// What the user's hand and the creature's aim look like: where it goes, which way it faces, what pulls at it.
+
+import * as THREE from "three";
+import { Strokes } from "./strokes";
+
+/** As the shader writes it. */
+const ACCENT = new THREE.Color(0x7fd1b8).convertLinearToSRGB();
+const PULL = new THREE.Color(0xffc24a).toArray();
+
+export class Marks {
+  readonly group = new THREE.Group();
+  private readonly goal: THREE.Mesh;
+  private readonly facing: THREE.Mesh;
+  private readonly spring = new Strokes(2.5, 0.95, 16);
+
+  constructor(private readonly height: number) {
+    this.goal = new THREE.Mesh(new THREE.PlaneGeometry(0.32 * height, 0.32 * height), drawn("abs(length(p) - 0.72) - 0.16", 0.85));
+    // An arrow head: within a triangle, outside of the notch behind.
+    const head = "max(0.45 * (p.x - 0.8) + 0.89 * abs(p.y), 0.85 * (-0.2 - 0.625 * abs(p.y) - p.x))";
+    this.facing = new THREE.Mesh(new THREE.PlaneGeometry(0.26 * height, 0.26 * height), drawn(head, 0.75));
+    for (const mark of [this.goal, this.facing]) {
+      mark.renderOrder = -5;
+      mark.position.z = 0.002 * height;
+      mark.visible = false;
+      this.group.add(mark);
+    }
+    this.group.add(this.spring.object);
+  }
+
+  showGoal(goal: [number, number] | null): void {
+    this.goal.visible = goal !== null;
+    if (goal !== null) this.goal.position.set(goal[0], goal[1], this.goal.position.z);
+  }
+
+  /** An arrow on the ground ahead of `middle`. */
+  showFacing(middle: THREE.Vector3, [x, y]: [number, number], reach: number): void {
+    this.facing.visible = true;
+    this.facing.position.set(middle.x + reach * x, middle.y + reach * y, this.facing.position.z);
+    this.facing.rotation.z = Math.atan2(y, x);
+  }
+
+  /** From where the body is held to the hand; without both, none. */
+  showSpring(held?: THREE.Vector3, hand?: THREE.Vector3): void {
+    if (held === undefined || hand === undefined) {
+      this.spring.set([], []);
+      return;
+    }
+    const ring: number[] = [];
+    const radius = 0.015 * this.height;
+    for (let k = 0; k < 16; k++) {
+      for (const j of [k, k + 1]) {
+        const angle = (Math.PI * j) / 8;
+        ring.push(hand.x + radius * Math.cos(angle), hand.y + radius * Math.sin(angle), hand.z);
+      }
+    }
+    const points = [...held.toArray(), ...hand.toArray(), ...ring];
+    this.spring.set(points, Array.from({ length: points.length }, (_, k) => PULL[k % 3]!));
+  }
+}
+
+/** Flat on the ground, smooth at its edge however few pixels there are: `distance` of p, each side of the square at 1, is
+ * negative inside. */
+function drawn(distance: string, opacity: number): THREE.ShaderMaterial {
+  return new THREE.ShaderMaterial({
+    uniforms: { colour: { value: ACCENT } },
+    vertexShader: `varying vec2 p; void main() { p = 2.0 * uv - 1.0; gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); }`,
+    fragmentShader: `varying vec2 p; uniform vec3 colour;
+      void main() { float d = ${distance}; gl_FragColor = vec4(colour, ${opacity} * clamp(0.5 - d / fwidth(d), 0.0, 1.0)); }`,
+    transparent: true,
+    depthWrite: false,
+    side: THREE.DoubleSide,
+  });
+}

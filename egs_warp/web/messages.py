@@ -1,0 +1,176 @@
+"""What the page asks of a live session: small JSON objects, checked before anything is done with them.
+
+Each has a ``type``; docs/guide/live.md lists them all.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from egs_warp.motions.script import Script, motion
+
+LONGEST_TEXT = 200
+"""Characters of motions asked for at once."""
+FURTHEST = 100.0
+"""Body heights from the start: nothing goes, or is pulled, further."""
+LEAST_SAG, MOST_SAG = 0.01, 0.1
+"""rho g H / E of a column: stiff and soft."""
+MOST_FRICTION = 2.0
+_MOTIONS = re.compile(r"[A-Za-z0-9_=+\-., ]+")
+
+
+@dataclass(frozen=True)
+class Perform:
+    """Do these motions next, in place of what was to come."""
+
+    script: Script
+
+
+@dataclass(frozen=True)
+class Go:
+    """Go to a point of the ground, in place of what was to come."""
+
+    point: tuple[float, float]
+    """Metres, frame of the body."""
+
+
+@dataclass(frozen=True)
+class Pull:
+    """Pull at a node by a spring, until ``Release``."""
+
+    node: int
+    target: tuple[float, float, float]
+    """Metres, frame of the body."""
+
+
+@dataclass(frozen=True)
+class Release:
+    """Let go of what is pulled."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """Another friction or stiffness; None: as it is."""
+
+    friction: float | None = None
+    """Coulomb coefficient."""
+    sag: float | None = None
+    """rho g H / E of a column."""
+
+
+@dataclass(frozen=True)
+class Pause:
+    """Hold still, or go on."""
+
+    on: bool
+
+
+@dataclass(frozen=True)
+class Step:
+    """One solver step, while it holds still."""
+
+
+@dataclass(frozen=True)
+class Cancel:
+    """Drop what was to come; what is being done is done to its end."""
+
+
+@dataclass(frozen=True)
+class StandUp:
+    """Put it back where it stood at first."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """Begin a take, or end it and write it."""
+
+    on: bool
+
+
+@dataclass(frozen=True)
+class TellScript:
+    """Say what it has done, as a script."""
+
+
+Message: TypeAlias = Perform | Go | Pull | Release | Change | Pause | Step | Cancel | StandUp | Record | TellScript
+
+
+def read_message(message: Mapping[str, Any], *, height: float, node_count: int) -> Message:
+    """The record of a JSON object, for a body of ``height`` metres. Raises ``ValueError`` for what makes no sense."""
+    kind = message.get("type")
+    if not isinstance(kind, str) or kind not in _READERS:
+        raise ValueError(f"type {str(kind)[:40]!r}; known are {', '.join(_READERS)}")
+    fields, read = _READERS[kind]
+    unknown = [name for name in message if name != "type" and name not in fields]
+    if unknown:
+        raise ValueError(f"{kind} has no {unknown[0][:40]!r}")
+    return read(message, FURTHEST * height, node_count)
+
+
+def _perform(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
+    text = message.get("text")
+    if not isinstance(text, str) or len(text) > LONGEST_TEXT:
+        raise ValueError(f"text: give motions in at most {LONGEST_TEXT} characters, as jump 0.5 0.2")
+    # A script or key frames would be files of this machine.
+    if not _MOTIONS.fullmatch(text) or re.search(r"\.(json|csv)", text, re.IGNORECASE):
+        raise ValueError("text: give motions by name and number, as hop x3, twist 90")
+    script = motion(text)
+    if any(request.file is not None for request in script.requests):
+        raise ValueError("text: motions that need a file are for egs-warp animate")
+    return Perform(script)
+
+
+def _go(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
+    return Go((_number(message, "x", -reach, reach), _number(message, "y", -reach, reach)))
+
+
+def _pull(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
+    node = message.get("node")
+    if not isinstance(node, int) or isinstance(node, bool) or not 0 <= node < node_count:
+        raise ValueError(f"node: give a whole number from 0 to {node_count - 1}")
+    x, y, z = (_number(message, name, -reach, reach) for name in "xyz")
+    return Pull(node, (x, y, z))
+
+
+def _change(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
+    given = [name for name in ("friction", "sag") if name in message]
+    if not given:
+        raise ValueError("set: give friction or sag")
+    spans = {"friction": (0.0, MOST_FRICTION), "sag": (LEAST_SAG, MOST_SAG)}
+    return Change(**{name: _number(message, name, *spans[name]) for name in given})
+
+
+def _on(message: Mapping[str, Any]) -> bool:
+    on = message.get("on")
+    if not isinstance(on, bool):
+        raise ValueError("on: give true or false")
+    return on
+
+
+def _number(message: Mapping[str, Any], name: str, least: float, most: float) -> float:
+    value = message.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{name}: give a number")
+    if not least <= value <= most or not math.isfinite(value):
+        raise ValueError(f"{name}: give a number from {least:g} to {most:g}")
+    return float(value)
+
+
+_Reader: TypeAlias = Callable[[Mapping[str, Any], float, int], Message]
+_READERS: dict[str, tuple[tuple[str, ...], _Reader]] = {
+    "motion": (("text",), _perform),
+    "go": (("x", "y"), _go),
+    "pull": (("node", "x", "y", "z"), _pull),
+    "release": ((), lambda *_: Release()),
+    "set": (("friction", "sag"), _change),
+    "pause": (("on",), lambda message, *_: Pause(_on(message))),
+    "step": ((), lambda *_: Step()),
+    "cancel": ((), lambda *_: Cancel()),
+    "stand": ((), lambda *_: StandUp()),
+    "record": (("on",), lambda message, *_: Record(_on(message))),
+    "script": ((), lambda *_: TellScript()),
+}

@@ -1,0 +1,222 @@
+"""What a live creature does next: motions that were asked for, a way to a point, or nothing but standing.
+
+A motion that has begun is done to its end; what is asked for meanwhile takes the place of what was to come, and begins
+as soon as the body is calm.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from egs_warp.errors import UserError
+from egs_warp.fem.body import BodyState
+from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.stepper import StepReport
+from egs_warp.motions.repertoire import REPERTOIRE
+from egs_warp.motions.request import MotionRequest
+from egs_warp.motions.script import Script, motion
+from egs_warp.motions.sequence import BodyMotion, Done, Part, Place
+from egs_warp.motions.stance import sole_shares
+from egs_warp.motions.walk import Walk
+from egs_warp.web.standing import Lie, Stand, tilt_degrees
+
+ARRIVED = 0.12
+"""Body heights from the middle of the feet to the point that it was sent to."""
+ASIDE = 15.0
+"""Degrees: what lies further to the side is turned towards first."""
+_NEAR = 0.25
+"""Body heights: for so short a way it does not turn."""
+_LONGEST_JUMP, _JUMP_HEIGHT = 0.5, 0.2
+"""Body heights."""
+_STEP_LENGTH, _MOST_STEPS = 0.1, 8
+_FRUITLESS = 3
+"""Legs that bring it no nearer, after which it gives up."""
+FALLEN = 60.0
+"""Degrees from upright beyond which no motion begins."""
+_DOWN = 1.0
+"""Of sqrt(H / g): for how long it is so tilted before it counts as fallen."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A motion to come, and how a script asks for it."""
+
+    part: Part
+    request: MotionRequest
+
+
+def tasks_of(script: Script, height: float) -> list[Task]:
+    """Of a body of ``height`` metres, in their order."""
+    tasks = []
+    for request in script.requests:
+        once = replace(request, repeat=1)
+        tasks += [Task(part, once) for part in REPERTOIRE[request.name].parts(request, height)]
+    return tasks
+
+
+class Journey:
+    """The way to a point: turn towards it, then walk or jump there; each leg is planned from where the last one
+    ended."""
+
+    def __init__(self, goal: np.ndarray, *, walks: bool) -> None:
+        """``goal`` (2,) metres; ``walks``: whether the body can walk."""
+        self.goal = goal
+        self._walks = walks
+        self._nearest, self._fruitless = np.inf, 0
+
+    def leg(self, place: Place) -> Task | None:
+        """What brings the body that stands at ``place`` nearer; None where it has arrived.
+
+        Raises ``UserError`` where several legs did not.
+        """
+        height = place.body.height
+        feet = sole_shares(place.body, place.ground, place.standing) @ place.standing
+        way = np.array([*(self.goal - feet[:2]), 0.0])
+        distance = float(np.linalg.norm(way)) / height
+        if distance <= ARRIVED:
+            return None
+        if distance < self._nearest - 0.05:
+            self._nearest, self._fruitless = distance, 0
+        else:
+            self._fruitless += 1
+        if self._fruitless > _FRUITLESS:
+            raise UserError(f"go: it comes no nearer than {self._nearest:.2f} body heights; choose another point")
+        walks = self._walks and distance >= _STEP_LENGTH
+        ahead = Walk(place, 1, _STEP_LENGTH * height).ground if walks else place.ground
+        x, y = ahead.axes[:2] @ way
+        aside = float(np.degrees(np.arctan2(y, x)))
+        if abs(aside) > ASIDE and distance > _NEAR:
+            return self._task(f"twist {aside:.1f} 0 {_JUMP_HEIGHT}", height)
+        if walks:
+            steps = min(max(round(distance / _STEP_LENGTH), 1), _MOST_STEPS)
+            return self._task(f"walk {steps} {_STEP_LENGTH}", height)
+        leap = distance / np.ceil(distance / _LONGEST_JUMP)
+        task = self._task(f"jump {leap:.3f} {_JUMP_HEIGHT}", height)
+        begin = task.part.begin
+        return replace(task, part=replace(task.part, begin=lambda at: begin(at.facing(way))))
+
+    @staticmethod
+    def _task(text: str, height: float) -> Task:
+        return tasks_of(motion(text), height)[0]
+
+
+class Steering:
+    """Holds the motion of a body and chooses the next; itself a motion."""
+
+    def __init__(self, place: Place, tell: Callable[[str], object]) -> None:
+        """``place``: where the body stands at first; ``tell`` is given each line for the user."""
+        self.begun: list[Done] = []
+        self.requests: list[MotionRequest] = []
+        """Of ``begun``."""
+        self._tell = tell
+        self._tasks: deque[Task] = deque()
+        self._journey: Journey | None = None
+        self.stand(place)
+        self.walks = _walks(place)
+
+    def stand(self, place: Place) -> None:
+        """Stand at ``place``, and drop all else."""
+        self.cancel()
+        self.place = place
+        self._motion: BodyMotion | Stand | Lie = Stand(place)
+        self._tilted_since: float | None = None
+
+    def perform(self, script: Script) -> None:
+        """Do its motions next."""
+        self.cancel()
+        self._tasks.extend(tasks_of(script, self.place.body.height))
+
+    def go(self, goal: np.ndarray) -> None:
+        """Go to ``goal`` (2,) next, metres."""
+        self.cancel()
+        self._journey = Journey(goal, walks=self.walks)
+
+    def cancel(self) -> None:
+        """Drop what was to come."""
+        self._tasks.clear()
+        self._journey = None
+
+    @property
+    def doing(self) -> str:
+        """Name of the motion."""
+        if isinstance(self._motion, Stand):
+            return "stand"
+        return "fallen" if isinstance(self._motion, Lie) else self.begun[-1].name
+
+    @property
+    def queued(self) -> str | None:
+        """Name of what comes next."""
+        return self._tasks[0].part.name if self._tasks else "go" if self._journey else None
+
+    @property
+    def idle(self) -> bool:
+        """Whether it stands or lies, and nothing is to come."""
+        return isinstance(self._motion, Stand | Lie) and self._motion.resting and self.queued is None
+
+    @property
+    def goal(self) -> np.ndarray | None:
+        """(2,) metres, where it is going."""
+        return self._journey.goal if self._journey else None
+
+    def facing(self, positions: np.ndarray) -> np.ndarray:
+        """(2,) unit vector of its way forward, with its nodes at ``positions`` (N, 3)."""
+        forward = self.place.now(positions).ground.axes[0, :2]
+        return forward / max(float(np.linalg.norm(forward)), 1e-12)
+
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[Objective | SpinObjective]:
+        """Objectives of the step of ``dt`` that starts at ``state``, from the motion whose turn it is."""
+        if self._has_fallen(state):
+            if not isinstance(self._motion, Lie):
+                self._motion = Lie()
+                self._tell("it has fallen; Backspace stands it up again")
+            self.cancel()
+        elif self._motion.resting:
+            self._begin_next(state)
+        return self._motion.objectives(state, report, dt)
+
+    def _begin_next(self, state: BodyState) -> None:
+        place = self.place.now(state.positions)
+        try:
+            task = self._tasks.popleft() if self._tasks else self._journey.leg(place) if self._journey else None
+            begun = task.part.begin(place) if task is not None else None
+        except UserError as error:
+            self.cancel()
+            self._tell(str(error))
+            task = begun = None
+        if task is None or begun is None:
+            self._journey = None
+            if not isinstance(self._motion, Stand):
+                self._say_notes()
+                self._motion = Stand(place)
+            return
+        self._say_notes()
+        self._motion = begun
+        self.begun.append(Done(task.part.name, task.part.asked, begun, state.time))
+        self.requests.append(task.request)
+
+    def _say_notes(self) -> None:
+        if not isinstance(self._motion, Stand | Lie):
+            for note in self._motion.notes():
+                self._tell(f"{self.doing}: {note}")
+
+    def _has_fallen(self, state: BodyState) -> bool:
+        if tilt_degrees(self.place, state.positions) <= FALLEN:
+            self._tilted_since = None
+            return False
+        if self._tilted_since is None:
+            self._tilted_since = state.time
+        body = self.place.body
+        longest = _DOWN * float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
+        return state.time - self._tilted_since > longest
+
+
+def _walks(place: Place) -> bool:
+    try:
+        Walk(place, 1, _STEP_LENGTH * place.body.height)
+    except UserError:
+        return False
+    return True

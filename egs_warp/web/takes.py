@@ -1,0 +1,163 @@
+"""A take: some seconds of a live session, kept as the folder of a run, as ``egs-warp animate`` writes one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from egs_warp.fem.body import BodyState
+from egs_warp.io.atomic import atomic_write
+from egs_warp.io.run_folder import MANIFEST, run_folder
+from egs_warp.locomotion.audit import audit
+from egs_warp.locomotion.ledger import EnergySums, ledger
+from egs_warp.locomotion.recorder import Recorder
+from egs_warp.locomotion.stepper import StepReport
+from egs_warp.locomotion.trajectory import Trajectory, measure
+from egs_warp.motions.request import MotionRequest
+from egs_warp.motions.sequence import Done
+from egs_warp.pipelines import drawn
+from egs_warp.pipelines.creature import Creature
+from egs_warp.pipelines.drawn import DrawnCreature
+from egs_warp.pipelines.report import (
+    CageFacts,
+    GaussianCounts,
+    MotionReport,
+    MuscleFacts,
+    QpCounts,
+    Report,
+    stage_times,
+)
+
+LONGEST_TAKE = 120.0
+"""Seconds of the creature's own time, after which a take ends by itself."""
+SCRIPT = "script.json"
+
+
+def script_text(requests: Sequence[MotionRequest]) -> str:
+    """A script of motions, one after the other, for ``egs-warp animate --motion script.json``."""
+    lines = [json.dumps({"motion": request.name, **request.asked}) for request in requests]
+    return "[\n" + ",\n".join(f"  {line}" for line in lines) + "\n]\n"
+
+
+@dataclass
+class Take:
+    """Gathers the steps of a session from ``start`` on."""
+
+    creature: Creature
+    start: BodyState
+    reports: list[StepReport] = field(default_factory=list)
+    pulled: bool = False
+    """Whether the user pulled at the creature meanwhile."""
+
+    def __post_init__(self) -> None:
+        stepper = self.creature.stepper
+        gaps, _ = stepper.detector.gaps(self.start.positions)
+        self._recorder = Recorder(
+            stepper.body,
+            stepper.muscles,
+            stepper.geometry,
+            self.start,
+            float(gaps.min()),
+            drag=stepper.settings.drag,
+            frame=self.creature.frame,
+        )
+
+    @property
+    def seconds(self) -> float:
+        """Its length so far."""
+        return self.reports[-1].state.time - self.start.time if self.reports else 0.0
+
+    def add(self, reports: Sequence[StepReport], *, pulled: bool) -> None:
+        """The next steps."""
+        self.reports += reports
+        self.pulled |= pulled
+        self._recorder.add(reports)
+
+    def write(
+        self,
+        folder: Path,
+        drawn_as: DrawnCreature,
+        begun: Sequence[Done],
+        requests: Sequence[MotionRequest],
+        *,
+        source: str,
+        asked: Mapping[str, Any],
+    ) -> Path:
+        """Write trajectory, creature, report and script into the first free ``folder/take-N``, which it returns.
+
+        ``begun`` are the motions of the session, ``requests`` how a script asks for them.
+        """
+        trajectory = self._recorder.trajectory()
+        chosen = [
+            (entry, request)
+            for entry, request in zip(begun, requests, strict=True)
+            if trajectory.time[0] - 1e-9 <= entry.start_time < trajectory.time[-1]
+        ]
+        report = self._report(trajectory, [entry for entry, _ in chosen], drawn_as, source=source, asked=asked)
+        path = _next_folder(folder)
+        with run_folder(path) as run:
+            trajectory.save(run.file("trajectory.npz"))
+            drawn_as.save(run.file(drawn.FILE))
+            with atomic_write(run.file(SCRIPT)) as temporary:
+                temporary.write_text(script_text([request for _, request in chosen]))
+            report.write(run.file("report.json"))
+            run.finish()
+        return path
+
+    def _report(
+        self,
+        trajectory: Trajectory,
+        begun: Sequence[Done],
+        drawn_as: DrawnCreature,
+        *,
+        source: str,
+        asked: Mapping[str, Any],
+    ) -> Report:
+        creature, reports, time = self.creature, self.reports, trajectory.time
+        mesh, books = creature.cage.mesh, ledger(trajectory)
+        starts = [int(np.searchsorted(time, entry.start_time - 1e-9)) for entry in begun]
+        spans = list(zip(starts, [*starts, len(time) - 1][1:], strict=True))
+        frames = np.arange(len(time))
+        notes = ["the user pulled at it; momentum and energy of the audit do not know of that"] if self.pulled else []
+        return Report(
+            source=source,
+            motion=tuple(
+                MotionReport(
+                    entry.name,
+                    entry.asked,
+                    entry.motion.planned(),
+                    measure(trajectory, first=first, last=last),
+                    entry.motion.reached(trajectory, first, last),
+                    tuple(entry.motion.notes()),
+                )
+                for entry, (first, last) in zip(begun, spans, strict=True)
+            ),
+            audit=audit(trajectory, energy=books, newton_unconverged=sum(not one.converged for one in reports)),
+            energy=EnergySums.of(books),
+            qp=QpCounts.of(reports, frames),
+            timing=stage_times(reports, frames, {}),
+            cage=CageFacts(len(mesh.nodes), len(mesh.tets), mesh.min_dihedral_degrees(), creature.body.mass),
+            muscles=MuscleFacts(creature.muscles.fibre_count, creature.muscles.segment_count),
+            gaussians=GaussianCounts(
+                creature.cloud.count,
+                drawn_as.splats.count,
+                creature.geometry.left_out,
+                creature.geometry.left_out_opacity,
+            ),
+            notes=tuple(notes),
+            device=str(creature.cloud.device),
+            seed=0,
+            asked=asked,
+        )
+
+
+def _next_folder(folder: Path) -> Path:
+    number = 1
+    while (folder / f"take-{number}" / MANIFEST).exists():
+        number += 1
+    return folder / f"take-{number}"

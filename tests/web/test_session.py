@@ -1,0 +1,186 @@
+"""A creature that lives: its thread, and what it does with messages."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egs_warp.web.messages import Pause, Perform, Step, read_message
+from egs_warp.web.packets import Frame
+from egs_warp.web.session import Session, changed_creature
+from tests.support.lives import Played, coarse_pawn, session_of
+
+
+def _wait(session: Session, woken: threading.Event, seen: list, done: Callable[[], bool]) -> None:
+    """Gathers news until ``done``."""
+    end = time.monotonic() + 60.0
+    while not done():
+        assert time.monotonic() < end, [one for one in seen if not isinstance(one, Frame)]
+        woken.wait(0.2)
+        woken.clear()
+        seen += session.waiting()
+
+
+def test_it_lives_in_its_thread_while_it_is_watched(tmp_path: Path):
+    session = session_of(coarse_pawn(), tmp_path)
+    woken, seen = threading.Event(), []
+    session.start()
+    time.sleep(0.1)
+    assert session.waiting() == [] and session.state.time == 0.0
+    try:
+        session.watch(woken.set)
+        _wait(session, woken, seen, lambda: any(isinstance(one, dict) for one in seen))
+        assert isinstance(seen[0], Frame)
+        message = read_message({"type": "motion", "text": "jump 0 0.1"}, height=1.0, node_count=1)
+        assert isinstance(message, Perform)
+        session.ask(message)
+        _wait(session, woken, seen, lambda: any(isinstance(one, dict) and one.get("doing") == "jump" for one in seen))
+        # Nobody watches: it waits where it is, and goes on from there.
+        session.unwatch()
+        time.sleep(0.3)
+        held = session.state.time
+        time.sleep(0.3)
+        assert session.state.time == held
+        session.watch(woken.set)
+        seen = session.waiting()
+        assert isinstance(seen[0], Frame) and seen[0].time == held
+        rested = lambda: any(isinstance(one, dict) and one.get("resting") for one in seen)  # noqa: E731
+        _wait(session, woken, seen, rested)
+        assert [entry.name for entry in session.steering.begun] == ["jump"]
+        end = session.state.time
+        time.sleep(0.2)
+        assert session.state.time == end, "a body at rest is stepped"
+    finally:
+        session.stop()
+    assert not [one for one in threading.enumerate() if one.name == "session"]
+    times = [one.time for one in seen if isinstance(one, Frame)]
+    assert np.diff(times).min() >= 0.0 and max(np.diff(times)) == pytest.approx(1.0 / 60.0)
+
+
+def test_a_pause_holds_it_and_a_step_is_one_step(tmp_path: Path):
+    session = session_of(coarse_pawn(), tmp_path)
+    woken, seen = threading.Event(), []
+    session.ask(Pause(True))
+    session.start()
+    try:
+        session.watch(woken.set)
+        _wait(session, woken, seen, lambda: any(isinstance(one, dict) and one.get("paused") for one in seen))
+        assert session.state.time == 0.0
+        for count in (1, 2, 3):
+            session.ask(Step())
+            _wait(session, woken, seen, lambda: session.state.time > (count - 0.5) / 60.0)  # noqa: B023
+        time.sleep(0.2)
+        assert session.state.time == pytest.approx(3.0 / 60.0)
+    finally:
+        session.stop()
+
+
+def test_it_is_no_faster_than_the_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    session = session_of(coarse_pawn(), tmp_path)
+    made = Played(coarse_pawn(), tmp_path)
+    made.step()
+    result = (made.session.state, made.session._memory, [made.session.report])
+    monkeypatch.setattr(type(session.creature.stepper), "advance", lambda *_: result)
+    monkeypatch.setattr(Session, "resting", property(lambda _: False))
+    woken, seen = threading.Event(), []
+    session.start()
+    try:
+        began = time.monotonic()
+        session.watch(woken.set)
+        _wait(session, woken, seen, lambda: len([one for one in seen if isinstance(one, Frame)]) > 32)
+        # It may catch up what two steps were late.
+        assert time.monotonic() - began > 27 / 60.0
+    finally:
+        session.stop()
+
+
+def test_frames_tell_what_the_solver_did(tmp_path: Path):
+    played = Played(coarse_pawn(), tmp_path)
+    played.step(3)
+    frame, session = played.frames[-1], played.session
+    report = session.report
+    assert report is not None
+    np.testing.assert_array_equal(frame.positions, session.state.positions)
+    force = frame.contacts[:, 6:].sum(axis=0)
+    assert force[2] == pytest.approx(session.creature.body.weight, rel=0.05)
+    assert np.abs(frame.activations).max() <= 1.0 + 1e-9
+    assert (frame.contacts[:, 5] == pytest.approx(1.0)) and np.abs(frame.contacts[:, 2]).max() < 0.02
+    height, pressed, used, gap = frame.curves
+    assert height == pytest.approx(0.37, abs=0.02) and pressed == pytest.approx(1.0, rel=0.05)
+    assert 0.0 <= used <= 1.0 + 1e-6 and abs(gap) < 0.01
+
+
+def test_friction_and_stiffness_change_under_it(tmp_path: Path):
+    played = Played(coarse_pawn(), tmp_path)
+    played.step(2)
+    before = played.session.state
+    young = played.session.creature.body.young_modulus
+    played.ask("set", friction=0.3)
+    assert played.session.creature.geometry.friction == 0.3
+    assert played.session.creature.body.young_modulus == young
+    played.ask("set", sag=0.025)
+    assert played.session.creature.body.young_modulus == pytest.approx(2.0 * young)
+    assert played.session.state is before
+    assert [news for news in played.news if news["type"] == "busy"] == 2 * [
+        {"type": "busy", "on": True},
+        {"type": "busy", "on": False},
+    ]
+    played.ask("motion", text="jump 0 0.1")
+    played.until_idle()
+    assert played.session.report is not None and played.session.report.converged
+    assert played.session.standing()["friction"] == 0.3 and played.session.standing()["sag"] == 0.025
+    # What is asked again changes nothing.
+    made = played.session.creature
+    played.ask("set", sag=0.025)
+    assert played.session.creature is made
+
+
+def test_a_changed_creature_is_that_which_would_have_been_made():
+    made = coarse_pawn()
+    same = changed_creature(made, friction=made.geometry.friction, sag=0.05, muscles_file=None)
+    np.testing.assert_allclose(same.start.positions, made.start.positions, atol=1e-12)
+    assert same.body.young_modulus == made.body.young_modulus
+
+
+def test_a_solver_that_fails_does_not_end_the_session(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    played = Played(coarse_pawn(), tmp_path)
+    played.step(2)
+
+    def fail(*_: object) -> None:
+        raise FloatingPointError("no definite matrix")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(type(played.session.creature.stepper), "advance", fail)
+        played.step()
+    assert played.told == ["the solver found no way on; the creature stands where it began"]
+    assert capsys.readouterr().err == "egs-warp: live: FloatingPointError: no definite matrix\n"
+    np.testing.assert_array_equal(played.session.state.positions, played.session.creature.start.positions)
+    played.step(2)
+    assert len(played.told) == 1
+
+
+def test_a_page_that_takes_nothing_loses_the_oldest_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("egs_warp.web.session._MOST_WAITING", 5)
+    session = session_of(coarse_pawn(), tmp_path)
+    session.watch(lambda: None)
+    for _ in range(8):
+        session.advance()
+    times = [round(60.0 * one.time) for one in session.waiting() if isinstance(one, Frame)]
+    assert times == [4, 5, 6, 7, 8]
+
+
+def test_a_script_of_what_it_did_is_told(tmp_path: Path):
+    played = Played(coarse_pawn(), tmp_path)
+    played.ask("script")
+    assert played.news[-1] == {"type": "script", "text": "[\n\n]\n", "motions": 0}
+    played.ask("motion", text="jump 0 0.1")
+    played.until_idle()
+    played.ask("script")
+    assert played.news[-1]["motions"] == 1 and '"motion": "jump"' in str(played.news[-1]["text"])

@@ -1,0 +1,103 @@
+"""What a creature does next."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egs_warp.errors import UserError
+from egs_warp.motions.script import motion
+from egs_warp.motions.stance import sole_shares
+from egs_warp.motions.walk import Walk
+from egs_warp.pipelines.creature import first_place
+from egs_warp.web.steering import ARRIVED, ASIDE, Journey, Steering
+from tests.support.creatures import coarse_creature
+from tests.support.lives import Played, coarse_pawn
+from tests.support.meshes import stool
+
+
+def test_what_is_asked_meanwhile_takes_the_place_of_what_was_to_come(tmp_path: Path):
+    played = Played(coarse_pawn(), tmp_path)
+    played.ask("motion", text="jump 0 0.1, hop")
+    played.step()
+    assert (played.session.steering.doing, played.session.steering.queued) == ("jump", "hop")
+    played.ask("motion", text="twist 20 0 0.1")
+    assert played.session.steering.queued == "twist"
+    played.until(lambda: played.session.steering.doing == "twist")
+    assert [entry.name for entry in played.session.steering.begun] == ["jump", "twist"]
+    played.ask("motion", text="hop")
+    played.ask("cancel")
+    played.until_idle()
+    assert [entry.name for entry in played.session.steering.begun] == ["jump", "twist"]
+
+
+def test_a_motion_that_the_body_cannot_do_is_told(tmp_path: Path):
+    played = Played(coarse_pawn(), tmp_path)
+    played.ask("motion", text="walk 2, jump")
+    played.step()
+    assert played.told == ["walk: a walk needs four separate feet, the body has 1"]
+    assert played.session.steering.idle or played.session.steering.doing == "stand"
+    assert played.session.steering.begun == []
+
+
+def test_a_journey_turns_first_and_then_jumps_straight_at_its_goal():
+    creature = coarse_pawn()
+    place = first_place(creature)
+    feet = sole_shares(place.body, place.ground, place.standing) @ place.standing
+    ahead, left = place.ground.axes[:2]
+
+    def leg(way: np.ndarray):
+        return Journey((feet + way)[:2], walks=False).leg(place)
+
+    aside = leg(1.0 * left)
+    assert aside is not None and aside.request.name == "twist"
+    assert aside.request.asked["heading_degrees"] == pytest.approx(90.0, abs=0.1)
+    slant = np.radians(ASIDE - 1.0)
+    straight = leg(np.cos(slant) * ahead + np.sin(slant) * left)
+    assert straight is not None and straight.request.name == "jump"
+    assert straight.request.asked["distance"] == pytest.approx(0.5, abs=1e-3)
+    assert leg(0.9 * ARRIVED * left) is None
+    # So near, it does not turn.
+    near = leg(0.2 * left)
+    assert near is not None and near.request.name == "jump"
+
+
+def test_a_journey_that_comes_no_nearer_is_given_up():
+    place = first_place(coarse_pawn())
+    journey = Journey(np.array([3.0, 0.0]), walks=False)
+    with pytest.raises(UserError, match="go: it comes no nearer than"):
+        for _ in range(10):
+            journey.leg(place)
+
+
+def test_a_body_with_feet_walks_there():
+    place = coarse_creature(stool(), forward=np.array([0.9, 0.3, 0.0]), sag=0.01, strength=20.0, settled=False).place
+    steering = Steering(place, print)
+    assert steering.walks
+    feet = sole_shares(place.body, place.ground, place.standing) @ place.standing
+    ahead = Walk(place, 1, 0.1).ground.axes[0]
+    leg = Journey((feet + 0.45 * place.body.height * ahead)[:2], walks=True).leg(place)
+    assert leg is not None and leg.request.name == "walk" and leg.request.asked["steps"] == 4
+    leg = Journey((feet - 0.5 * place.body.height * ahead)[:2], walks=True).leg(place)
+    assert leg is not None and leg.request.name == "twist"
+    assert abs(leg.request.asked["heading_degrees"]) == pytest.approx(180.0, abs=0.1)
+    steering.perform(motion("walk 1"))
+    assert steering.queued == "walk"
+
+
+def test_a_click_sends_it_there(tmp_path: Path):
+    played = Played(coarse_pawn(), tmp_path)
+    body = played.session.creature.body
+    place = played.session.steering.place
+    feet = sole_shares(place.body, place.ground, place.standing)
+    start = feet @ played.session.state.positions
+    goal = start + 0.4 * place.ground.axes[0] + 0.35 * place.ground.axes[1]
+    played.ask("go", x=goal[0], y=goal[1])
+    played.until_idle(most=900)
+    end = feet @ played.session.state.positions
+    assert np.linalg.norm((end - goal)[:2]) < ARRIVED * body.height
+    assert played.session.steering.goal is None
+    names = [entry.name for entry in played.session.steering.begun]
+    assert names[0] == "twist" and "jump" in names
