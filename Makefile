@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 # Frames of each example; as many as its motion takes where this is empty.
 FRAMES ?=
+# Threads cost the small matrices of a step more than they bring.
+export OPENBLAS_NUM_THREADS ?= 1
 # Of make fuzz, for all readers together.
 MINUTES ?= 10
 BIN := $(VENV)/bin

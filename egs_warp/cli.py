@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -17,6 +18,8 @@ from egs_warp.version import __version__
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; whatever stops it prints one line (``commands.endings``) and is told by the status."""
+    # The matrices of a step are small: threads cost more than they bring, and tenfold beside other work.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         with one_line_errors("egs-warp"):
             given = _joined(sys.argv[1:] if arguments is None else arguments)

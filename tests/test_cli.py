@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -149,3 +152,17 @@ def test_axes_and_planes_are_read() -> None:
     assert np.array_equal(plane.normal, [0.0, 1.0, 0.0]) and plane.offset == -2.0
     with pytest.raises(UserError, match="give one of x, y, z"):
         parse_up("up")
+
+
+@pytest.mark.parametrize(("given", "taken"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "4"}, "4")])
+def test_small_matrices_take_one_thread_unless_told(given: dict[str, str], taken: str) -> None:
+    """The variable stands before NumPy, which reads it, is loaded."""
+    script = """
+import atexit, os, sys
+import egs_warp.cli
+atexit.register(lambda: print(os.environ["OPENBLAS_NUM_THREADS"], "numpy" in sys.modules))
+egs_warp.cli.main(["--version"])
+"""
+    rest = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    done = subprocess.run([sys.executable, "-c", script], env=rest | given, capture_output=True, text=True, check=True)
+    assert done.stdout.split()[-2:] == [taken, "False"]

@@ -51,7 +51,7 @@ def test_every_benchmark_takes_the_flags(
 
 def test_there_are_benchmarks() -> None:
     """The scripts are found by their ``main``; a renamed one must not leave the test above empty."""
-    assert len(SCRIPTS) == 15
+    assert len(SCRIPTS) == 16
 
 
 def test_what_a_benchmark_leaves(harness: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

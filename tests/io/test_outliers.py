@@ -66,7 +66,10 @@ def test_a_capture_of_outliers_is_refused(tmp_path: Path) -> None:
 def test_values_that_single_precision_cannot_use_are_told(tmp_path: Path) -> None:
     path = spoiled(tmp_path / "a.ply", [5, 6], log_scales=-3e38, opacity_logits=-1e30)
     capture = read_capture(path, device="cpu")
-    assert capture.notes == ("2 Gaussians with a log scale below -100 read as that",)
+    assert capture.notes == (
+        "2 Gaussians with a log scale below -100 read as that",
+        "2 infinite opacities were read as 0 or 1",
+    )
     assert capture.infinite_opacities == 2
     assert (capture.cloud.log_scales.numpy()[[5, 6]] == -100.0).all()
     assert (capture.cloud.opacity_logits.numpy()[[5, 6]] == -16.0).all()

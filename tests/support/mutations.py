@@ -223,6 +223,11 @@ BESIDE_THE_PAPER: list[Mutation] = [
             "motions/test_stance.py::test_the_nearest_acceleration_that_does_not_tip",
         ),
         (
+            *("balance: what friction gives under load", "motions/stance.py"),
+            *("GRIP * self.friction * max(gravity + up, 0.2 * gravity)", "GRIP * self.friction * gravity"),
+            "motions/test_stance.py::test_no_more_is_asked_than_friction_gives",
+        ),
+        (
             *("balance: the margin of the footprint", "motions/stance.py"),
             *("place + margin * self.support_high", "place + self.support_high"),
             "motions/test_stance.py::test_the_nearest_acceleration_that_does_not_tip",
