@@ -78,7 +78,7 @@ class Follow:
         for key in self.keys:
             if key.part not in self.parts:
                 raise UserError(f"{key.where}: the body has no part {key.part!r}; it has {', '.join(self.parts)}")
-        self.pose = PoseFamily(self.body, place.ground, place.standing, place.touching, place.friction)
+        self.pose = PoseFamily(self.body, place.ground, place.standing, place.touching)
         self.phase = FollowPhase.FOLLOW
         self._standing = place.standing
         self._gravity = float(np.linalg.norm(self.body.gravity))

@@ -77,13 +77,12 @@ class Jump:
             ground.origin + target.distance * ground.axes[0] + target.rise * ground.axes[2],
             ground.surface_normal,
         )
-        self.pose = PoseFamily(body, ground, place.standing, place.touching, place.friction)
+        self.pose = PoseFamily(body, ground, place.standing, place.touching)
         self._landing = PoseFamily(
             body,
             landing,
             landing.world(ground.local(place.standing)),
             landing.world(ground.local(place.touching)),
-            place.friction,
         )
         ahead = ground.axes[0] @ (place.touching - body.centre_of_mass(place.standing)).T
         self.plan = plan_jump(
@@ -155,7 +154,7 @@ class Jump:
     def _advance_phase(self, seen: Measurement, time: float, dt: float) -> None:
         # What a foot brushes on its way up is no landing.
         seen = replace(seen, touching=seen.touching and seen.velocity[2] < 0.0)
-        elapsed, plan = time - self._entered + 1e-9, self.plan
+        elapsed, plan = time - self._entered, self.plan
         following = {
             JumpPhase.SETTLE: elapsed >= 0.3 * self._time_unit,
             JumpPhase.CROUCH: elapsed >= plan.crouch_time,

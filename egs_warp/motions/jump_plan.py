@@ -38,7 +38,6 @@ class JumpPlan:
     crouch_depth: float
     extension: float
     crouch_time: float
-    """A whole number of steps: what is asked goes over into the thrust without a jolt."""
     thrust_time: float
     flight_time: float
     speed_up: float
@@ -132,7 +131,7 @@ def plan_jump(
     return JumpPlan(
         crouch_depth=float(crouch_depth),
         extension=float(extension),
-        crouch_time=float(np.ceil(1.1 * time_unit / step) * step),
+        crouch_time=float(1.1 * time_unit),
         thrust_time=float(thrust_time),
         flight_time=float(flight_time),
         speed_up=float(speed_up),

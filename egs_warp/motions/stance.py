@@ -19,8 +19,6 @@ CALM = 0.03
 """Speed of the centre of mass, in sqrt(g H), below which a standing body is calm."""
 CALM_TIME = 0.3
 """Of sqrt(H / g): for how long a body is calm before it is at rest."""
-GRIP = 0.95
-"""Of what friction could give at most: asked for more, feet slide, and what else is asked falls short."""
 
 
 @dataclass(frozen=True)
@@ -112,12 +110,9 @@ class PoseFamily:
     See docs/concepts/motions.md.
     """
 
-    def __init__(
-        self, body: SoftBody, ground: Ground, standing: np.ndarray, touching: np.ndarray, friction: float
-    ) -> None:
-        """``standing`` (N, 3): nodes at rest; ``touching`` (k, 3): points of the body on the ground then; ``friction``:
-        Coulomb coefficient."""
-        self.body, self.ground, self.friction = body, ground, friction
+    def __init__(self, body: SoftBody, ground: Ground, standing: np.ndarray, touching: np.ndarray) -> None:
+        """``standing`` (N, 3): nodes at rest; ``touching`` (k, 3): points of the body on the ground then."""
+        self.body, self.ground = body, ground
         local = ground.local(standing)
         self._arms = (local - body.centre_of_mass(local)) @ ground.axes
         self.standing_height = float(body.centre_of_mass(local)[2])
@@ -132,13 +127,11 @@ class PoseFamily:
         self, seen: Measurement, wanted: np.ndarray, up: float, gravity: float, *, margin: float = 0.8
     ) -> np.ndarray:
         """(2,) the horizontal acceleration nearest to ``wanted`` (2,) m/s^2 that the feet can give without tipping the
-        body or sliding.
+        body.
 
         The centre of pressure com - h a / (g + ``up``) stays within ``margin`` of the footprint (linear inverted
         pendulum).
         """
-        grip = GRIP * self.friction * max(gravity + up, 0.2 * gravity)
-        wanted = wanted * min(1.0, grip / max(float(np.linalg.norm(wanted)), 1e-12))
         lever = max(seen.com[2], 0.3 * self.standing_height) / max(gravity + up, 0.2 * gravity)
         pressure = seen.com[:2] - lever * wanted
         place = seen.base - self.base_offset

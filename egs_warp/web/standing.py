@@ -19,7 +19,7 @@ class Stand:
 
     def __init__(self, place: Place) -> None:
         self.body = place.body
-        self.pose = PoseFamily(place.body, place.ground, place.standing, place.touching, place.friction)
+        self.pose = PoseFamily(place.body, place.ground, place.standing, place.touching)
         self._gravity = float(np.linalg.norm(place.body.gravity))
         self._time_unit = float(np.sqrt(place.body.height / self._gravity))
         self._height = self.pose.standing_height

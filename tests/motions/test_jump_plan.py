@@ -90,15 +90,3 @@ def test_a_given_lean_is_kept() -> None:
     shared = {"height": 1.0, "com_height": 0.5, "support_ahead": 0.2}
     plan = plan_jump(JumpTarget(0.5, 0.3), **shared, gravity=GRAVITY, step=STEP, lean=0.09)
     assert plan.lean == 0.09
-
-
-@pytest.mark.parametrize("step", [1 / 30, 1 / 60, 1 / 90])
-def test_a_crouch_goes_over_into_its_thrust_in_whole_steps(step: float) -> None:
-    """Otherwise its last step would ask for less than its whole way: a jolt against the motion."""
-    plan = plan_jump(
-        JumpTarget(0.5, 0.2), height=1.0, com_height=0.45, support_ahead=0.2, gravity=GRAVITY, step=step, lean=0.1
-    )
-    steps = plan.crouch_time / step
-    assert steps == pytest.approx(round(steps)) and 1.1 <= plan.crouch_time * np.sqrt(GRAVITY) < 1.1 + 3.2 * step
-    for before, after in zip(plan.crouch(np.zeros(3), plan.crouch_time), plan.thrust(np.zeros(3), 0.0), strict=True):
-        assert before == pytest.approx(after, abs=1e-12)

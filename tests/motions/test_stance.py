@@ -21,7 +21,7 @@ def test_the_nearest_acceleration_that_does_not_tip(
     """The ground's force on a body that neither turns nor tips points through its centre of mass, from inside the
     footprint.
     """
-    pose = PoseFamily(place.body, place.ground, place.standing, place.touching, 1e3)
+    pose = PoseFamily(place.body, place.ground, place.standing, place.touching)
     positions = place.standing + np.array([0.05, -0.03, 0.1]) * (place.standing[:, 2:] > 1e-9)
     seen = pose.measure(BodyState(positions, np.zeros_like(positions)), None)
     com = place.ground.local(place.body.centre_of_mass(positions))
@@ -42,7 +42,7 @@ def test_the_nearest_acceleration_that_does_not_tip(
 
 
 def test_the_usual_margin_stays_inside_the_feet_and_a_falling_body_may_be_pushed_either_way(place: Place) -> None:
-    pose = PoseFamily(place.body, place.ground, place.standing, place.touching, place.friction)
+    pose = PoseFamily(place.body, place.ground, place.standing, place.touching)
     still = np.zeros_like(place.standing)
     seen = pose.measure(BodyState(place.standing, still), None)
     hard = pose.balanced_acceleration(seen, np.array([100.0, -100.0]), 0.0, GRAVITY)
@@ -51,15 +51,3 @@ def test_the_usual_margin_stays_inside_the_feet_and_a_falling_body_may_be_pushed
     falling = pose.measure(BodyState(past, still), None)
     ways = [pose.balanced_acceleration(falling, np.array([x, 0.0]), 0.0, GRAVITY)[0] for x in (-100.0, 100.0)]
     assert ways[0] < -0.5 and ways[1] > 0.5
-
-
-@pytest.mark.parametrize("up", [0.0, 15.0])
-def test_no_more_is_asked_than_friction_gives(place: Place, up: float) -> None:
-    """Coulomb: what is asked keeps its way and is 0.95 of what the ground's friction could do; less is asked as it
-    is."""
-    pose = PoseFamily(place.body, place.ground, place.standing, place.touching, 0.05)
-    seen = pose.measure(BodyState(place.standing, np.zeros_like(place.standing)), None)
-    wanted = np.array([0.9, -1.2])
-    got = pose.balanced_acceleration(seen, wanted, up, GRAVITY)
-    assert got == pytest.approx(0.95 * 0.05 * (GRAVITY + up) * wanted / 1.5)
-    assert pose.balanced_acceleration(seen, 0.1 * wanted, up, GRAVITY) == pytest.approx(0.1 * wanted)

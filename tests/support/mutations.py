@@ -210,13 +210,8 @@ BESIDE_THE_PAPER: list[Mutation] = [
         ),
         (
             *("balance: the centre of pressure under load", "motions/stance.py"),
-            *("standing_height) / max(gravity + up, 0.2 * gravity)", "standing_height) / gravity"),
+            *("max(gravity + up, 0.2 * gravity)", "gravity"),
             "motions/test_stance.py::test_the_nearest_acceleration_that_does_not_tip",
-        ),
-        (
-            *("balance: what friction gives under load", "motions/stance.py"),
-            *("GRIP * self.friction * max(gravity + up, 0.2 * gravity)", "GRIP * self.friction * gravity"),
-            "motions/test_stance.py::test_no_more_is_asked_than_friction_gives",
         ),
         (
             *("balance: the margin of the footprint", "motions/stance.py"),
