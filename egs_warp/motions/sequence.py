@@ -147,5 +147,10 @@ class MotionSequence:
 
     def spans(self, time: np.ndarray) -> list[tuple[int, int]]:
         """First and last index into ``time`` (F+1,) of each motion that was begun."""
-        starts = [int(np.searchsorted(time, entry.start_time - 1e-9)) for entry in self.done]
-        return list(zip(starts, [*starts[1:], len(time) - 1], strict=True))
+        return spans_of(self.done, time)
+
+
+def spans_of(done: Sequence[Done], time: np.ndarray) -> list[tuple[int, int]]:
+    """First and last index into ``time`` (F+1,) of each of the motions ``done``, one after the other to the end."""
+    starts = [int(np.searchsorted(time, entry.start_time - 1e-9)) for entry in done]
+    return list(zip(starts, [*starts, len(time) - 1][1:], strict=True))

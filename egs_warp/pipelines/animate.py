@@ -17,29 +17,19 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.run_folder import RunFolder, run_folder
 from egs_warp.io.video import ffmpeg_program
-from egs_warp.locomotion.audit import audit
-from egs_warp.locomotion.ledger import EnergySums, Ledger, ledger
+from egs_warp.locomotion.ledger import ledger
 from egs_warp.locomotion.stepper import LocomotionSettings
-from egs_warp.locomotion.trajectory import measure
 from egs_warp.motions.request import LARGEST_TARGET, LARGEST_TURN
 from egs_warp.motions.script import motion as script
 from egs_warp.pipelines import drawn
 from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.drawn import DrawnCreature
-from egs_warp.pipelines.film import Film, draw_film
+from egs_warp.pipelines.film import draw_film
 from egs_warp.pipelines.finished_run import PARTS
 from egs_warp.pipelines.oddities import oddities
-from egs_warp.pipelines.performance import Performance, simulate
+from egs_warp.pipelines.performance import simulate
 from egs_warp.pipelines.plots import draw_plots
-from egs_warp.pipelines.report import (
-    CageFacts,
-    GaussianCounts,
-    MotionReport,
-    MuscleFacts,
-    QpCounts,
-    Report,
-    stage_times,
-)
+from egs_warp.pipelines.report import Report, report_of_run
 from egs_warp.pipelines.shot import LARGEST_SIDE, SMALLEST_SIDE, Shot
 
 LARGEST_FRICTION = 10.0
@@ -208,7 +198,17 @@ def animate(
             solids=len(solids),
         )
         notes = (*notes, *performance.sequence.cut_short())
-        report = _report(performance, books, film, asked_for, source=source, notes=notes)
+        simulation = performance.simulation
+        report = report_of_run(
+            *(creature, simulation.trajectory, simulation.reports, simulation.frames),
+            *(performance.sequence.done, books),
+            drawn=film.splats.count,
+            drawing=film.milliseconds,
+            source=source,
+            notes=notes,
+            seed=options.seed,
+            asked=asked_for.to_json(),
+        )
         report.write(run.file("report.json"))
         if not isinstance(out, RunFolder):
             run.finish()
@@ -217,41 +217,3 @@ def animate(
 
 def _numbers(vector: np.ndarray | None) -> tuple[float, ...]:
     return () if vector is None else tuple(float(x) for x in vector)
-
-
-def _report(
-    performance: Performance, books: Ledger, film: Film, asked: Asked, *, source: str, notes: tuple[str, ...]
-) -> Report:
-    creature, sequence, simulation = performance.creature, performance.sequence, performance.simulation
-    trajectory, reports = simulation.trajectory, simulation.reports
-    mesh, spans = creature.cage.mesh, sequence.spans(trajectory.time)
-    return Report(
-        source=source,
-        motion=tuple(
-            MotionReport(
-                entry.name,
-                entry.asked,
-                entry.motion.planned(),
-                measure(trajectory, first=first, last=last),
-                entry.motion.reached(trajectory, first, last),
-                tuple(entry.motion.notes()),
-            )
-            for entry, (first, last) in zip(sequence.done, spans, strict=True)
-        ),
-        audit=audit(trajectory, energy=books, newton_unconverged=sum(not report.converged for report in reports)),
-        energy=EnergySums.of(books),
-        qp=QpCounts.of(reports, simulation.frames),
-        timing=stage_times(reports, simulation.frames, film.milliseconds),
-        cage=CageFacts(len(mesh.nodes), len(mesh.tets), mesh.min_dihedral_degrees(), creature.body.mass),
-        muscles=MuscleFacts(creature.muscles.fibre_count, creature.muscles.segment_count),
-        gaussians=GaussianCounts(
-            creature.cloud.count,
-            film.splats.count,
-            creature.geometry.left_out,
-            creature.geometry.left_out_opacity,
-        ),
-        notes=notes,
-        device=str(creature.cloud.device),
-        seed=asked.options.seed,
-        asked=asked.to_json(),
-    )

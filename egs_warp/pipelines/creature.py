@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +124,20 @@ def make_creature(
             front = _front(standing.gaussians, body.height)
             return Creature(frame, in_body_frame(cloud, frame), front, cage, stepper, start, everything)
         sag *= 0.5
+
+
+def changed_creature(creature: Creature, *, friction: float, sag: float, muscles_file: Path | None) -> Creature:
+    """``creature`` with another friction and another stiffness, by its ``sag`` (``make_body``); cage and ground stay.
+
+    Muscles change with the stiffness; it is made to stand anew.
+    """
+    device = str(creature.cloud.device)
+    body, geometry = creature.body, replace(creature.geometry, friction=friction)
+    up = -body.gravity / np.linalg.norm(body.gravity)
+    made = make_body(creature.cage.mesh, GROUND, up=up, sag=sag, device=device)
+    muscles = body_muscles(made, muscles_file, creature.frame)
+    stepper = LocomotionStepper(made, muscles, geometry, settings=creature.stepper.settings, device=device)
+    return replace(creature, stepper=stepper, start=settle(stepper))
 
 
 @dataclass(frozen=True)

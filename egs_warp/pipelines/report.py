@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from egs_warp.io.atomic import atomic_write
-from egs_warp.locomotion.audit import Audit
-from egs_warp.locomotion.ledger import EnergySums
+from egs_warp.locomotion.audit import Audit, audit
+from egs_warp.locomotion.ledger import EnergySums, Ledger
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.locomotion.trajectory import Reached
+from egs_warp.locomotion.trajectory import Reached, Trajectory, measure
+from egs_warp.motions.sequence import Done, spans_of
+from egs_warp.pipelines.creature import Creature
 from egs_warp.version import __version__
 
 if TYPE_CHECKING:
@@ -232,15 +234,64 @@ AUDIT_LIMITS = {
 """Beyond these a run is not what the equations say (docs/guide/report.md)."""
 
 
-def verdict(audit: Audit) -> str:
+def verdict(found: Audit) -> str:
     """One line: whether the run obeys its equations, and by how much not."""
-    values = asdict(audit)
+    values = asdict(found)
     # Not "value > limit": NaN is beyond, too.
     beyond = {name: value for name, value in values.items() if not value <= AUDIT_LIMITS[name]}
     if beyond:
         said = ", ".join(f"{name} {value:.2g} (at most {AUDIT_LIMITS[name]:g})" for name, value in beyond.items())
         return f"audit: FAILED: {said}"
     return "audit: passed (" + ", ".join(f"{name} {value:.2g}" for name, value in values.items()) + ")"
+
+
+def report_of_run(
+    creature: Creature,
+    trajectory: Trajectory,
+    steps: Sequence[StepReport],
+    frames: np.ndarray,
+    done: Sequence[Done],
+    books: Ledger,
+    *,
+    drawn: int,
+    drawing: Mapping[str, Sequence[float]],
+    source: str,
+    notes: Sequence[str],
+    seed: int,
+    asked: Mapping[str, Any],
+) -> Report:
+    """Of the motions ``done`` on a ``trajectory`` with its ``books``; ``frames`` (n,) are indices into its times.
+
+    ``drawn`` splats are in its pictures, ``drawing`` are the milliseconds of each by stage.
+    """
+    mesh = creature.cage.mesh
+    return Report(
+        source=source,
+        motion=tuple(
+            MotionReport(
+                entry.name,
+                entry.asked,
+                entry.motion.planned(),
+                measure(trajectory, first=first, last=last),
+                entry.motion.reached(trajectory, first, last),
+                tuple(entry.motion.notes()),
+            )
+            for entry, (first, last) in zip(done, spans_of(done, trajectory.time), strict=True)
+        ),
+        audit=audit(trajectory, energy=books, newton_unconverged=sum(not step.converged for step in steps)),
+        energy=EnergySums.of(books),
+        qp=QpCounts.of(steps, frames),
+        timing=stage_times(steps, frames, drawing),
+        cage=CageFacts(len(mesh.nodes), len(mesh.tets), mesh.min_dihedral_degrees(), creature.body.mass),
+        muscles=MuscleFacts(creature.muscles.fibre_count, creature.muscles.segment_count),
+        gaussians=GaussianCounts(
+            creature.cloud.count, drawn, creature.geometry.left_out, creature.geometry.left_out_opacity
+        ),
+        notes=tuple(notes),
+        device=str(creature.cloud.device),
+        seed=seed,
+        asked=asked,
+    )
 
 
 def write_report(path: Path, report: Mapping[str, Any]) -> None:

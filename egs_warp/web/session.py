@@ -10,20 +10,18 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.fem.body import DEFAULT_SAG, BodyState, make_body
-from egs_warp.geometry.body_frame import GROUND
-from egs_warp.locomotion.rollout import FRAME_RATE, settle, steps_per_frame
-from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
+from egs_warp.fem.body import DEFAULT_SAG, BodyState
+from egs_warp.locomotion.rollout import FRAME_RATE, steps_per_frame
 from egs_warp.motions.script import MOST_MOTIONS
 from egs_warp.motions.sequence import Place
-from egs_warp.pipelines.creature import Creature, body_muscles, first_place
+from egs_warp.pipelines.creature import Creature, changed_creature, first_place
 from egs_warp.pipelines.drawn import DrawnCreature
 from egs_warp.web.messages import (
     Cancel,
@@ -39,6 +37,7 @@ from egs_warp.web.messages import (
     Step,
     TellScript,
 )
+from egs_warp.web.moments import frame_of
 from egs_warp.web.packets import Frame
 from egs_warp.web.spring import Spring
 from egs_warp.web.standing import tilt_degrees
@@ -370,46 +369,3 @@ class Session:
             "motions": len(steering.begun),
             "step": self._dt,
         }
-
-
-def changed_creature(creature: Creature, *, friction: float, sag: float, muscles_file: Path | None) -> Creature:
-    """``creature`` with another friction and another stiffness, by its ``sag`` (``make_body``); cage and ground stay.
-
-    Muscles change with the stiffness; it is made to stand anew.
-    """
-    device = str(creature.cloud.device)
-    body, geometry = creature.body, replace(creature.geometry, friction=friction)
-    up = -body.gravity / np.linalg.norm(body.gravity)
-    made = make_body(creature.cage.mesh, GROUND, up=up, sag=sag, device=device)
-    muscles = body_muscles(made, muscles_file, creature.frame)
-    stepper = LocomotionStepper(made, muscles, geometry, settings=creature.stepper.settings, device=device)
-    return replace(creature, stepper=stepper, start=settle(stepper))
-
-
-def frame_of(index: int, state: BodyState, report: StepReport | None, creature: Creature) -> Frame:
-    """What the page is sent of ``state``, to which the step of ``report`` led; curves as those of a recording."""
-    body, muscles = creature.body, creature.muscles
-    height = float(-body.gravity @ body.centre_of_mass(state.positions)) / float(np.linalg.norm(body.gravity))
-    if report is None:
-        curves = np.array([height / body.height, 0.0, 0.0, 0.0])
-        return Frame(index, state.time, state.positions, np.zeros(muscles.segment_count), np.zeros((0, 9)), curves)
-    contacts = report.contacts
-    points = np.einsum("nw,nwi->ni", contacts.weights, state.positions[contacts.nodes])
-    forces = np.einsum("na,nai->ni", report.forces, contacts.axes)
-    rubbed = float(np.linalg.norm(report.forces[:, 1:], axis=1).sum())
-    pressed = creature.geometry.friction * float(report.forces[:, 0].sum())
-    return Frame(
-        index,
-        state.time,
-        state.positions,
-        report.activations / np.maximum(muscles.bounds, 1e-12),
-        np.concatenate([points, contacts.axes[:, 0], forces], axis=1),
-        np.array(
-            [
-                height / body.height,
-                float(np.linalg.norm(forces.sum(axis=0))) / body.weight,
-                rubbed / max(pressed, 1e-9 * body.weight),
-                report.min_gap / body.height,
-            ]
-        ),
-    )

@@ -13,25 +13,15 @@ import numpy as np
 from egs_warp.fem.body import BodyState
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.run_folder import MANIFEST, run_folder
-from egs_warp.locomotion.audit import audit
-from egs_warp.locomotion.ledger import EnergySums, ledger
+from egs_warp.locomotion.ledger import ledger
 from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.locomotion.trajectory import Trajectory, measure
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.sequence import Done
 from egs_warp.pipelines import drawn
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.drawn import DrawnCreature
-from egs_warp.pipelines.report import (
-    CageFacts,
-    GaussianCounts,
-    MotionReport,
-    MuscleFacts,
-    QpCounts,
-    Report,
-    stage_times,
-)
+from egs_warp.pipelines.report import report_of_run
 
 LONGEST_TAKE = 120.0
 """Seconds of the creature's own time, after which a take ends by itself."""
@@ -98,7 +88,17 @@ class Take:
             for entry, request in zip(begun, requests, strict=True)
             if trajectory.time[0] - 1e-9 <= entry.start_time < trajectory.time[-1]
         ]
-        report = self._report(trajectory, [entry for entry, _ in chosen], drawn_as, source=source, asked=asked)
+        notes = ["the user pulled at it; momentum and energy of the audit do not know of that"] if self.pulled else []
+        report = report_of_run(
+            *(self.creature, trajectory, self.reports, np.arange(len(trajectory.time))),
+            *([entry for entry, _ in chosen], ledger(trajectory)),
+            drawn=drawn_as.splats.count,
+            drawing={},
+            source=source,
+            notes=notes,
+            seed=0,
+            asked=asked,
+        )
         path = _next_folder(folder)
         with run_folder(path) as run:
             trajectory.save(run.file("trajectory.npz"))
@@ -108,52 +108,6 @@ class Take:
             report.write(run.file("report.json"))
             run.finish()
         return path
-
-    def _report(
-        self,
-        trajectory: Trajectory,
-        begun: Sequence[Done],
-        drawn_as: DrawnCreature,
-        *,
-        source: str,
-        asked: Mapping[str, Any],
-    ) -> Report:
-        creature, reports, time = self.creature, self.reports, trajectory.time
-        mesh, books = creature.cage.mesh, ledger(trajectory)
-        starts = [int(np.searchsorted(time, entry.start_time - 1e-9)) for entry in begun]
-        spans = list(zip(starts, [*starts, len(time) - 1][1:], strict=True))
-        frames = np.arange(len(time))
-        notes = ["the user pulled at it; momentum and energy of the audit do not know of that"] if self.pulled else []
-        return Report(
-            source=source,
-            motion=tuple(
-                MotionReport(
-                    entry.name,
-                    entry.asked,
-                    entry.motion.planned(),
-                    measure(trajectory, first=first, last=last),
-                    entry.motion.reached(trajectory, first, last),
-                    tuple(entry.motion.notes()),
-                )
-                for entry, (first, last) in zip(begun, spans, strict=True)
-            ),
-            audit=audit(trajectory, energy=books, newton_unconverged=sum(not one.converged for one in reports)),
-            energy=EnergySums.of(books),
-            qp=QpCounts.of(reports, frames),
-            timing=stage_times(reports, frames, {}),
-            cage=CageFacts(len(mesh.nodes), len(mesh.tets), mesh.min_dihedral_degrees(), creature.body.mass),
-            muscles=MuscleFacts(creature.muscles.fibre_count, creature.muscles.segment_count),
-            gaussians=GaussianCounts(
-                creature.cloud.count,
-                drawn_as.splats.count,
-                creature.geometry.left_out,
-                creature.geometry.left_out_opacity,
-            ),
-            notes=tuple(notes),
-            device=str(creature.cloud.device),
-            seed=0,
-            asked=asked,
-        )
 
 
 def _next_folder(folder: Path) -> Path:

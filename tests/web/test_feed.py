@@ -49,6 +49,16 @@ def _live(session: Session, **place: Any) -> Iterator[PageServer]:
         yield server
 
 
+@contextmanager
+def _watched(chromium: Any, session: Session, *size: int) -> Iterator[Any]:
+    """The page of a live session, which must not complain."""
+    with _live(session) as server:
+        page, complaints = opened(chromium, server.address, *size)
+        yield page
+        assert complaints == []
+        page.close()
+
+
 def _socket(server: PageServer, token: str | None = None) -> ClientConnection:
     own = f"http://127.0.0.1:{server.port}"
     address = f"ws://127.0.0.1:{server.port}/{token or server.token}/live"
@@ -183,8 +193,7 @@ def test_a_port_in_use_is_told_before_any_work(session: Session, capsys: pytest.
 
 @in_browser
 def test_a_key_makes_it_jump_and_the_take_says_so(chromium: Any, session: Session, tmp_path: Path):
-    with _live(session) as server:
-        page, complaints = opened(chromium, server.address)
+    with _watched(chromium, session) as page:
         page.keyboard.press("r")
         wait_until(page, "egs.live.state?.recording")
         page.keyboard.press("j")
@@ -197,14 +206,11 @@ def test_a_key_makes_it_jump_and_the_take_says_so(chromium: Any, session: Sessio
         report = json.loads((tmp_path / "take-1" / "report.json").read_text())
         assert [motion["name"] for motion in report["motion"]] == ["jump"]
         assert report["motion"][0]["reached"]["distance"] > 0.4
-        assert complaints == []
-        page.close()
 
 
 @in_browser
 def test_what_is_shown_goes_evenly_and_never_back(chromium: Any, session: Session):
-    with _live(session) as server:
-        page, complaints = opened(chromium, server.address)
+    with _watched(chromium, session) as page:
         page.keyboard.press(" ")
         wait_until(page, "egs.live.state?.doing === 'jump'")
         shown = page.evaluate(
@@ -221,15 +227,12 @@ def test_what_is_shown_goes_evenly_and_never_back(chromium: Any, session: Sessio
         # A frame of the solver is shown in more than one picture where the solver is slower than the screen.
         assert np.diff(shown).max() < 0.1
         assert "stand" in page.text_content(".pace") or "jump" in page.text_content(".pace")
-        assert complaints == []
-        page.close()
 
 
 @pytest.mark.slow
 @in_browser
 def test_a_click_on_the_ground_sends_it_there(chromium: Any, session: Session):
-    with _live(session) as server:
-        page, complaints = opened(chromium, server.address, 640, 480)
+    with _watched(chromium, session, 640, 480) as page:
         box = page.locator("canvas.view").bounding_box()
         page.mouse.click(box["x"] + 400, box["y"] + 300)
         wait_until(page, "egs.live.state?.goal")
@@ -241,14 +244,11 @@ def test_a_click_on_the_ground_sends_it_there(chromium: Any, session: Session):
         place = session.steering.place
         feet = sole_shares(place.body, place.ground, place.standing) @ session.state.positions
         assert np.linalg.norm(feet[:2] - goal) < 0.15
-        assert complaints == []
-        page.close()
 
 
 @in_browser
 def test_a_drag_pulls_at_it(chromium: Any, session: Session):
-    with _live(session) as server:
-        page, complaints = opened(chromium, server.address)
+    with _watched(chromium, session) as page:
         before = page.evaluate("egs.stages[0].middle.toArray()")
         camera = page.evaluate("egs.stages[0].camera.position.toArray()")
         seen = page.evaluate(
@@ -269,14 +269,11 @@ def test_a_drag_pulls_at_it(chromium: Any, session: Session):
         # The camera has gone along with it, and was not turned.
         moved = np.subtract(page.evaluate("egs.stages[0].camera.position.toArray()"), camera)
         assert np.linalg.norm(moved) < 0.5
-        assert complaints == []
-        page.close()
 
 
 @in_browser
 def test_pause_step_sliders_and_script(chromium: Any, session: Session):
-    with _live(session) as server:
-        page, complaints = opened(chromium, server.address)
+    with _watched(chromium, session) as page:
         page.keyboard.press("p")
         wait_until(page, "egs.live.state?.paused && document.querySelector('.pace').textContent === 'paused'")
         time.sleep(0.2)
@@ -297,8 +294,6 @@ def test_pause_step_sliders_and_script(chromium: Any, session: Session):
             page.click("[title^='Save what it did']")
         assert script.value.suggested_filename == "script.json"
         assert json.loads(Path(script.value.path()).read_text())[0]["motion"] == "jump"
-        assert complaints == []
-        page.close()
 
 
 @in_browser
@@ -338,8 +333,7 @@ def test_a_second_page_is_told_in_one_line(chromium: Any, session: Session):
 
 @in_browser
 def test_a_phone_has_all_controls_within_reach(chromium: Any, session: Session):
-    with _live(session) as server:
-        page, complaints = opened(chromium, server.address, 360, 740)
+    with _watched(chromium, session, 360, 740) as page:
         assert page.evaluate("document.documentElement.scrollWidth") <= 360
         page.click("[title^=Keys]")
         for part in (".dock", "#left", "#forward", "#jump", "[title^='Record a take']", "[title^=Keys]", ".keys"):
@@ -347,5 +341,3 @@ def test_a_phone_has_all_controls_within_reach(chromium: Any, session: Session):
             assert box["x"] >= 0 and box["x"] + box["width"] <= 360 and box["y"] + box["height"] <= 740, part
         page.locator("#jump").tap() if page.evaluate("navigator.maxTouchPoints") else page.click("#jump")
         wait_until(page, "egs.live.state?.doing === 'jump'")
-        assert complaints == []
-        page.close()

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from egs_warp.pipelines.creature import changed_creature
 from egs_warp.web.messages import Pause, Perform, Step, read_message
 from egs_warp.web.packets import Frame
-from egs_warp.web.session import Session, changed_creature
+from egs_warp.web.session import Session
 from tests.support.lives import Played, coarse_pawn, session_of
 
 
