@@ -128,6 +128,7 @@ class LocomotionStepper:
         self.speed_scale = float(np.sqrt(np.linalg.norm(body.gravity) * body.height))
         self._columns = MuscleColumns(muscles, device=device or "cpu")
         self._factors = SparseFactors(body.assembly.upper_pattern)
+        self._horizon_factors = SparseFactors(body.assembly.upper_pattern)
         self.solver = CoupledSolver(
             self.detector,
             self.points,
@@ -299,7 +300,7 @@ class LocomotionStepper:
         previous = self.synergies.mean(activations / self.muscles.bounds)
         cost = (
             objectives_cost(problem, linear, objectives, self.speed_scale)
-            + effort_cost(problem, linear, foreseen.ravel())
+            + effort_cost(problem, linear, foreseen.ravel(), self._horizon_factors)
             + self._activation_cost(problem.dt, previous, linear.columns.shape[1])
         )
         rows = np.hstack([contacts.frame @ solved[:, :-1], weight * response.delassus]) / self.speed_scale

@@ -331,9 +331,11 @@ class Jump:
         if np.abs(rate).max() > 5.0 / self._time_unit:
             rate = np.zeros((3, 3))
         self._last_pose = pose
+        # What comes down is to be stopped by the ground: asked for free fall, muscles would pull the feet away.
+        falling = self.phase is JumpPhase.FLIGHT and float(com_velocity[2]) < 0.0
         follow, weights = 6.0 / self._time_unit, self.weights
-        if self.phase is JumpPhase.LAND:
-            share = weights.landing + (1.0 - weights.landing) * self._landed_share(state.time + dt)
+        if self.phase is JumpPhase.LAND or falling:
+            share = 0.0 if falling else weights.landing + (1.0 - weights.landing) * self._landed_share(state.time + dt)
             weights = replace(weights, com=share * weights.com, up=share * weights.up, spin=share * weights.spin)
         if left is not None:
             follow, weights = min(IN_TIME / left, follow), replace(weights, pose=self._airborne_weight)
