@@ -120,18 +120,21 @@ def search_pieces(
 ) -> PieceSearch:
     """From the piece of ``modes``, which holds ``start`` (m + 3n,), onward as long as the objective falls.
 
-    Neighbouring pieces share the point between them, so no step is lost on an infeasible one.
+    Neighbouring pieces share the point between them, so no step is lost on an infeasible one. What slides in ``modes``
+    is held at first: feet that slide apart under a load each resist only where they came from, and no way leads from
+    there to a common push.
     """
     best: PieceSolution | None = None
     count = infeasible = 0
+    sliding, modes = modes, ContactModes(np.where(modes.kind == SLIDE, STICK, modes.kind), modes.slip)
     while count < qp_limit:
         count += 1
         solution = solve_piece(program, start, modes, solver)
         if solution is None:
             infeasible += 1
-            if best is not None or (modes.kind != SLIDE).all():
+            if best is not None or infeasible > 1 or (sliding.kind != SLIDE).all():
                 break
-            modes = ContactModes(np.where(modes.kind == SLIDE, STICK, modes.kind), modes.slip)
+            modes = sliding
             continue
         if best is not None and solution.objective >= best.objective:
             # Together the contacts went too far; the one that is pushed most may still gain.

@@ -15,7 +15,7 @@ from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.objectives import Objective, SpinObjective
 
-EFFORT = 2.0
+EFFORT = 1.0
 """Cost of m g H of elastic and damping energy."""
 HORIZON = 0.16
 """Of sqrt(H / g): how far ahead that energy is foreseen. One step ahead, a body that holds itself bent gains next to

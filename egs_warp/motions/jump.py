@@ -43,6 +43,7 @@ LONGEST_LANDING = 9.0
 """Of sqrt(H / g): a body that is not calm by then counts as at rest."""
 TOUCHING_DOWN = 0.5
 """Of sqrt(H / g): the time from touch-down until balance and upright are asked for in full."""
+LANDED_LEAN_FREE = 0.7
 BLEND = 0.3
 """Of sqrt(H / g): the time in which a phase's pose takes over from the last one's."""
 
@@ -201,7 +202,8 @@ class Jump:
             position, velocity = self.plan.crouch(self._start_com, elapsed)
         velocity = self._following(seen, position, velocity, dt)
         pose = self.pose.over_base(position, self._start_base)
-        return self._write(state, velocity, pose, self._upright(state, pose), dt)
+        velocity, spin = self.pose.balanced(state, seen, velocity, self._upright(state, pose), dt)
+        return self._write(state, velocity, pose, spin, dt)
 
     def _thrust(
         self, state: BodyState, seen: Measurement, elapsed: float, dt: float
@@ -221,15 +223,17 @@ class Jump:
         short = self._asked - seen.velocity[:2] if self._asked is not None else np.zeros(2)
         most = np.linalg.norm(change)
         short *= min(1.0, most / max(float(np.linalg.norm(short)), 1e-12))
-        velocity = self._balanced(seen, np.array([*(seen.velocity[:2] + change + short), up]), dt)
-        self._asked = velocity[:2]
-        upright = self.pose.over_base(landing, self._base_of_landing(), self.facing.turned)
+        velocity = np.array([*(seen.velocity[:2] + change + short), up])
+        flat = self._base_of_landing() - LANDED_LEAN_FREE * np.array([self.plan.landing_lag, 0.0])
+        upright = self.pose.over_base(landing, flat, self.facing.turned)
         # From what keeps it upright to what brings it to the landing's tilt by then.
         share = min(elapsed / plan.thrust_time, 1.0)
         tilt = share * self.pose.turn_towards(state, upright) / plan.flight_time
         standing = self.pose.over_base(position, self._start_base, self.facing.turned)
         tilt = tilt + (1.0 - share) * self._upright(state, standing)
         spin = self.facing.thrust_spin(tilt, state, self.ground.axes[2], plan.flight_time)
+        velocity, spin = self.pose.balanced(state, seen, velocity, spin, dt)
+        self._asked = velocity[:2]
         return self._write(state, velocity, standing, spin, dt)
 
     def _fly(self, state: BodyState, seen: Measurement, dt: float) -> list[Objective | SpinObjective]:
@@ -248,14 +252,13 @@ class Jump:
         goal = np.array([*(seen.base - self.pose.base_offset), self._start_com[2]])
         acceleration = rate**2 * (goal - seen.com) - 2.0 * rate * seen.velocity
         acceleration[2] = max(acceleration[2], -0.8 * self.gravity)
-        # Sideways the capture point com + v sqrt(h/g) is steered to its place over the base.
-        pendulum = self.gravity / seen.com[2]
-        capture = seen.com[:2] + seen.velocity[:2] / np.sqrt(pendulum)
-        acceleration[:2] = -2.0 * pendulum * (capture - goal[:2]) + pendulum * (seen.com[:2] - goal[:2])
-        velocity = self._balanced(seen, seen.velocity + dt * acceleration, dt)
+        acceleration[:2] = self.pose.caught(seen, goal[:2])
+        velocity = seen.velocity + dt * acceleration
         heading = self.facing.landed_heading(self.pose, state.positions)
         pose = self.pose.over_base(seen.com + dt * velocity, seen.base, heading)
-        return self._write(state, velocity, pose, self._landed_share(state.time + dt) * self._upright(state, pose), dt)
+        upright = self._landed_share(state.time + dt) * self._upright(state, pose)
+        velocity, spin = self.pose.balanced(state, seen, velocity, upright, dt)
+        return self._write(state, velocity, pose, spin, dt)
 
     def _landed_share(self, time: float) -> float:
         """How much is asked for at ``time`` s of what a standing body is asked for."""
@@ -263,15 +266,9 @@ class Jump:
         return share * share * (3.0 - 2.0 * share)
 
     def _following(self, seen: Measurement, position: np.ndarray, velocity: np.ndarray, dt: float) -> np.ndarray:
-        """(3,) m/s that follows a reference ``position`` (3,) with its ``velocity`` (3,) as well as the feet can."""
+        """(3,) m/s that follows a reference ``position`` (3,) with its ``velocity`` (3,)."""
         rate = 6.0 / self._time_unit
-        return self._balanced(seen, velocity + rate * (position - velocity * dt - seen.com), dt)
-
-    def _balanced(self, seen: Measurement, velocity: np.ndarray, dt: float) -> np.ndarray:
-        """``velocity`` (3,) with its horizontal change kept within what the feet can give."""
-        acceleration = (velocity - seen.velocity) / dt
-        level = self.pose.balanced_acceleration(seen, acceleration[:2], float(acceleration[2]), self.gravity)
-        return np.array([*(seen.velocity[:2] + dt * level), velocity[2]])
+        return velocity + rate * (position - velocity * dt - seen.com)
 
     def _upright(self, state: BodyState, pose: np.ndarray) -> np.ndarray:
         """(3,) rad/s that turns a standing body to ``pose`` (3, 3)."""

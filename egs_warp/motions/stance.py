@@ -20,6 +20,8 @@ CALM = 0.03
 """Speed of the centre of mass, in sqrt(g H), below which a standing body is calm."""
 CALM_TIME = 0.3
 """Of sqrt(H / g): for how long a body is calm before it is at rest."""
+MARGIN = 0.8
+"""Of the footprint: where the centre of pressure may be."""
 GRIP = 0.95
 """Of what friction could give at most: asked for more, feet slide, and what else is asked falls short."""
 
@@ -37,7 +39,7 @@ class Weights:
     """Of the centre of mass, up."""
     spin: float = 300.0
     pose: float = 0.02
-    airborne: float = 0.5
+    airborne: float = 2.0
     """Of the pose in the air, where nothing else can be steered and the feet have to get to their place. It crumples a
     body if it is large, and one so slender that it was made stiffer to stand (``SoftBody.stiffening``) buckles under
     less, by the square."""
@@ -63,6 +65,9 @@ class Measurement:
     """Normal contact forces, body weights."""
     heading: float
     """Radians about z, from the start."""
+    swing: np.ndarray
+    """(2,) m/s: what the spin about the centre of mass adds to its speed along the ground in the momentum about the
+    feet."""
 
 
 @dataclass(frozen=True)
@@ -141,26 +146,63 @@ class PoseFamily:
         self.support_low = np.minimum(footprint.min(axis=0), -0.01 * body.height)
         self.support_high = np.maximum(footprint.max(axis=0), 0.01 * body.height)
 
-    def balanced_acceleration(
-        self, seen: Measurement, wanted: np.ndarray, up: float, gravity: float, *, margin: float = 0.8
-    ) -> np.ndarray:
-        """(2,) the horizontal acceleration nearest to ``wanted`` (2,) m/s^2 that the feet can give without tipping the
-        body or sliding.
+    def balanced(
+        self, state: BodyState, seen: Measurement, velocity: np.ndarray, spin: np.ndarray, dt: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The end velocity (3,) m/s of the centre of mass, ground axes, and spin (3,) rad/s, world axes, nearest to
+        those asked for that feet can bring about without tipping or sliding.
 
-        The centre of pressure com - h a / (g + ``up``) stays within ``margin`` of the footprint (linear inverted
-        pendulum).
+        About the feet the momentum m h (v + swing) changes by the weight times the way from the centre of pressure to
+        the centre of mass, so that centre, kept within the footprint, bounds the sum of both; friction bounds the one.
         """
-        grip = GRIP * self.friction * max(gravity + up, 0.2 * gravity)
-        wanted = wanted * min(1.0, grip / max(float(np.linalg.norm(wanted)), 1e-12))
-        lever = max(seen.com[2], 0.3 * self.standing_height) / max(gravity + up, 0.2 * gravity)
-        pressure = seen.com[:2] - lever * wanted
+        gravity = float(np.linalg.norm(self.body.gravity))
+        up = max(gravity + (velocity[2] - seen.velocity[2]) / dt, 0.2 * gravity)
+        height = self._lever(seen.com)
+        level = velocity[:2] - seen.velocity[:2]
+        inertia = self.body.inertia(state.positions)
+        turn = self._swing(inertia @ spin, height) - seen.swing
+
+        def within_grip(change: np.ndarray) -> np.ndarray:
+            return change * min(1.0, GRIP * self.friction * up * dt / max(float(np.linalg.norm(change)), 1e-12))
+
+        level = within_grip(level)
+        pressure = seen.com[:2] - height / up * (level + turn) / dt
         place = seen.base - self.base_offset
         # Never ask for a fall: some push either way stays allowed even where the centre of mass is past the edge.
         slack = 0.04 * self.body.height
-        low = np.minimum(place + margin * self.support_low, seen.com[:2] - slack)
-        high = np.maximum(place + margin * self.support_high, seen.com[:2] + slack)
-        pressure = np.clip(pressure, low, high)
-        return (seen.com[:2] - pressure) / lever
+        low = np.minimum(place + MARGIN * self.support_low, seen.com[:2] - slack)
+        high = np.maximum(place + MARGIN * self.support_high, seen.com[:2] + slack)
+        missing = (seen.com[:2] - np.clip(pressure, low, high)) * up / height * dt - (level + turn)
+        # Each gives way as its objective weighs it: speeds as they are, spins with the radius of gyration.
+        share = 1.0 / (1.0 + 0.5 * np.trace(inertia) / (self.body.mass * height**2))
+        level = within_grip(level + share * missing)
+        turn = turn + (1.0 - share) * missing
+        swing = seen.swing + turn
+        momentum = self.ground.axes @ inertia @ spin
+        momentum[:2] = self.body.mass * height * np.array([-swing[1], swing[0]])
+        return (
+            np.array([*(seen.velocity[:2] + level), velocity[2]]),
+            np.linalg.solve(inertia, self.ground.axes.T @ momentum),
+        )
+
+    def caught(self, seen: Measurement, goal: np.ndarray) -> np.ndarray:
+        """(2,) m/s^2 along the ground that brings a body that falls like a pendulum to rest over ``goal`` (2,).
+
+        The capture point, of the momentum about the feet, is steered to it.
+        """
+        gravity = float(np.linalg.norm(self.body.gravity))
+        pendulum = gravity / self._lever(seen.com)
+        capture = seen.com[:2] + (seen.velocity[:2] + seen.swing) / np.sqrt(pendulum)
+        return -2.0 * pendulum * (capture - goal) + pendulum * (seen.com[:2] - goal)
+
+    def _lever(self, com: np.ndarray) -> float:
+        """Metres: height of the centre of mass ``com`` (3,), ground coordinates, over the feet."""
+        return max(float(com[2]), 0.3 * self.standing_height)
+
+    def _swing(self, momentum: np.ndarray, height: float) -> np.ndarray:
+        """(2,) of ``Measurement``, of an angular ``momentum`` (3,), world axes."""
+        turning = self.ground.axes @ momentum / (self.body.mass * height)
+        return np.array([turning[1], -turning[0]])
 
     def _base(self, local: np.ndarray) -> np.ndarray:
         return (self._sole_share @ local)[:2]
@@ -170,14 +212,17 @@ class PoseFamily:
         local = self.ground.local(state.positions)
         forces = report.forces[:, 0].sum() if report is not None else self.body.weight
         turn = self.ground.axes @ self.rotation(state.positions) @ self.ground.axes.T
+        com = self.body.centre_of_mass(local)
+        momentum = self.body.angular_momentum(state.positions, state.velocities)
         return Measurement(
-            com=self.body.centre_of_mass(local),
+            com=com,
             velocity=self.ground.axes @ self.body.centre_of_mass(state.velocities),
             base=self._base(local),
             sole_height=report.min_gap if report is not None else 0.0,
             touching=bool(forces > 1e-6 * self.body.weight),
             load=float(forces / self.body.weight),
             heading=float(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])),
+            swing=self._swing(momentum, self._lever(com)),
         )
 
     def rotation(self, positions: np.ndarray) -> np.ndarray:
