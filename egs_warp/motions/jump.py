@@ -255,7 +255,8 @@ class Jump:
         acceleration[:2] = self.pose.caught(seen, goal[:2])
         velocity = seen.velocity + dt * acceleration
         heading = self.facing.landed_heading(self.pose, state.positions)
-        pose = self.pose.over_base(seen.com + dt * velocity, seen.base, heading)
+        # Upright, wherever the centre of mass is now: a body that leans with it is never called back.
+        pose = self.pose.over_base(np.array([*goal[:2], seen.com[2] + dt * velocity[2]]), seen.base, heading)
         upright = self._landed_share(state.time + dt) * self._upright(state, pose)
         velocity, spin = self.pose.balanced(state, seen, velocity, upright, dt)
         return self._write(state, velocity, pose, spin, dt)

@@ -8,13 +8,14 @@ import numpy as np
 
 CARRIED = 2.0
 """Speed ahead at the end of a crouch, in leans over its time: 2 is a steady acceleration, 0 a stop."""
-LEAN = 0.2
+LEAN = 0.15
 """Of the distance: how far the weight is put ahead before take-off. With it over the middle of the feet a push forward
 would turn the body backward."""
 FURTHEST_LEAN = 0.35
 """Of the way from under the centre of mass to the front of the feet."""
 DEEPEST_CROUCH = 0.26
 """Of the height of the centre of mass, deeper ones crush elements to a fifth; a higher jump thrusts harder instead."""
+PUSH = 2.4
 ONSET, RAMP = 0.3, 0.4
 """Share of its full strength with which a thrust begins, where the crouch has left it, and share of its time until it
 is reached.
@@ -128,7 +129,7 @@ def plan_jump(
     extension = min(0.04 * height, 0.25 * target.height)
     rise = target.height - extension
     speed_up = np.sqrt(2.0 * gravity * rise) + 0.5 * gravity * step
-    acceleration = 1.6 * gravity
+    acceleration = PUSH * gravity
     stroke = max(speed_up**2 / (2.0 * acceleration), extension + 0.02 * height)
     # Every step goes its whole way at the speed of its end: half a step's way more than the thrust itself.
     stroke += 0.5 * speed_up * step
