@@ -29,6 +29,8 @@ _FASTEST = 7.0
 """Bounds of activations, in their bounds a sqrt(H / g): how fast a muscle is switched on and off."""
 _REGULAR = 1e-7
 _MOST_HALVINGS = 4
+_LOOKS = 2
+"""Newton steps in which a step is foreseen: the first starts from afar."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class LocomotionSettings:
     """A point takes part if the step may bring it this near to a plane."""
     penetration_tolerance: float = 5e-3
     push_out_cap: float = 0.05
-    qp_limit: int = 3
+    qp_limit: int = 6
     """QPs a step at most; in doubt ``strategies.PATIENCE`` times as many for all strategies but ``pieces``."""
     qp_solver: QpSolver | str = QpSolver.OSQP
     strategy: Strategy | str = Strategy.PIECES
@@ -229,16 +231,18 @@ class LocomotionStepper:
         """Response of the contacts; velocities (N, 3) and contact forces (n, 3) that last step's activations would
         bring.
         """
-        start = problem.start
-        tangent = problem.tangent(self._factors, start, tension)
-        response = ContactResponse.of(tangent, contacts)
-        free = start.ravel() - tangent.solve(problem.residual(start, tension).ravel())
+        velocities, known = problem.start, self.points.matched(contacts.points, memory.points, memory.forces)
         shift = self.solver.shift(contacts, problem.dt)
-        forces = response.forces(
-            free, shift, self.geometry.friction, self.points.matched(contacts.points, memory.points, memory.forces)
-        )
-        foreseen = (free + response.columns @ forces.ravel()).reshape(start.shape)
-        return response, foreseen if problem.feasible(foreseen) else start, forces
+        for _ in range(_LOOKS):
+            tangent = problem.tangent(self._factors, velocities, tension)
+            response = ContactResponse.of(tangent, contacts)
+            free = velocities.ravel() - tangent.solve(problem.residual(velocities, tension).ravel())
+            forces = response.forces(free, shift, self.geometry.friction, known)
+            ahead = (free + response.columns @ forces.ravel()).reshape(velocities.shape)
+            if not problem.feasible(ahead):
+                break
+            velocities, known = ahead, forces
+        return response, velocities, forces
 
     def _program(
         self,
