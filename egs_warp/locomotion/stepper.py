@@ -29,7 +29,7 @@ _FASTEST = 7.0
 """Bounds of activations, in their bounds a sqrt(H / g): how fast a muscle is switched on and off."""
 _REGULAR = 1e-7
 _MOST_HALVINGS = 4
-_LOOKS = 2
+_LOOKS = 3
 """Newton steps in which a step is foreseen: the first starts from afar."""
 
 
