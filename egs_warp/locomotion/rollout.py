@@ -19,6 +19,7 @@ from egs_warp.locomotion.trajectory import Trajectory
 
 FRAME_RATE = 60
 """Frames of a video, 1/s."""
+_STEPS_A_UNIT = 19.0
 REST_FRAMES = 20
 """Frames shown after the last motion has come to rest."""
 
@@ -41,10 +42,14 @@ class Simulation:
     """(n,) index into the trajectory's times for each frame of the video."""
 
 
-def steps_per_frame(body: SoftBody) -> int:
-    """Solver steps a frame, so that a step is at most sqrt(H / g) / 19 (docs/concepts/conventions.md)."""
-    longest = np.sqrt(body.height / np.linalg.norm(body.gravity)) / 19.0
-    return int(np.ceil(1.0 / (FRAME_RATE * longest) - 1e-3))
+def solver_steps(body: SoftBody, step: float | None = None) -> tuple[float, int]:
+    """Seconds of a solver step, and how many make a frame: steps of at most ``step`` seconds and of sqrt(H / g) / 19,
+    within which a body can be steered (docs/concepts/conventions.md). A frame is as long as a ``step`` that is longer.
+    """
+    longest = float(np.sqrt(body.height / np.linalg.norm(body.gravity))) / _STEPS_A_UNIT
+    frame = max(1.0 / FRAME_RATE, step or 0.0)
+    count = int(np.ceil(frame / min(longest, step or longest) - 1e-3))
+    return frame / count, count
 
 
 def settle(stepper: LocomotionStepper) -> BodyState:
@@ -84,12 +89,10 @@ def roll_out(
 ) -> Simulation:
     """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``.
 
-    ``step``: seconds of a solver step, if not the usual (docs/concepts/conventions.md); one longer than a
-    frame makes the frame as long. ``place`` is where the body lies in its capture; steps are written into the folder
+    ``step``: seconds that a solver step takes at most, see ``solver_steps``. ``place`` is where the body lies in its capture; steps are written into the folder
     that ``parts`` tells as they are done (``Recorder``). ``progress`` is told each frame done.
     """
-    per_frame = steps_per_frame(stepper.body) if step is None else max(round(1.0 / (FRAME_RATE * step)), 1)
-    dt = step or 1.0 / (FRAME_RATE * per_frame)
+    dt, per_frame = solver_steps(stepper.body, step)
     state, memory = start, stepper.initial_memory()
     reports: list[StepReport] = []
     shown = [0]

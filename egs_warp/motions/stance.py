@@ -33,11 +33,11 @@ class Weights:
     What is asked for is what happens, since contact forces come as they are planned: balance goes before effort.
     """
 
-    com: float = 300.0
+    com: float = 1000.0
     """Of the centre of mass, along the ground."""
-    up: float = 300.0
+    up: float = 600.0
     """Of the centre of mass, up."""
-    spin: float = 300.0
+    spin: float = 600.0
     pose: float = 0.02
     airborne: float = 2.0
     """Of the pose in the air, where nothing else can be steered and the feet have to get to their place. It crumples a
