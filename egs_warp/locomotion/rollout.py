@@ -14,12 +14,11 @@ from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.locomotion.objectives import Objective, SpinObjective
 from egs_warp.locomotion.recorder import Recorder
-from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
+from egs_warp.locomotion.stepper import STEPS_A_UNIT, LocomotionStepper, StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 
 FRAME_RATE = 60
 """Frames of a video, 1/s."""
-_STEPS_A_UNIT = 19.0
 REST_FRAMES = 20
 """Frames shown after the last motion has come to rest."""
 
@@ -46,7 +45,7 @@ def solver_steps(body: SoftBody, step: float | None = None) -> tuple[float, int]
     """Seconds of a solver step, and how many make a frame: steps of at most ``step`` seconds and of sqrt(H / g) / 19,
     within which a body can be steered (docs/concepts/conventions.md). A frame is as long as a ``step`` that is longer.
     """
-    longest = float(np.sqrt(body.height / np.linalg.norm(body.gravity))) / _STEPS_A_UNIT
+    longest = float(np.sqrt(body.height / np.linalg.norm(body.gravity))) / STEPS_A_UNIT
     frame = max(1.0 / FRAME_RATE, step or 0.0)
     count = int(np.ceil(frame / min(longest, step or longest) - 1e-3))
     return frame / count, count

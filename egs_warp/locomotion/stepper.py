@@ -24,7 +24,8 @@ from egs_warp.muscles.muscle_set import MuscleColumns, MuscleSet
 from egs_warp.muscles.tension import MuscleTension
 
 _ORDINARY_STRENGTH = 4.0
-_STEPS_A_UNIT = 19.0
+STEPS_A_UNIT = 19.0
+"""Least number of steps in sqrt(H / g) within which a body can be steered."""
 _FASTEST = 7.0
 """Bounds of activations, in their bounds a sqrt(H / g): how fast a muscle is switched on and off."""
 _REGULAR = 1e-7
@@ -139,7 +140,7 @@ class LocomotionStepper:
             penetration_tolerance=self.settings.penetration_tolerance * body.height,
         )
         rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
-        problem = StepProblem(body, rest, self.time_unit / _STEPS_A_UNIT)
+        problem = StepProblem(body, rest, self.time_unit / STEPS_A_UNIT)
         tangent = problem.tangent(self._factors, rest.velocities, None)
         full = self._columns.sparse(rest.positions).toarray() * muscles.bounds
         self.synergies = find_synergies(muscles, tangent.solve(full), body.node_mass)
@@ -322,7 +323,7 @@ class LocomotionStepper:
         """Of ``count`` unknowns that begin with the activations, how large they are and how they change from
         ``previous`` (m,)."""
         settings, members = self.settings, self.synergies.members
-        share = dt * _STEPS_A_UNIT / self.time_unit
+        share = dt * STEPS_A_UNIT / self.time_unit
         strength = self.muscles.max_forces / (_ORDINARY_STRENGTH * self.body.weight)
         size = settings.activation_weight * share**2 * (members.T @ strength)
         change = settings.activation_change_weight * share * (members.T @ strength**2)

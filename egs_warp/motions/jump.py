@@ -43,7 +43,10 @@ LONGEST_LANDING = 9.0
 """Of sqrt(H / g): a body that is not calm by then counts as at rest."""
 TOUCHING_DOWN = 0.5
 """Of sqrt(H / g): the time from touch-down until balance and upright are asked for in full."""
-LANDED_LEAN_FREE = 0.7
+FLAT = 0.7
+"""Of the lean of the landing: what the body is not to be turned by at touch-down. It shears by so much less than its
+feet are ahead, and on its heels it would be thrown over them.
+"""
 BLEND = 0.3
 """Of sqrt(H / g): the time in which a phase's pose takes over from the last one's."""
 
@@ -224,7 +227,7 @@ class Jump:
         most = np.linalg.norm(change)
         short *= min(1.0, most / max(float(np.linalg.norm(short)), 1e-12))
         velocity = np.array([*(seen.velocity[:2] + change + short), up])
-        flat = self._base_of_landing() - LANDED_LEAN_FREE * np.array([self.plan.landing_lag, 0.0])
+        flat = self._base_of_landing() - FLAT * np.array([self.plan.landing_lag, 0.0])
         upright = self.pose.over_base(landing, flat, self.facing.turned)
         # From what keeps it upright to what brings it to the landing's tilt by then.
         share = min(elapsed / plan.thrust_time, 1.0)

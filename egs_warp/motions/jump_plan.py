@@ -16,6 +16,8 @@ FURTHEST_LEAN = 0.35
 DEEPEST_CROUCH = 0.26
 """Of the height of the centre of mass, deeper ones crush elements to a fifth; a higher jump thrusts harder instead."""
 PUSH = 2.4
+"""Of gravity: mean acceleration of a thrust. A harder one takes a shallower crouch, which strains a stiff body less.
+"""
 ONSET, RAMP = 0.3, 0.4
 """Share of its full strength with which a thrust begins, where the crouch has left it, and share of its time until it
 is reached.
