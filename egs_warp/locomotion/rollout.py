@@ -88,8 +88,9 @@ def roll_out(
 ) -> Simulation:
     """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``.
 
-    ``step``: seconds that a solver step takes at most, see ``solver_steps``. ``place`` is where the body lies in its capture; steps are written into the folder
-    that ``parts`` tells as they are done (``Recorder``). ``progress`` is told each frame done.
+    ``step``: seconds that a solver step takes at most, see ``solver_steps``. ``place`` is where the body lies in its
+    capture; steps are written into the folder that ``parts`` tells as they are done (``Recorder``). ``progress`` is
+    told each frame done.
     """
     dt, per_frame = solver_steps(stepper.body, step)
     state, memory = start, stepper.initial_memory()

@@ -20,7 +20,7 @@ CALM = 0.03
 """Speed of the centre of mass, in sqrt(g H), below which a standing body is calm."""
 CALM_TIME = 0.3
 """Of sqrt(H / g): for how long a body is calm before it is at rest."""
-MARGIN = 0.8
+MARGIN = 0.95
 """Of the footprint: where the centre of pressure may be."""
 GRIP = 0.95
 """Of what friction could give at most: asked for more, feet slide, and what else is asked falls short."""
@@ -33,7 +33,7 @@ class Weights:
     What is asked for is what happens, since contact forces come as they are planned: balance goes before effort.
     """
 
-    com: float = 1000.0
+    com: float = 600.0
     """Of the centre of mass, along the ground."""
     up: float = 600.0
     """Of the centre of mass, up."""
