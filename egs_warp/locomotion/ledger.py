@@ -258,11 +258,12 @@ class _Elements:
         )
 
     def _remainder(self, change: np.ndarray, relative: np.ndarray, log_j: np.ndarray) -> np.ndarray:
-        """(T,) Psi(F0) - Psi(F1) + P(F1) : (F1 - F0), from the ``change`` F1 - F0 (T, 3, 3) alone.
+        """(T,) Psi(F0) - Psi(F1) + P(F1) : (F1 - F0), from the ``change`` F1 - F0 (T, 3, 3) and ln det F1.
 
         ``relative`` is A = F1^-1 (F1 - F0), so det F0 = det F1 det(I - A), however far the step goes.
         """
-        fallen = np.log(np.linalg.det(np.eye(3) - relative))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            fallen = np.log(np.linalg.det(np.eye(3) - relative))
         curved = fallen + _trace(relative)  # -tr(A A) / 2 of a small step
         squares = self.mu * (change * change).sum(axis=(1, 2)) + self.lam * fallen**2
         return 0.5 * squares + (self.lam * log_j - self.mu) * curved

@@ -97,6 +97,28 @@ def test_stored_energies_are_those_of_the_body(trajectory: Trajectory, books: Le
     assert books.stored == pytest.approx(theirs, rel=1e-10)
 
 
+@pytest.mark.parametrize("crushed", [0.5, 0.02, 1e-4])
+def test_what_a_step_loses_holds_for_crushed_elements(crushed: float) -> None:
+    """Psi(F0) - Psi(F1) + P(F1) : (F1 - F0) with energy and stress of one element written out (Eq. 5), also where the
+    straight way between the two would invert it."""
+    mu, lam = 3.0, 7.0
+    element = module._Elements(np.zeros((1, 4), int), np.eye(3)[None], np.ones(1), mu, lam, 0.0)
+    turn = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+    before, after = np.diag([1.1, 0.9, 1.0]), np.diag([1.0, 1.0, crushed])
+
+    def energy(F: np.ndarray) -> float:
+        log_j = np.log(np.linalg.det(F))
+        return 0.5 * mu * ((F * F).sum() - 3.0) - mu * log_j + 0.5 * lam * log_j**2
+
+    for start in (before, turn @ before):
+        log_j = np.log(np.linalg.det(after))
+        stress = mu * after + (lam * log_j - mu) * np.linalg.inv(after).T
+        expected = energy(start) - energy(after) + (stress * (after - start)).sum()
+        change = (after - start)[None]
+        got = element._remainder(change, np.linalg.inv(after)[None] @ change, np.array([log_j]))
+        assert got[0] == pytest.approx(expected, rel=1e-9)
+
+
 def test_it_shares_no_code_with_the_solver() -> None:
     """It imports NumPy and the record that it reads; that record imports nothing of bodies, muscles or contact."""
     for path in (Path(module.__file__), Path(module.__file__).with_name("audit.py")):

@@ -291,8 +291,8 @@ BESIDE_THE_PAPER: list[Mutation] = [
             "locomotion/test_ledger.py::test_every_step_closes",
         ),
         (
-            *("ledger: the curvature of the elastic energy", "locomotion/ledger.py"),
-            *("(self.mu - self.lam * along) * bend", "(self.mu + self.lam * along) * bend"),
+            *("ledger: what a step loses of the elastic energy", "locomotion/ledger.py"),
+            *("(self.lam * log_j - self.mu) * curved", "(self.lam * log_j + self.mu) * curved"),
             "locomotion/test_ledger.py::test_every_step_closes",
         ),
         (
