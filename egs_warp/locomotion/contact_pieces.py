@@ -17,6 +17,7 @@ _FACES = 8
 """Of the pyramid that stands in for the friction cone of a contact that sticks."""
 _SINGULAR = 1e-7
 """Of the mean of the operator's diagonal: more points than the cage can resolve leave it singular."""
+_WEDGE = np.radians(45.0)
 _SLOWEST = 1e-9
 """Of sqrt(g H): tangential velocity without a direction."""
 _ACTIVE = 1e-3
@@ -219,19 +220,22 @@ def _bounds(
     narrow = friction * np.cos(np.pi / _FACES)
     for c, s in zip(np.cos(angle), np.sin(angle), strict=True):
 
-        def side(value: np.ndarray, c: float = c, s: float = s) -> np.ndarray:
+        def facet(value: np.ndarray, c: float = c, s: float = s) -> np.ndarray:
             return narrow * value[3 * stick] - c * value[3 * stick + 1] - s * value[3 * stick + 2]
 
-        parts.append((side(slope), side(offset), stick, _SLIPS))
+        parts.append((facet(slope), facet(offset), stick, _SLIPS))
     d = modes.slip[slide]
-    parts.append(
-        (
-            d[:, :1] * speed[3 * slide + 1] + d[:, 1:] * speed[3 * slide + 2],
-            d[:, 0] * speed_offset[3 * slide + 1] + d[:, 1] * speed_offset[3 * slide + 2],
-            slide,
-            _STOPS,
+    # The way it slides is near the one that its friction is taken against.
+    for side in (1.0, -1.0):
+        edge = np.sin(_WEDGE) * d + side * np.cos(_WEDGE) * d[:, ::-1] * [-1.0, 1.0]
+        parts.append(
+            (
+                edge[:, :1] * speed[3 * slide + 1] + edge[:, 1:] * speed[3 * slide + 2],
+                edge[:, 0] * speed_offset[3 * slide + 1] + edge[:, 1] * speed_offset[3 * slide + 2],
+                slide,
+                _STOPS,
+            )
         )
-    )
     parts.append((speed[3 * free], speed_offset[3 * free], free, _LANDS))
     A = np.vstack([part[0] for part in parts])
     b = np.concatenate([part[1] for part in parts])
@@ -258,8 +262,6 @@ def _beyond(
             kind[i] = FREE
         elif onward[index] == _SLIPS:
             kind[i], slip[i] = SLIDE, _unit(-forces[i : i + 1, 1:])[0]
-        elif onward[index] == _STOPS:
-            kind[i] = STICK
         elif np.linalg.norm(velocities[i, 1:]) > _SLOWEST:
             kind[i], slip[i] = SLIDE, _unit(velocities[i : i + 1, 1:])[0]
         else:
