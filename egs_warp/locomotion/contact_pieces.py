@@ -17,7 +17,7 @@ _FACES = 8
 """Of the pyramid that stands in for the friction cone of a contact that sticks."""
 _SINGULAR = 1e-7
 """Of the mean of the operator's diagonal: more points than the cage can resolve leave it singular."""
-_WEDGE = np.radians(45.0)
+_WEDGE = np.radians(30.0)
 _SLOWEST = 1e-9
 """Of sqrt(g H): tangential velocity without a direction."""
 _ACTIVE = 1e-3

@@ -47,7 +47,6 @@ FLAT = 0.7
 """Of the lean of the landing: what the body is not to be turned by at touch-down. It shears by so much less than its
 feet are ahead, and on its heels it would be thrown over them.
 """
-AIRE = 0.0
 BLEND = 0.3
 """Of sqrt(H / g): the time in which a phase's pose takes over from the last one's."""
 
@@ -104,7 +103,7 @@ class Jump:
         self._start_com = body.centre_of_mass(local)
         self._start_base = self._start_com[:2] + self.pose.base_offset
         self._time_unit = float(np.sqrt(body.height / self.gravity))
-        self._airborne_weight = self.weights.airborne * body.stiffening**AIRE
+        self._airborne_weight = self.weights.airborne
         self._last_pose = self._pose_before = np.eye(3)
         self._asked: np.ndarray | None = None
         self._flew = False

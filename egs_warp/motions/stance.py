@@ -40,9 +40,7 @@ class Weights:
     spin: float = 600.0
     pose: float = 0.02
     airborne: float = 2.0
-    """Of the pose in the air, where nothing else can be steered and the feet have to get to their place. It crumples a
-    body if it is large, and one so slender that it was made stiffer to stand (``SoftBody.stiffening``) buckles under
-    less, by the square."""
+    """Of the pose in the air, where nothing else can be steered and the feet have to get to their place."""
     landing: float = 0.1
     """Share of ``com``, ``up`` and ``spin`` that is asked for at touch-down, where the ground's push comes first."""
 
