@@ -42,7 +42,7 @@ class LocomotionSettings:
     """A point takes part if the step may bring it this near to a plane."""
     penetration_tolerance: float = 5e-3
     push_out_cap: float = 0.05
-    qp_limit: int = 6
+    qp_limit: int = 12
     """QPs a step at most; in doubt ``strategies.PATIENCE`` times as many for all strategies but ``pieces``."""
     qp_solver: QpSolver | str = QpSolver.OSQP
     strategy: Strategy | str = Strategy.PIECES
