@@ -51,7 +51,7 @@ class LocomotionSettings:
     activation_weight: float = 2e-4
     """For a step of sqrt(H / g) / 19 and a muscle of 4 body weights. Shorter steps change speeds by less, so they weigh
     activations less: by the square of their share. Stronger muscles weigh more, as their force."""
-    activation_change_weight: float = 3e-4
+    activation_change_weight: float = 3e-3
     """Likewise, by the step's share, and by the square of the force: the strong muscles of a stiff body would else play
     full strokes against each other from step to step, further than the linearised program knows the way."""
     drag: float = 0.0

@@ -103,7 +103,6 @@ class Jump:
         self._start_com = body.centre_of_mass(local)
         self._start_base = self._start_com[:2] + self.pose.base_offset
         self._time_unit = float(np.sqrt(body.height / self.gravity))
-        self._airborne_weight = self.weights.airborne
         self._last_pose = self._pose_before = np.eye(3)
         self._asked: np.ndarray | None = None
         self._flew = False
@@ -336,10 +335,10 @@ class Jump:
         falling = self.phase is JumpPhase.FLIGHT and float(com_velocity[2]) < 0.0
         follow, weights = 6.0 / self._time_unit, self.weights
         if self.phase is JumpPhase.LAND or falling:
-            share = 0.0 if falling else weights.landing + (1.0 - weights.landing) * self._landed_share(state.time + dt)
+            share = 0.0 if falling else weights.landing
             weights = replace(weights, com=share * weights.com, up=share * weights.up, spin=share * weights.spin)
         if left is not None:
-            follow, weights = min(IN_TIME / left, follow), replace(weights, pose=self._airborne_weight)
+            follow, weights = min(IN_TIME / left, follow), replace(weights, pose=weights.airborne)
         return self.pose.objectives(
             state,
             com_velocity=com_velocity,

@@ -42,7 +42,8 @@ class Weights:
     airborne: float = 2.0
     """Of the pose in the air, where nothing else can be steered and the feet have to get to their place."""
     landing: float = 0.1
-    """Share of ``com``, ``up`` and ``spin`` that is asked for at touch-down, where the ground's push comes first."""
+    """Share of ``com``, ``up`` and ``spin`` that is asked for from touch-down on: what is left to do is to come to rest,
+    at no given time."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,8 @@ class Measurement:
     """Normal contact forces, body weights."""
     heading: float
     """Radians about z, from the start."""
+    support: np.ndarray
+    """(2, 2) metres: least and largest coordinates along the ground of what the body can press on now."""
     swing: np.ndarray
     """(2,) m/s: what the spin about the centre of mass adds to its speed along the ground in the momentum about the
     feet."""
@@ -165,11 +168,11 @@ class PoseFamily:
 
         level = within_grip(level)
         pressure = seen.com[:2] - height / up * (level + turn) / dt
-        place = seen.base - self.base_offset
+        middle, reach = seen.support.mean(axis=0), 0.5 * MARGIN * (seen.support[1] - seen.support[0])
         # Never ask for a fall: some push either way stays allowed even where the centre of mass is past the edge.
         slack = 0.04 * self.body.height
-        low = np.minimum(place + MARGIN * self.support_low, seen.com[:2] - slack)
-        high = np.maximum(place + MARGIN * self.support_high, seen.com[:2] + slack)
+        low = np.minimum(middle - reach, seen.com[:2] - slack)
+        high = np.maximum(middle + reach, seen.com[:2] + slack)
         missing = (seen.com[:2] - np.clip(pressure, low, high)) * up / height * dt - (level + turn)
         # Each gives way as its objective weighs it: speeds as they are, spins with the radius of gyration.
         share = 1.0 / (1.0 + 0.5 * np.trace(inertia) / (self.body.mass * height**2))
@@ -220,8 +223,17 @@ class PoseFamily:
             touching=bool(forces > 1e-6 * self.body.weight),
             load=float(forces / self.body.weight),
             heading=float(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])),
+            support=self._support(local, report),
             swing=self._swing(momentum, self._lever(com)),
         )
+
+    def _support(self, local: np.ndarray, report: StepReport | None) -> np.ndarray:
+        """(2, 2) of ``Measurement``: the whole footprint where nothing is on the ground."""
+        if report is None or report.contacts.count == 0:
+            return self._base(local) - self.base_offset + np.stack([self.support_low, self.support_high])
+        contacts = report.contacts
+        places = np.einsum("cw,cwi->ci", contacts.weights, local[contacts.nodes])[:, :2]
+        return np.stack([places.min(axis=0), places.max(axis=0)])
 
     def rotation(self, positions: np.ndarray) -> np.ndarray:
         """(3, 3) best-fit rotation from the standing pose, world axes."""
