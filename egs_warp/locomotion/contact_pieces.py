@@ -17,7 +17,6 @@ _FACES = 8
 """Of the pyramid that stands in for the friction cone of a contact that sticks."""
 _SINGULAR = 1e-7
 """Of the mean of the operator's diagonal: more points than the cage can resolve leave it singular."""
-_WEDGE = np.radians(30.0)
 _SLOWEST = 1e-9
 """Of sqrt(g H): tangential velocity without a direction."""
 _ACTIVE = 1e-3
@@ -27,10 +26,13 @@ _GAIN = 5e-3
 _BROKEN = 0.02
 """By which a start may break a row that its piece does not quite hold."""
 
+_WEDGE = np.radians(30.0)
+"""How far a contact that slides may turn from the way that its friction is taken against. Friction that stays where it
+was while a foot slides elsewhere pushes a body along that no ground would."""
 _NOTHING = 1e-9
 """Body weights: what rounding leaves of the force of a contact that is open."""
 
-_LEAVES, _SLIPS, _STOPS, _LANDS = 0, 1, 2, 3
+_LEAVES, _SLIPS, _TURNS, _LANDS = 0, 1, 2, 3
 
 FREE, STICK, SLIDE = 0, 1, 2
 
@@ -233,7 +235,7 @@ def _bounds(
                 edge[:, :1] * speed[3 * slide + 1] + edge[:, 1:] * speed[3 * slide + 2],
                 edge[:, 0] * speed_offset[3 * slide + 1] + edge[:, 1] * speed_offset[3 * slide + 2],
                 slide,
-                _STOPS,
+                _TURNS,
             )
         )
     parts.append((speed[3 * free], speed_offset[3 * free], free, _LANDS))

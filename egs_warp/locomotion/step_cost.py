@@ -70,6 +70,27 @@ def objectives_cost(
     return QuadraticCost(P, q, constant)
 
 
+def objectives_missed(
+    problem: StepProblem,
+    objectives: Sequence[Objective | SpinObjective],
+    velocities: np.ndarray,
+    torque: np.ndarray,
+    speed: float,
+) -> float:
+    """The same weighted squares of a step that ends at ``velocities`` (N, 3) under contact forces of ``torque`` (3,)
+    about the centre of mass, N m."""
+    body, state, total = problem.body, problem.state, 0.0
+    for objective in objectives:
+        if isinstance(objective, SpinObjective):
+            gyration = np.sqrt(0.5 * np.trace(problem.inertia) / body.mass)
+            momentum = body.angular_momentum(state.positions, state.velocities) + problem.dt * torque
+            gap = (momentum - objective.target) / (body.mass * gyration * speed)
+        else:
+            gap = (objective.rows @ velocities.ravel() - objective.target) / speed
+        total += objective.weight * float(gap @ gap)
+    return total
+
+
 def effort_cost(
     problem: StepProblem,
     linear: LinearStep,

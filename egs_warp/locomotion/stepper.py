@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.contact_pieces import ContactPieces
 from egs_warp.locomotion.objectives import Objective, SpinObjective
 from egs_warp.locomotion.solvers import QpSolver
-from egs_warp.locomotion.step_cost import LinearStep, QuadraticCost, effort_cost, objectives_cost
+from egs_warp.locomotion.step_cost import LinearStep, QuadraticCost, effort_cost, objectives_cost, objectives_missed
 from egs_warp.locomotion.strategies import Foreseen, Strategy, search_program
 from egs_warp.locomotion.synergies import find_synergies
 from egs_warp.muscles.muscle_set import MuscleColumns, MuscleSet
@@ -30,6 +30,8 @@ _FASTEST = 7.0
 """Bounds of activations, in their bounds a sqrt(H / g): how fast a muscle is switched on and off."""
 _REGULAR = 1e-7
 _MOST_HALVINGS = 4
+_AMISS, _LITTLE = 1.2, 0.01
+"""A step whose end costs more than this factor of what its program expected, and this much more, is asked for again."""
 _LOOKS = 3
 """Newton steps in which a step is foreseen: the first starts from afar."""
 
@@ -210,14 +212,39 @@ class LocomotionStepper:
         response, foreseen, forces = self.foresee(problem, contacts, memory, before)
         clock.lap("foresee")
         plan = self._program(response, foreseen, forces, memory, objectives, clock)
-        result = self.solver.solve(
-            response,
-            MuscleTension.of(self.muscles, plan.activations),
-            velocities=plan.velocities,
-            forces=plan.forces,
-        )
+        result = self._solve(response, plan)
         clock.lap("solve")
+        expected = self._missed(problem, objectives, response.contacts, plan.velocities, plan.forces)
+        got = self._missed(problem, objectives, result.contacts, result.velocities, result.forces)
+        if result.converged and got > _AMISS * expected + _LITTLE:
+            # The muscles went further than the tangent knows the way: asked again from where they have brought it.
+            tangent = problem.tangent(
+                self._factors, result.velocities, MuscleTension.of(self.muscles, plan.activations)
+            )
+            response = ContactResponse.of(tangent, result.contacts)
+            again = self._program(response, result.velocities, result.forces, memory, objectives, clock)
+            other = self._solve(response, again)
+            clock.lap("again")
+            better = self._missed(problem, objectives, other.contacts, other.velocities, other.forces) < got
+            if other.converged and better:
+                plan, result = again.after(plan), other
         return self._finish(problem, plan, result, clock)
+
+    def _solve(self, response: ContactResponse, plan: _Plan) -> CoupledResult:
+        tension = MuscleTension.of(self.muscles, plan.activations)
+        return self.solver.solve(response, tension, velocities=plan.velocities, forces=plan.forces)
+
+    def _missed(
+        self,
+        problem: StepProblem,
+        objectives: Sequence[Objective | SpinObjective],
+        contacts: ContactSet,
+        velocities: np.ndarray,
+        forces: np.ndarray,
+    ) -> float:
+        """What the objectives cost at an end of the step, of ``velocities`` (N, 3) and contact ``forces`` (n, 3)."""
+        torque = problem.turns.T @ (contacts.frame.T @ forces.ravel())
+        return objectives_missed(problem, objectives, velocities, torque, self.speed_scale)
 
     def _detect(self, problem: StepProblem, memory: StepMemory) -> ContactSet:
         ballistic = problem.state.velocities + problem.dt * self.body.gravity
@@ -365,6 +392,14 @@ class _Plan:
     forces: np.ndarray
     qp_count: int
     qp_infeasible: int
+
+    def after(self, other: _Plan) -> _Plan:
+        """This plan, with the programs counted that ``other`` took before it."""
+        return replace(
+            self,
+            qp_count=self.qp_count + other.qp_count,
+            qp_infeasible=self.qp_infeasible + other.qp_infeasible,
+        )
 
 
 @dataclass
