@@ -64,11 +64,11 @@ class WalkPlan:
 class WalkControl:
     """Weights of the objectives (speeds are compared in sqrt(g H)) and gains of the feedback."""
 
-    com: float = 180.0
-    spin: float = 150.0
-    pose: float = 3.0
-    swing: float = 60.0
-    support: float = 15.0
+    com: float = 600.0
+    spin: float = 600.0
+    pose: float = 1.0
+    swing: float = 20.0
+    support: float = 5.0
     balance: float = 3.0
     """How far the centre of pressure goes for each metre that the divergent part of the motion is off."""
     turn_rate: float = 4.0

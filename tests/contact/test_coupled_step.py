@@ -265,7 +265,7 @@ def test_foreseen_forces_press_and_rub_no_more_than_they_may() -> None:
         assert (forces[:, 0] * speed[:, 0]).max() < 1e-6 * standing.body.weight
         assert (pull <= 0.5 * forces[:, 0] + 1e-9).all()
         sliding = (slip > 1e-4) & (forces[:, 0] > 0.0)
-        np.testing.assert_allclose(pull[sliding], 0.5 * forces[sliding, 0], rtol=1e-6)
+        np.testing.assert_allclose(pull[sliding], 0.5 * forces[sliding, 0], rtol=1e-6, atol=1e-9)
         along = (forces[:, 1:] * speed[:, 1:]).sum(axis=1)
         np.testing.assert_allclose(along[sliding], -(pull * slip)[sliding], rtol=1e-4)
         kinds |= set(np.where(forces[:, 0] == 0.0, "free", np.where(sliding, "slides", "sticks")).tolist())
