@@ -226,8 +226,9 @@ class LocomotionStepper:
             other = self._solve(response, again)
             clock.lap("again")
             better = self._missed(problem, objectives, other.contacts, other.velocities, other.forces) < got
-            if other.converged and better:
-                plan, result = again.after(plan), other
+            chosen = again if other.converged and better else plan
+            result = other if chosen is again else result
+            plan = chosen.counting(plan, again)
         return self._finish(problem, plan, result, clock)
 
     def _solve(self, response: ContactResponse, plan: _Plan) -> CoupledResult:
@@ -393,12 +394,12 @@ class _Plan:
     qp_count: int
     qp_infeasible: int
 
-    def after(self, other: _Plan) -> _Plan:
-        """This plan, with the programs counted that ``other`` took before it."""
+    def counting(self, *plans: _Plan) -> _Plan:
+        """This plan, with the programs counted that all ``plans`` of the step took."""
         return replace(
             self,
-            qp_count=self.qp_count + other.qp_count,
-            qp_infeasible=self.qp_infeasible + other.qp_infeasible,
+            qp_count=sum(plan.qp_count for plan in plans),
+            qp_infeasible=sum(plan.qp_infeasible for plan in plans),
         )
 
 
@@ -409,5 +410,5 @@ class _Clock:
 
     def lap(self, name: str) -> None:
         now = time.perf_counter()
-        self.milliseconds[name] = 1e3 * (now - self._last)
+        self.milliseconds[name] = self.milliseconds.get(name, 0.0) + 1e3 * (now - self._last)
         self._last = now
