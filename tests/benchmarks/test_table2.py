@@ -10,7 +10,7 @@ import pytest
 from egs_warp.locomotion.contact_pieces import ContactPieces
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.strategies import Strategy
-from tests.benchmarks.test_harness import BENCHMARKS, module_of
+from tests.support.scripts import BENCHMARKS, module_of
 
 
 @pytest.fixture

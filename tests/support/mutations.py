@@ -219,18 +219,18 @@ BESIDE_THE_PAPER: list[Mutation] = [
         ),
         (
             *("balance: the centre of pressure under load", "motions/stance.py"),
-            *("standing_height) / max(gravity + up, 0.2 * gravity)", "standing_height) / gravity"),
-            "motions/test_stance.py::test_the_nearest_acceleration_that_does_not_tip",
+            *("height / up * (level + turn) / dt", "height / gravity * (level + turn) / dt"),
+            "motions/test_stance.py::test_the_nearest_end_of_a_step_that_does_not_tip",
         ),
         (
             *("balance: what friction gives under load", "motions/stance.py"),
-            *("GRIP * self.friction * max(gravity + up, 0.2 * gravity)", "GRIP * self.friction * gravity"),
+            *("GRIP * self.friction * up * dt", "GRIP * self.friction * gravity * dt"),
             "motions/test_stance.py::test_no_more_is_asked_than_friction_gives",
         ),
         (
             *("balance: the margin of the footprint", "motions/stance.py"),
-            *("place + margin * self.support_high", "place + self.support_high"),
-            "motions/test_stance.py::test_the_nearest_acceleration_that_does_not_tip",
+            *("0.5 * MARGIN * (seen.support[1]", "0.5 * (seen.support[1]"),
+            "motions/test_stance.py::test_the_nearest_end_of_a_step_that_does_not_tip",
         ),
         (
             *("the largest turn: the lever of a disc", "motions/turn.py"),
