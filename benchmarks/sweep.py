@@ -51,7 +51,7 @@ BOUNDS = {
     "energy_residual": 1e-6,
     "cone_violation": 1e-4,
     "friction_gap": 1e-5,
-    "contact_velocity": 0.1,
+    "contact_velocity": 1e-6,
     "complementarity_gap": 1e-4,
     "penetration": 0.01,
     "inverted_elements": 0,
