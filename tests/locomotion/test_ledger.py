@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import ast
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from egs_warp.fem.body import BodyState
+from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion import ledger as module
 from egs_warp.locomotion.ledger import FLOWS, STORED, Ledger, ledger
 from egs_warp.locomotion.trajectory import Trajectory
+from tests.support.places import DT
 from tests.support.slides import slide
 
 CLOSES = 1e-6
@@ -46,6 +50,48 @@ def test_each_flow_counts(books: Ledger) -> None:
             assert np.abs(values).max() < 1e-8 * books.unit, flow
         else:
             assert worst(replace(books, **{flow: 1.1 * values})) > CLOSES, flow
+
+
+@dataclass(frozen=True)
+class PartlyInside(StepProblem):
+    """Gives back a share of the spin within the step."""
+
+    share: float = 0.0
+
+    def spin(self, internal_gradient: np.ndarray) -> np.ndarray:
+        """(3,) rad/s."""
+        return self.share * super().spin(internal_gradient)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.6])
+def test_spin_that_is_added_after_a_step_counts(trajectory: Trajectory, share: float) -> None:
+    """A block that spins in the air and is given the rest of what implicit Euler eats when its step is done."""
+    body, positions = slide().stepper.body, trajectory.positions[0]
+    state = BodyState(positions, np.cross([3.0, -2.0, 5.0], positions - body.centre_of_mass(positions)))
+    problem = PartlyInside(body, state, DT, trajectory.drag, share)
+    velocities, factors = problem.start, SparseFactors(body.assembly.upper_pattern)
+    for _ in range(40):
+        change = problem.tangent(factors, velocities, None).solve(problem.residual(velocities, None).ravel())
+        velocities = velocities - change.reshape(velocities.shape)
+    assert np.linalg.norm(problem.residual(velocities, None)) < 1e-11 * problem.unit
+    end = problem.end_positions(velocities)
+    whole = StepProblem.spin(problem, problem.internal_gradient(velocities, None))
+    added = np.linalg.solve(body.inertia(end), (1.0 - share) * problem.inertia @ whole)
+    after = velocities + np.cross(added, end - body.centre_of_mass(end))
+    nothing = {name: getattr(trajectory, name)[:0] for name in vars(trajectory) if name.startswith("contact_")}
+    step = replace(
+        trajectory,
+        **nothing,
+        time=np.array([0.0, DT]),
+        dt=np.array([DT]),
+        positions=np.stack([positions, end]),
+        velocities=np.stack([state.velocities, after]),
+        activations=np.zeros_like(trajectory.activations[:1]),
+    )
+    books = ledger(step)
+    assert worst(books) < 1e-9
+    assert worst(replace(books, spin_after=1.1 * books.spin_after)) > CLOSES
+    assert (np.abs(books.spin_inside).max() < 1e-9 * books.unit) == (share == 0.0)
 
 
 def test_each_stored_energy_counts(books: Ledger) -> None:

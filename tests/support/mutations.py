@@ -313,7 +313,7 @@ BESIDE_THE_PAPER: list[Mutation] = [
         (
             *("ledger: the energy of the spin that is added", "locomotion/ledger.py"),
             *("+ 0.5 * _inertia(mass, after) @ added", "+ 1.0 * _inertia(mass, after) @ added"),
-            "locomotion/test_ledger.py::test_every_step_closes",
+            "locomotion/test_ledger.py::test_spin_that_is_added_after_a_step_counts",
         ),
         (
             *("audit: friction against slip", "locomotion/audit.py"),
