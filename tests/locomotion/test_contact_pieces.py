@@ -1,4 +1,4 @@
-"""The program over activations alone: what it plans is what exact Coulomb contact answers."""
+"""The program over activations alone: what it plans is what exact Coulomb contact answers (Eq. 9, 13)."""
 
 from __future__ import annotations
 

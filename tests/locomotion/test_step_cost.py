@@ -1,4 +1,4 @@
-"""The cost of a step against what it says of positions and velocities, by differences."""
+"""The cost of a step against what it says of positions and velocities, by differences (Eq. 13)."""
 
 from __future__ import annotations
 
