@@ -150,7 +150,7 @@ def animation_frames(
             SpinObjective(body.angular_momentum(after.positions, after.velocities), weights.spin),
             node_velocities(body, after.velocities, weights.pose),
         ]
-        program = stepper.program(response, foreseen, pushes, before, objectives)
+        program = stepper.program(response, foreseen, pushes, before, before, objectives)
         made.append(Frame(program.pieces, program.foreseen, current))
         state, forces = after, result.forces
     return made

@@ -8,6 +8,7 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.spatial import ConvexHull
 
+from egs_warp.contact.detection import ContactSet
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.geometry.frames import square_to
 
@@ -247,6 +248,13 @@ def part_nodes(body: SoftBody, part: BodyPart, target: np.ndarray, weight: float
         (np.full(3 * count, share), (np.arange(3 * count), columns)), shape=(3 * count, 3 * len(body.node_mass))
     )
     return Objective(f"{part.name} nodes", rows, share * np.asarray(target, float).ravel(), weight)
+
+
+def held_contacts(contacts: ContactSet, loads: np.ndarray, weight: float) -> Objective:
+    """That no contact slides, each weighted by its share of the weight in ``loads`` (n,)."""
+    along = contacts.frame[np.flatnonzero(np.arange(3 * contacts.count) % 3)]
+    rows = sparse.csr_matrix(sparse.diags(np.sqrt(np.repeat(loads, 2))) @ along)
+    return Objective("hold", rows, np.zeros(rows.shape[0]), weight)
 
 
 def _cross_matrices(arms: np.ndarray) -> np.ndarray:

@@ -211,7 +211,7 @@ class LocomotionStepper:
         before = MuscleTension.of(self.muscles, memory.activations)
         response, foreseen, forces = self.foresee(problem, contacts, memory, before)
         clock.lap("foresee")
-        plan = self._program(response, foreseen, forces, memory, objectives, clock)
+        plan = self._program(response, foreseen, forces, memory, memory.activations, objectives, clock)
         result = self._solve(response, plan)
         clock.lap("solve")
         expected = self._missed(problem, objectives, response.contacts, plan.velocities, plan.forces)
@@ -222,7 +222,9 @@ class LocomotionStepper:
                 self._factors, result.velocities, MuscleTension.of(self.muscles, plan.activations)
             )
             response = ContactResponse.of(tangent, result.contacts)
-            again = self._program(response, result.velocities, result.forces, memory, objectives, clock)
+            again = self._program(
+                response, result.velocities, result.forces, memory, plan.activations, objectives, clock
+            )
             other = self._solve(response, again)
             clock.lap("again")
             better = self._missed(problem, objectives, other.contacts, other.velocities, other.forces) < got
@@ -279,12 +281,15 @@ class LocomotionStepper:
         foreseen: np.ndarray,
         forces: np.ndarray,
         memory: StepMemory,
+        under: np.ndarray,
         objectives: Sequence[Objective | SpinObjective],
         clock: _Clock,
     ) -> _Plan:
-        """Activations, and what the step's tangent makes of them."""
+        """Activations, and what the step's tangent makes of them; ``foreseen`` and ``forces`` are those ``under``
+        (M,).
+        """
         problem, settings, m = response.tangent.problem, self.settings, self.synergies.count
-        program = self.program(response, foreseen, forces, memory.activations, objectives)
+        program = self.program(response, foreseen, forces, memory.activations, under, objectives)
         clock.lap("program")
         found = search_program(
             program.pieces,
@@ -313,10 +318,11 @@ class LocomotionStepper:
         foreseen: np.ndarray,
         forces: np.ndarray,
         activations: np.ndarray,
+        under: np.ndarray,
         objectives: Sequence[Objective | SpinObjective],
     ) -> StepProgram:
         """What is asked of the step, linear about the ``foreseen`` velocities (N, 3) and contact ``forces`` (n, 3) that
-        last step's ``activations`` (M,) would bring.
+        the activations ``under`` (M,) would bring; ``activations`` (M,) are last step's.
         """
         problem, members = response.tangent.problem, self.synergies.members
         contacts, weight, m = response.contacts, self.body.weight, self.synergies.count
@@ -345,7 +351,8 @@ class LocomotionStepper:
             *(np.maximum(previous - reach, -1.0), np.minimum(previous + reach, 1.0)),
         )
         slip = (contacts.frame @ foreseen.ravel()).reshape(-1, 3) / self.speed_scale
-        return StepProgram(pieces, Foreseen(previous, forces / weight, slip), linear)
+        start = self.synergies.mean(under / self.muscles.bounds)
+        return StepProgram(pieces, Foreseen(start, forces / weight, slip), linear)
 
     def _activation_cost(self, dt: float, previous: np.ndarray, count: int) -> QuadraticCost:
         """Of ``count`` unknowns that begin with the activations, how large they are and how they change from

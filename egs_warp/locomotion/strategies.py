@@ -166,7 +166,7 @@ class _Search:
 
 @dataclass(frozen=True)
 class Foreseen:
-    """Stage 1: what last step's activations would bring."""
+    """Stage 1: what known activations, first those of the last step, would bring."""
 
     activations: np.ndarray
     """(M,) in their bounds."""

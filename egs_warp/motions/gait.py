@@ -8,6 +8,9 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial import ConvexHull
 
+_CARRIED_FROM, _CARRIED = 0.1, 0.7
+"""Parts of a swing: when a foot begins to be carried ahead, and for how long."""
+
 
 @dataclass(frozen=True)
 class Gait:
@@ -35,6 +38,11 @@ class Gait:
     def swings(self) -> int:
         """Swings in all."""
         return self.steps + 1
+
+    @property
+    def carried_time(self) -> float:
+        """Seconds into a swing at which the foot is over its footprint."""
+        return (_CARRIED_FROM + _CARRIED) * self.swing_time
 
     @property
     def distance(self) -> float:
@@ -72,7 +80,7 @@ class Gait:
     def carried(progress: float) -> float:
         """Part of its way that a foot has gone when ``progress`` (0 to 1) of its swing is over; it has arrived before
         it lands, lest an early touch of the ground drag it."""
-        return float(_smooth((progress - 0.1) / 0.7))
+        return float(_smooth((progress - _CARRIED_FROM) / _CARRIED))
 
 
 def _smooth(s: float) -> float:

@@ -173,11 +173,12 @@ class PoseFamily:
         slack = 0.04 * self.body.height
         low = np.minimum(middle - reach, seen.com[:2] - slack)
         high = np.maximum(middle + reach, seen.com[:2] + slack)
-        missing = (seen.com[:2] - np.clip(pressure, low, high)) * up / height * dt - (level + turn)
-        # Each gives way as its objective weighs it: speeds as they are, spins with the radius of gyration.
+        both = (seen.com[:2] - np.clip(pressure, low, high)) * up / height * dt
+        # Each gives way as its objective weighs it, speeds as they are, spins with the radius of gyration; what
+        # friction denies the one, the other takes.
         share = 1.0 / (1.0 + 0.5 * np.trace(inertia) / (self.body.mass * height**2))
-        level = within_grip(level + share * missing)
-        turn = turn + (1.0 - share) * missing
+        level = within_grip(level + share * (both - level - turn))
+        turn = both - level
         swing = seen.swing + turn
         momentum = self.ground.axes @ inertia @ spin
         momentum[:2] = self.body.mass * height * np.array([-swing[1], swing[0]])

@@ -88,6 +88,18 @@ def test_no_more_is_asked_than_friction_gives(place: Place, up: float) -> None:
     assert little[:2] == pytest.approx(0.1 * wanted)
 
 
+@pytest.mark.parametrize("spin", [(0.0, -2.0, 0.0), (1.5, 1.0, 0.2)])
+def test_what_friction_denies_the_speed_the_spin_takes(place: Place, spin: tuple[float, float, float]) -> None:
+    """On a slippery ground, too, the centre of pressure asked for is within the footprint."""
+    pose, state, seen = stood(place, 0.3, (0.05, -0.03, 0.1))
+    velocity, turned = pose.balanced(state, seen, np.array([0.3, 0.01, 0.0]), np.array(spin), DT)
+    change = velocity[:2] + swing(place, state, seen, turned)
+    middle = place.ground.local(place.touching)[:, :2].mean(axis=0)
+    pressure = seen.com[:2] - seen.com[2] / GRAVITY * change / DT
+    assert np.linalg.norm(velocity[:2]) <= 0.3 * GRAVITY * DT
+    assert np.abs(pressure - middle).max() <= MARGIN * EDGE + 1e-9
+
+
 def test_a_body_that_turns_forward_is_caught_further_ahead(place: Place) -> None:
     """The capture point is that of the momentum about the feet: at rest over its place nothing is asked, and spin
     counts as the speed that has the same momentum."""
