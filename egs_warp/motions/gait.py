@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial import ConvexHull
 
-_CARRIED_FROM, _CARRIED = 0.1, 0.7
+_CARRIED_FROM, _CARRIED = 0.15, 0.65
 """Parts of a swing: when a foot begins to be carried ahead, and for how long."""
 
 
@@ -40,8 +40,13 @@ class Gait:
         return self.steps + 1
 
     @property
-    def carried_time(self) -> float:
-        """Seconds into a swing at which the foot is over its footprint."""
+    def carried_from(self) -> float:
+        """Seconds into a swing at which the foot goes ahead."""
+        return _CARRIED_FROM * self.swing_time
+
+    @property
+    def carried_until(self) -> float:
+        """Seconds into a swing at which it is over its next footprint."""
         return (_CARRIED_FROM + _CARRIED) * self.swing_time
 
     @property

@@ -182,14 +182,14 @@ class Walk:
             SpinObjective(body.inertia(state.positions) @ (spin @ axes), control.spin),
             node_velocities(body, follow * (next_pose - local) @ axes, control.pose),
             *(self._foot_objective(index, local, before, after, dt) for index in self.swinging),
-            *([self._hold(report)] if report is not None else []),
+            *([self._hold(report, elapsed)] if report is not None else []),
         ]
 
     def _advance_phase(self, local: np.ndarray, report: StepReport | None, time: float) -> None:
         if self._entered is None:
             self._entered = time
         elapsed, gait = time - self._entered + 1e-9, self.gait
-        if self.swinging and elapsed >= gait.carried_time:
+        if self.swinging and elapsed >= gait.carried_until:
             loads = foot_loads(self.feet, report, self.body.weight)
             for index in self.swinging:
                 if loads[index] > LOADED:
@@ -280,10 +280,11 @@ class Walk:
         velocity = (control.foot_share * error + after[index] - before[index]) / dt
         return part_nodes(self.body, part, velocity @ self.ground.axes, control.swing)
 
-    def _hold(self, report: StepReport) -> Objective:
-        """What stands does not slide."""
+    def _hold(self, report: StepReport, elapsed: float) -> Objective:
+        """What stands does not slide, nor does what is lifted before it goes ahead."""
         contacts = report.contacts
-        stands = ~np.isin(foot_of_contact(self.feet, contacts), self.swinging)
+        ahead = self.swinging if elapsed > self.gait.carried_from else ()
+        stands = ~np.isin(foot_of_contact(self.feet, contacts), ahead)
         return held_contacts(contacts, np.where(stands, report.forces[:, 0], 0.0) / self.body.weight, self.control.support)
 
     def _pose(self, com: np.ndarray, targets: np.ndarray) -> np.ndarray:
