@@ -181,7 +181,7 @@ class Walk:
             centre_of_mass_velocity(body, com_velocity @ axes, control.com),
             SpinObjective(body.inertia(state.positions) @ (spin @ axes), control.spin),
             node_velocities(body, follow * (next_pose - local) @ axes, control.pose),
-            *(self._foot_objective(index, local, before, after, dt) for index in self.swinging),
+            *(self._foot_objective(index, local, before, after, elapsed, dt) for index in self.swinging),
             *([self._hold(report, elapsed)] if report is not None else []),
         ]
 
@@ -273,11 +273,13 @@ class Walk:
         return targets
 
     def _foot_objective(
-        self, index: int, local: np.ndarray, before: np.ndarray, after: np.ndarray, dt: float
+        self, index: int, local: np.ndarray, before: np.ndarray, after: np.ndarray, elapsed: float, dt: float
     ) -> Objective:
         sole, part, control = self.feet[index].sole, self._parts[index], self.control
         error = before[index] - self._soles[index] + self._standing[sole] - local[sole]
-        velocity = (control.foot_share * error + after[index] - before[index]) / dt
+        # The sole that stood is not the flat one that swings: torn straight in the first step, it would drag.
+        share = control.foot_share * self.gait.eased(elapsed / self.gait.swing_time)
+        velocity = (share * error + after[index] - before[index]) / dt
         return part_nodes(self.body, part, velocity @ self.ground.axes, control.swing)
 
     def _hold(self, report: StepReport, elapsed: float) -> Objective:
@@ -285,7 +287,9 @@ class Walk:
         contacts = report.contacts
         ahead = self.swinging if elapsed > self.gait.carried_from else ()
         stands = ~np.isin(foot_of_contact(self.feet, contacts), ahead)
-        return held_contacts(contacts, np.where(stands, report.forces[:, 0], 0.0) / self.body.weight, self.control.support)
+        return held_contacts(
+            contacts, np.where(stands, report.forces[:, 0], 0.0) / self.body.weight, self.control.support
+        )
 
     def _pose(self, com: np.ndarray, targets: np.ndarray) -> np.ndarray:
         """(N, 3) the standing shape with its feet at ``targets`` (4, 3) and its centre of mass at ``com`` (3,)."""
