@@ -252,9 +252,10 @@ def part_nodes(body: SoftBody, part: BodyPart, target: np.ndarray, weight: float
 
 def held_contacts(contacts: ContactSet, loads: np.ndarray, weight: float) -> Objective:
     """That no contact slides, each weighted by its share of the weight in ``loads`` (n,)."""
-    along = contacts.frame[np.flatnonzero(np.arange(3 * contacts.count) % 3)]
-    rows = sparse.csr_matrix(sparse.diags(np.sqrt(np.repeat(loads, 2))) @ along)
-    return Objective("hold", rows, np.zeros(rows.shape[0]), weight)
+    shares = np.sqrt(np.repeat(loads, 3))
+    shares[::3] = 0.0
+    rows = sparse.csr_matrix(sparse.diags(shares) @ contacts.frame)
+    return Objective("hold", rows, np.zeros(3 * contacts.count), weight)
 
 
 def _cross_matrices(arms: np.ndarray) -> np.ndarray:

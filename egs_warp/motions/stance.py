@@ -137,6 +137,7 @@ class PoseFamily:
         """``standing`` (N, 3): nodes at rest; ``touching`` (k, 3): points of the body on the ground then; ``friction``:
         Coulomb coefficient."""
         self.body, self.ground, self.friction = body, ground, friction
+        self._normal = ground.axes @ ground.surface_normal
         local = ground.local(standing)
         self._arms = (local - body.centre_of_mass(local)) @ ground.axes
         self.standing_height = float(body.centre_of_mass(local)[2])
@@ -164,7 +165,8 @@ class PoseFamily:
         turn = self._swing(inertia @ spin, height) - seen.swing
 
         def within_grip(change: np.ndarray) -> np.ndarray:
-            return change * min(1.0, GRIP * self.friction * up * dt / max(float(np.linalg.norm(change)), 1e-12))
+            push = np.array([*(change / dt), 0.0])
+            return change * min(1.0, _share_in_cone(push, np.array([0.0, 0.0, up]), self._normal, GRIP * self.friction))
 
         level = within_grip(level)
         pressure = seen.com[:2] - height / up * (level + turn) / dt
@@ -309,6 +311,20 @@ class PoseFamily:
         """(3,) rotation vector, world axes, from the measured best-fit rotation to that of ``pose``."""
         wanted = best_turn(self.body.node_mass, self._arms, self._arms @ pose.T)
         return Rotation.from_matrix(wanted @ self.rotation(state.positions).T).as_rotvec()
+
+
+def _share_in_cone(push: np.ndarray, held: np.ndarray, normal: np.ndarray, friction: float) -> float:
+    """Largest s for which ``held`` + s ``push`` (3,) is in the friction cone about ``normal`` (3,); 0 where ``held`` is
+    not; infinite where ``push`` never leaves it."""
+    wide = 1.0 + friction**2
+    a = float(push @ push - wide * (push @ normal) ** 2)
+    b = float(push @ held - wide * (push @ normal) * (held @ normal))
+    c = float(held @ held - wide * (held @ normal) ** 2)
+    if c > 0.0:
+        return 0.0
+    if a <= 0.0:
+        return float("inf")
+    return (float(np.sqrt(b * b - a * c)) - b) / a
 
 
 def sole_shares(body: SoftBody, ground: Ground, standing: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import pytest
 
 from egs_warp.fem.body import BodyState
 from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import MARGIN, Measurement, PoseFamily
+from egs_warp.motions.stance import MARGIN, Measurement, PoseFamily, _share_in_cone
 
 GRAVITY, EDGE, DT = 9.81, 0.2, 1 / 60
 
@@ -86,6 +86,23 @@ def test_no_more_is_asked_than_friction_gives(place: Place, up: float) -> None:
     assert got[:2] == pytest.approx(most * wanted / 0.015)
     little, _ = pose.balanced(state, seen, np.array([*(0.1 * wanted), up]), np.zeros(3), DT)
     assert little[:2] == pytest.approx(0.1 * wanted)
+
+
+@pytest.mark.parametrize("way", [(1.0, 0.0), (-1.0, 0.0), (0.6, -0.8)])
+def test_on_a_slope_friction_gives_less_uphill(way: tuple[float, float]) -> None:
+    """What is asked for is on the cone about the ground's normal: uphill that is weight x tan(friction angle - slope),
+    by hand."""
+    friction, slope = 0.3, np.radians(8.0)
+    rising = np.array([-np.sin(slope), 0.0, np.cos(slope)])
+    push, weight = np.array([*way, 0.0]), np.array([0.0, 0.0, 2.0])
+    share = _share_in_cone(push, weight, rising, friction)
+    force = weight + share * push
+    assert np.linalg.norm(np.cross(force, rising)) == pytest.approx(friction * force @ rising)
+    angle = np.arctan(friction)
+    by_hand = {(1.0, 0.0): np.tan(angle - slope), (-1.0, 0.0): np.tan(angle + slope)}
+    assert share == pytest.approx(2.0 * by_hand.get(way, share / 2.0))
+    assert _share_in_cone(push, weight, rising, 0.1) == 0.0
+    assert _share_in_cone(weight, weight, rising, friction) == np.inf
 
 
 @pytest.mark.parametrize("spin", [(0.0, -2.0, 0.0), (1.5, 1.0, 0.2)])

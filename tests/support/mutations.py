@@ -224,7 +224,7 @@ BESIDE_THE_PAPER: list[Mutation] = [
         ),
         (
             *("balance: what friction gives under load", "motions/stance.py"),
-            *("GRIP * self.friction * up * dt", "GRIP * self.friction * gravity * dt"),
+            *("np.array([0.0, 0.0, up]), self._normal", "np.array([0.0, 0.0, gravity]), self._normal"),
             "motions/test_stance.py::test_no_more_is_asked_than_friction_gives",
         ),
         (
