@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
 from egs_warp.assets import pawn, stool
-from egs_warp.contact.corrector import contact_step
 from egs_warp.contact.detection import contact_geometry
-from egs_warp.contact.penalty import predict
 from egs_warp.fem.body import BodyState, make_body
-from egs_warp.fem.factorisation import Factorisation
-from egs_warp.fem.implicit_step import ImplicitStep, conserve_angular_momentum
+from egs_warp.fem.step_problem import StepProblem
 from egs_warp.io import read_capture
-from egs_warp.locomotion.complementarity import ContactLayout, states_from_prediction
+from egs_warp.locomotion.contact_pieces import ContactPieces
 from egs_warp.locomotion.objectives import SpinObjective, centre_of_mass_velocity, node_velocities
-from egs_warp.locomotion.program import ContactProgram, CostScales, contact_program, linear_response
 from egs_warp.locomotion.rollout import FRAME_RATE, settle
-from egs_warp.locomotion.stepper import LocomotionSettings, LocomotionStepper
+from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory
+from egs_warp.locomotion.strategies import Foreseen
+from egs_warp.locomotion.synergies import Synergies
 from egs_warp.meshing.cage import build_cage
 from egs_warp.motions.stance import Weights
-from egs_warp.muscles.muscle_set import MuscleColumns, MuscleSet, automatic_muscles
+from egs_warp.muscles.muscle_set import MuscleSet, automatic_muscles
 from egs_warp.muscles.tension import MuscleTension
 from egs_warp.segmentation.base_plane import find_base_plane
 from harness import data_folder
@@ -35,13 +33,11 @@ CAPTURES = {"monkey": ("monkey.ply", (0.0, 1.0, 0.0)), "plush dog": ("plush_dog.
 class Frame:
     """One step of the animation as every strategy gets it."""
 
-    program: ContactProgram
-    predicted: np.ndarray
-    """(n,) states of stage 1."""
-    previous: np.ndarray
-    """(M,) the known activations of the step before, in their bounds."""
+    pieces: ContactPieces
+    foreseen: Foreseen
+    """What the known activations of the step before would bring."""
     known: np.ndarray
-    """(M,) those of this step."""
+    """(M,) those of this step, in their bounds."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +49,7 @@ class BenchBody:
     device: str
 
 
-def body_named(name: str, device: str, *, nodes: int = 250) -> BenchBody:
+def body_named(name: str, device: str, *, nodes: int = 300) -> BenchBody:
     """A built-in body ("pawn", "stool") or a real capture of ``CAPTURES``, 1 m tall,
     with a cage of about ``nodes`` nodes.
     """
@@ -81,17 +77,15 @@ def body_named(name: str, device: str, *, nodes: int = 250) -> BenchBody:
     return BenchBody(stepper, settle(stepper), device)
 
 
-def grouped_segments(muscles: MuscleSet, nodes: np.ndarray, groups: int, seed: int) -> np.ndarray:
-    """(M, groups) 0 or 1: each group is neighbouring segments of a like direction that act as one;
-    ``nodes`` (N, 3) at rest.
-    """
+def grouped_segments(muscles: MuscleSet, nodes: np.ndarray, groups: int, seed: int) -> Synergies:
+    """Each group is neighbouring segments of a like direction that act as one; ``nodes`` (N, 3) at rest."""
     ends = muscles.end_points(nodes)
     first, second = ends[muscles.segments[:, 0]], ends[muscles.segments[:, 1]]
     upright = np.abs(second - first)[:, 2] / np.linalg.norm(second - first, axis=1)
     features = np.column_stack([0.5 * (first + second), 0.5 * upright * np.ptp(nodes, axis=0).max()])
     # scipy 1.15 renamed the argument, with other random numbers under the new name.
     _, group = kmeans2(features, groups, minit="++", seed=seed)  # pyright: ignore[reportCallIssue]
-    return np.eye(groups)[group]
+    return Synergies(group.astype(np.int32))
 
 
 def spread_points(bench: BenchBody, count: int) -> np.ndarray:
@@ -123,79 +117,40 @@ def animation_frames(
     frames: int = 50,
     activations: int = 10,
     contacts: int = 5,
-    directions: int = 8,
     strength: float = 0.3,
     seed: int = 0,
 ) -> list[Frame]:
     """An animation with known activations of muscle groups and exact contact at a few points; each step as a program.
 
-    A step asks for the animation's own end velocity: that of the centre of mass, the spin and the pose.
+    A step asks for the animation's own end velocity: that of the centre of mass, the spin and the pose. Its program is
+    the engine's own.
     """
-    body, stepper = bench.stepper.body, bench.stepper
-    settings = LocomotionSettings()
-    groups = grouped_segments(bench.stepper.muscles, body.mesh.nodes, activations, seed)
+    body, muscles = bench.stepper.body, bench.stepper.muscles
+    stepper = LocomotionStepper(body, muscles, bench.stepper.geometry, device=bench.device)
+    stepper.synergies = grouped_segments(muscles, body.mesh.nodes, activations, seed)
+    # No point joins those that were chosen, however deep.
+    stepper.solver = replace(stepper.solver, penetration_tolerance=np.inf)
     points = spread_points(bench, contacts)
-    columns = MuscleColumns(bench.stepper.muscles, device=bench.device)
     known = known_activations(activations, frames, strength, seed)
-    weight = body.node_mass[:, None] * body.gravity
-    dt, cap = 1.0 / FRAME_RATE, settings.push_out_cap * stepper.speed_scale
-    ones = np.ones(activations)
-    scales = CostScales(
-        stepper.speed_scale, settings.activation_weight * ones, settings.activation_change_weight * ones
-    )
-    layout = ContactLayout(activations, contacts, directions)
-    friction, weights = bench.stepper.geometry.friction, Weights()
-    factorisation = Factorisation(body)
+    weights, dt = Weights(), 1.0 / FRAME_RATE
     state, forces = bench.start, np.zeros((contacts, 3))
     made = []
     for previous, current in zip(known[:-1], known[1:], strict=True):
-        step = ImplicitStep(body, state, dt, factorisation)
-        before, now = (
-            MuscleTension.of(stepper.muscles, stepper.muscles.bounds * (groups @ a)) for a in (previous, current)
-        )
-        result = contact_step(
-            step,
-            stepper.detector,
-            points,
-            weight,
-            tension=now,
-            start_velocities=state.velocities,
-            start_forces=forces,
-            push_out_cap=cap,
-            penetration_tolerance=np.inf,
-        )
+        before, now = (muscles.bounds * (stepper.synergies.members @ a) for a in (previous, current))
+        problem = StepProblem(body, state, dt)
+        contact_set = stepper.detector.contact_set(points, state.positions)
+        memory = StepMemory(points, forces, before)
+        response, foreseen, pushes = stepper.foresee(problem, contact_set, memory, MuscleTension.of(muscles, before))
+        result = stepper.solver.solve(response, MuscleTension.of(muscles, now), velocities=foreseen, forces=pushes)
         if not result.converged:
             raise RuntimeError(f"the animation failed at frame {len(made)}; use less strength")
-        end = step.end_positions(result.velocities)
-        velocities, _ = conserve_angular_momentum(body, state, end, result.velocities, result.nodal_forces, dt)
-        contact_set = stepper.detector.contact_set(points, state.positions)
-        prediction = predict(
-            step,
-            contact_set,
-            weight,
-            state.velocities,
-            tension=before,
-            normal_forces=forces[:, 0],
-            friction=friction,
-            push_out_cap=cap,
-        )
-        pulls = columns.sparse(step.end_positions(prediction.velocities)).multiply(stepper.muscles.bounds)
-        linear = linear_response(step, pulls.tocsr() @ groups, contact_set, prediction.velocities, layout, before)
+        after = BodyState(problem.end_positions(result.velocities), result.velocities, state.time + dt)
         objectives = [
-            centre_of_mass_velocity(body, body.centre_of_mass(result.velocities), weights.com),
-            SpinObjective(body.angular_momentum(end, velocities), weights.spin),
-            node_velocities(body, result.velocities, weights.pose),
+            centre_of_mass_velocity(body, body.centre_of_mass(after.velocities), weights.com),
+            SpinObjective(body.angular_momentum(after.positions, after.velocities), weights.spin),
+            node_velocities(body, after.velocities, weights.pose),
         ]
-        program = contact_program(
-            step, linear, contact_set, layout, objectives, previous, friction=friction, push_out_cap=cap, scales=scales
-        )
-        predicted = states_from_prediction(
-            prediction.normal_forces,
-            prediction.tangential_forces,
-            prediction.tangential_velocities,
-            friction,
-            directions,
-        )
-        made.append(Frame(program, predicted, previous, current))
-        state, forces = BodyState(end, velocities, state.time + dt), result.forces
+        program = stepper.program(response, foreseen, pushes, before, before, objectives)
+        made.append(Frame(program.pieces, program.foreseen, current))
+        state, forces = after, result.forces
     return made

@@ -8,16 +8,13 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from egs_warp.contact.corrector import contact_step
 from egs_warp.contact.detection import contact_geometry
 from egs_warp.fem.body import GRAVITY, BodyState, SoftBody
 from egs_warp.fem.elasticity import ElasticAssembly, Material
-from egs_warp.fem.factorisation import Factorisation
-from egs_warp.fem.implicit_step import ImplicitStep, conserve_angular_momentum
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
-from egs_warp.locomotion.stepper import LocomotionStepper
+from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory
 from egs_warp.muscles.muscle_set import automatic_muscles
 
 TIME_STEP = 1.0 / 120.0
@@ -82,26 +79,13 @@ def simulated_drop(
     state = BodyState(turned, np.tile(np.sqrt(2.0 * GRAVITY * height) * gravity / GRAVITY, (len(turned), 1)))
     # The flight itself deforms nothing: start just above the floor, at the speed of arrival.
     state.positions[:, 2] -= height - 0.01 * body_height
-    force = body.node_mass[:, None] * gravity
-    factorisation, memory = Factorisation(body), stepper.initial_memory()
+    memory = stepper.initial_memory()
     frames, energies = [state.positions], [0.0]
     for _ in range(round(seconds / TIME_STEP)):
-        step = ImplicitStep(body, state, TIME_STEP, factorisation)
-        points = stepper.choose_contacts(step, memory)
-        result = contact_step(
-            step,
-            stepper.detector,
-            points,
-            force,
-            start_velocities=state.velocities,
-            start_forces=stepper.matched_forces(memory, points),
-            push_out_cap=stepper.settings.push_out_cap * stepper.speed_scale,
-            penetration_tolerance=stepper.settings.penetration_tolerance * body.height,
-        )
-        end = step.end_positions(result.velocities)
-        velocities, _ = conserve_angular_momentum(body, state, end, result.velocities, result.nodal_forces, TIME_STEP)
-        state = BodyState(end, velocities, state.time + TIME_STEP)
-        memory = stepper.remember(result, memory.activations)
+        result = stepper.passive_step(state, memory, TIME_STEP)
+        end = state.positions + TIME_STEP * result.velocities
+        state = BodyState(end, result.velocities, state.time + TIME_STEP)
+        memory = StepMemory(result.contacts.points, result.forces, memory.activations)
         frames.append(end)
         energies.append(assembly.energy(end))
     return Drop(np.stack(frames), np.array(energies), mesh.nodes)

@@ -69,9 +69,14 @@ def row_of(name: str, told: Row, contacts: np.ndarray) -> Row:
     }
 
 
+def stages_of(rows: list[Row]) -> list[str]:
+    """Of all examples: some never ask twice for a step."""
+    return list(dict.fromkeys(stage for row in rows for stage in row["milliseconds"]))
+
+
 def print_rows(rows: list[Row]) -> None:
     """The table: in brackets the most in a step or frame; stages in milliseconds a frame."""
-    stages = list(rows[0]["milliseconds"])
+    stages = stages_of(rows)
     columns = {"example": "<8", "nodes": "d", "tets": "d", "fibres": "d", "segments": "d"}
     table = Table(**columns, contacts="10s", QPs="10s", **dict.fromkeys(stages, "8.1f"))
     for row in rows:
@@ -79,7 +84,7 @@ def print_rows(rows: list[Row]) -> None:
             *(row[name] for name in columns),
             f"{row['contacts_mean']:.0f} ({row['contacts_most']})",
             f"{row['qps_a_frame']:.1f} ({row['qps_worst']})",
-            *(row["milliseconds"][stage] for stage in stages),
+            *(row["milliseconds"].get(stage, 0.0) for stage in stages),
         )
     print("in brackets the most in a step or frame; stages in ms a frame")
 
@@ -88,8 +93,8 @@ def draw(figure: Figure, rows: list[Row]) -> None:
     """Milliseconds a frame by stage, one bar an example."""
     axes = figure.subplots()
     left = np.zeros(len(rows))
-    for stage in rows[0]["milliseconds"]:
-        width = np.array([row["milliseconds"][stage] for row in rows])
+    for stage in stages_of(rows):
+        width = np.array([row["milliseconds"].get(stage, 0.0) for row in rows])
         axes.barh([row["example"] for row in rows], width, left=left, label=stage)
         left += width
     axes.set(xlabel="ms a frame")

@@ -3,8 +3,9 @@
 python benchmarks/qp_solvers.py [--quick] [--device cpu] [--seed 0] [--body pawn] [--json PATH] [--plot PATH]
 
 The programs are steps of an animation (Eq. 13) with 40 muscle groups, 4 friction directions and 1 to 32 contacts.
-``first`` is set-up and solve, ``again`` a re-solve for other contact states by a change of bounds alone, ``search`` the
-whole two-stage search of a step. Both solvers get the same programs in turn. ``breach`` is the worst violation of a
+``first`` is set-up and solve of the program with complementarity, ``again`` a re-solve for other contact states by a
+change of bounds alone, ``search`` the engine's whole search of a step, by pieces over the activations alone. Both
+solvers get the same programs in turn. ``breach`` is the worst violation of a
 bound (forces in body weights, speeds in sqrt(g H)); ``objective`` is relative to DAQP's. No aim is named for this
 benchmark.
 """
@@ -18,8 +19,10 @@ import numpy as np
 
 from contact_frames import Frame, animation_frames, body_named
 from egs_warp.locomotion.complementarity import SEPARATE, states_of_pairs
+from egs_warp.locomotion.program import ContactProgram
 from egs_warp.locomotion.solvers import QpSolution, QpSolver, quadratic_program
-from egs_warp.locomotion.strategies import Strategy, contact_under, find_states
+from egs_warp.locomotion.stepper import LocomotionSettings
+from egs_warp.locomotion.strategies import Strategy, contact_under, search_program
 from harness import Row, Table, flags, report, timed
 
 if TYPE_CHECKING:
@@ -27,18 +30,18 @@ if TYPE_CHECKING:
 
 CONTACTS = (1, 2, 4, 8, 16, 32)
 GROUPS = 40
-QP_LIMIT = 6
+DIRECTIONS = 4
+QP_LIMIT = LocomotionSettings.qp_limit
 
 
 def frame_figures(frame: Frame, solver: QpSolver) -> Row:
     """Figures of one program."""
-    program = frame.program
-    y = contact_under(program, frame.previous)
-    states = frame.predicted if y is None else states_of_pairs(program.layout, *program.pairs(y))
+    program = ContactProgram.of(frame.pieces, DIRECTIONS)
+    y = contact_under(program, frame.foreseen.activations)
+    separate = np.full(program.layout.contacts, SEPARATE)
+    states = separate if y is None else states_of_pairs(program.layout, *program.pairs(y))
     other = contact_under(program, frame.known)
-    changed = (
-        np.full_like(states, SEPARATE) if other is None else states_of_pairs(program.layout, *program.pairs(other))
-    )
+    changed = separate if other is None else states_of_pairs(program.layout, *program.pairs(other))
 
     def first() -> tuple[Any, QpSolution]:
         qp = quadratic_program(program.P, program.q, program.A, solver=solver)
@@ -47,7 +50,13 @@ def frame_figures(frame: Frame, solver: QpSolver) -> Row:
     (qp, solution), first_time = timed(first)
     again, again_time = timed(qp.solve, *program.bounds(changed))
     found, search_time = timed(
-        find_states, program, Strategy.TWO_STAGE, frame.predicted, frame.previous, qp_limit=QP_LIMIT, solver=solver
+        search_program,
+        frame.pieces,
+        Strategy.PIECES,
+        frame.foreseen,
+        directions=DIRECTIONS,
+        qp_limit=QP_LIMIT,
+        solver=solver,
     )
     breach = 0.0
     for result, chosen in ((solution, states), (again, changed)):
@@ -92,7 +101,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
             frames=frames + 4,
             activations=GROUPS,
             contacts=contacts,
-            directions=4,
             strength=0.2,
             seed=options.seed,
         )[4:]
@@ -105,7 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             column = {name: np.array([row[name] for row in measured]) for name in measured[0]}
             row = {
                 "contacts": contacts,
-                "variables": made[0].program.layout.variables,
+                "variables": ContactProgram.of(made[0].pieces, DIRECTIONS).layout.variables,
                 "solver": solver.value,
                 **{name: float(np.median(column[name])) for name in ("first", "again", "search")},
                 "qps": float(column["qps"].mean()),

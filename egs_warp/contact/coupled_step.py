@@ -24,6 +24,10 @@ _PUSH_OUT = 0.2
 """Of the depth beyond the tolerance, a step."""
 _ADDED = 0.6
 """Of the tolerance: points that would end deeper join at once."""
+_SINKS = 0.3
+"""Of the tolerance: by how much what is deep already may go deeper in a step; by next to nothing beyond the tolerance.
+"""
+_CREEPS = 0.02
 _SINGULAR = 1e-7
 """Of the mean of the Delassus operator's diagonal: more points than the cage can resolve leave it singular."""
 
@@ -100,8 +104,8 @@ class CoupledSolver:
         velocities: np.ndarray,
         forces: np.ndarray,
     ) -> CoupledResult:
-        """The step from a start of ``velocities`` (N, 3) and ``forces`` (n, 3); ``response`` is kept while it
-        serves.
+        """The step from a start of ``velocities`` (N, 3), which invert no element, and ``forces`` (n, 3); ``response``
+        is kept while it serves.
         """
         problem = response.tangent.problem
         iterations = tangents = 0
@@ -113,7 +117,8 @@ class CoupledSolver:
             gaps, _ = self.detector.gaps(problem.end_positions(velocities))
             contacts = response.contacts
             # What is deep already is held where it is only once it would go deeper.
-            sinking = np.where(gaps < start_gaps - 0.5 * _ADDED * self.penetration_tolerance, gaps, 0.0)
+            allowed = np.where(gaps < -self.penetration_tolerance, _CREEPS, _SINKS) * self.penetration_tolerance
+            sinking = np.where(gaps < start_gaps - allowed, gaps, 0.0)
             added = self.points.deeper(contacts.points, sinking, _ADDED * self.penetration_tolerance)
             if not result.converged or len(added) == 0 or number == _ROUNDS - 1:
                 break

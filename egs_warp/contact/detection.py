@@ -70,17 +70,6 @@ class ContactSet:
         """n."""
         return len(self.points)
 
-    def head(self, count: int) -> ContactSet:
-        """The first ``count`` contacts."""
-        return ContactSet(
-            self.points[:count],
-            self.nodes[:count],
-            self.weights[:count],
-            self.axes[:count],
-            self.gaps[:count],
-            self.frame[: 3 * count],
-        )
-
     def end_gaps(self, dt: float, velocities: np.ndarray) -> np.ndarray:
         """(n,) gap after a step of ``dt`` with nodal end velocities (N, 3)."""
         return self.gaps + dt * (self.frame @ velocities.ravel())[0::3]
@@ -164,7 +153,7 @@ def _hull_points(tet_from_point: np.ndarray, weights: np.ndarray, tet_count: int
 
 
 class ContactDetector:
-    """Finds and keeps a temporally stable contact set."""
+    """Gaps of all points, and the frames of those that take part."""
 
     def __init__(self, geometry: ContactGeometry, *, device: str | None = None) -> None:
         self.geometry = geometry
@@ -223,50 +212,10 @@ class ContactDetector:
         )
         return ContactSet(points, nodes, weights, axes, gaps[points], frame)
 
-    def candidates(self, previous: np.ndarray, gaps: np.ndarray, near: float) -> np.ndarray:
-        """The lowest point of each tetrahedron that comes within ``near`` metres, last step's points first in line.
 
-        ``gaps`` (P,): predicted at the end of the step.
-        """
-        kept = previous[gaps[previous] < 2.0 * near]
-        close = np.flatnonzero(gaps < near)
-        close = close[np.lexsort((gaps[close], self.geometry.tet_from_point[close]))]
-        _, first = np.unique(self.geometry.tet_from_point[close], return_index=True)
-        lowest = close[first]
-        lowest = lowest[np.argsort(gaps[lowest], kind="stable")]
-        fresh = lowest[~np.isin(self.geometry.tet_from_point[lowest], self.geometry.tet_from_point[kept])]
-        return np.concatenate([kept, fresh])
-
-
-def independent_contacts(compliance: np.ndarray, kept: int, limit: int, tolerance: float) -> np.ndarray:
-    """Pivoted Cholesky of N S^-1 N^T (n, n): indices of at most ``limit`` well-conditioned points.
-
-    The first ``kept`` points go first in line. Stops at pivots below ``tolerance`` of the largest diagonal:
-    docs/concepts/contact.md.
-    """
-    residual = np.diag(compliance).copy()
-    scale = residual.max(initial=0.0)
-    factors: list[np.ndarray] = []
-    chosen: list[int] = []
-    for group in (np.arange(kept), np.arange(kept, len(residual))):
-        available = np.zeros(len(residual), bool)
-        available[group] = True
-        while len(chosen) < limit and available.any():
-            pick = int(np.argmax(np.where(available, residual, -1.0)))
-            if residual[pick] <= tolerance * scale:
-                break
-            available[pick] = False
-            row = compliance[pick] - sum((f[pick] * f for f in factors), np.zeros_like(residual))
-            row = row / np.sqrt(residual[pick])
-            factors.append(row)
-            residual = residual - row**2
-            chosen.append(pick)
-    return np.array(chosen, dtype=int)
-
-
-def push_out_speeds(gaps: np.ndarray, dt: float, cap: float, factor: float = 0.5, slop: float = 0.0) -> np.ndarray:
-    """(n,) constant of the normal measure c = N^T u' + min(phi, 0) b / dt + max(phi, 0) / dt, the push-out capped
-    (docs/concepts/contact.md).
+def push_out_speeds(gaps: np.ndarray, dt: float, cap: float, factor: float, slop: float) -> np.ndarray:
+    """(n,) constant of the normal measure c = N^T u' + max(phi, 0) / dt + min(phi + slop, 0) b / dt, the push-out
+    capped (docs/concepts/contact.md); b is ``factor``.
     """
     return np.maximum(gaps, 0.0) / dt + np.maximum(np.minimum(gaps + slop, 0.0) * factor / dt, -cap)
 

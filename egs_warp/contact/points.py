@@ -12,8 +12,6 @@ MOST_AT_REST = 32
 """Cells that touch the ground at rest: the cage cannot resolve more forces than it has nodes there, nor a base tell
 more apart.
 """
-MOST_REGIONS = 8
-"""Regions that touch the ground at rest: the program of a step needs no more to foresee what the ground can give."""
 _FINEST = 0.4
 """Edges of the cage across the smallest cells: small feet stand on several."""
 _WIDER = 1.1
@@ -21,8 +19,7 @@ _WIDER = 1.1
 
 
 class ContactPoints:
-    """Cells of the body's surface about as wide as an edge of the cage, each with at most one point in the contact set,
-    and wider regions.
+    """Cells of the body's surface about as wide as an edge of the cage, each with at most one point in the contact set.
 
     A cell brings its lowest point. Points that press stay, and so do those that a step has added; others leave once
     they are clear of the ground by twice the distance at which they came, or their cell has a clearly lower one: points
@@ -40,7 +37,6 @@ class ContactPoints:
         sole = np.flatnonzero(heights < heights.min() + 2.0 * near)
         spacing = _FINEST * mean_edge_length(geometry.mesh)
         self.cell_from_point = _few_cells(places, heights, sole, spacing, MOST_AT_REST)
-        self.region_from_point = _few_cells(places, heights, sole, spacing, MOST_REGIONS)
 
     def choose(self, previous: np.ndarray, loaded: np.ndarray, gaps: np.ndarray) -> np.ndarray:
         """(n,) points of the next step in ascending order; ``previous`` (m,) were the last's, ``loaded`` (m,) bool

@@ -105,18 +105,10 @@ class ElasticAssembly:
         self.upper_pattern = pattern
         self.diagonal_entries = pattern.indptr[1:] - 1
         self._block_keys = blocks
-        self._entry_from_block_host = entry_from_block
         self._contribution_offsets = wp.array(offsets.astype(np.int32), dtype=int, device=self.device)
         self._block_from_contribution = wp.array(upper[order].astype(np.int32), dtype=int, device=self.device)
         self._entry_from_block = wp.array(entry_from_block, dtype=int, device=self.device)
         self._entries = wp.zeros(pattern.nnz, dtype=real, device=self.device)
-
-    def entries_of_node_pairs(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        """(m, 9) indices into the upper matrix's entries of the 3x3 blocks of node pairs first <= second;
-        -1 where absent.
-        """
-        keys = first.astype(np.int64) * len(self.mesh.nodes) + second
-        return self._entry_from_block_host[np.searchsorted(self._block_keys, keys)]
 
     def _upload(self, target: wp.array, values: np.ndarray) -> None:
         target.assign(np.ascontiguousarray(values, dtype=np.float64))

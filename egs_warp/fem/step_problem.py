@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.elasticity import Damping
@@ -74,6 +75,16 @@ class StepProblem:
     def feasible(self, velocities: np.ndarray) -> bool:
         """Whether no element is inverted at the end of ``velocities`` (N, 3)."""
         return bool(self.body.assembly.determinants(self.end_positions(velocities)).min() > 0.0)
+
+    @cached_property
+    def start(self) -> np.ndarray:
+        """(N, 3) m/s to solve the step from: the body goes on rigidly with its momenta, so no element is inverted, and
+        what is stiff, whose speed at the start says nothing about the end, is at rest."""
+        positions, mass = self.state.positions, self.body.node_mass
+        centre = self.body.centre_of_mass(positions)
+        spin = np.linalg.solve(self.inertia, self.body.angular_momentum(positions, self.state.velocities))
+        turned = Rotation.from_rotvec(self.dt * spin).apply(positions - centre)
+        return mass @ self.state.velocities / mass.sum() + (turned - (positions - centre)) / self.dt
 
     def internal_gradient(self, velocities: np.ndarray, tension: MuscleTension | None) -> np.ndarray:
         """(N, 3) newtons, minus the forces of elasticity, damping and muscles at the end of ``velocities`` (N, 3)."""

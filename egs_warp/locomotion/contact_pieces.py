@@ -23,9 +23,16 @@ _ACTIVE = 1e-3
 """Multiplier, of the objective's value for a unit of the row, from which a bound is worth leaving."""
 _GAIN = 5e-3
 """Share of the objective by which a further piece has to lower it."""
-
 _BROKEN = 0.02
 """By which a start may break a row that its piece does not quite hold."""
+
+_WEDGE = np.radians(30.0)
+"""How far a contact that slides may turn from the way that its friction is taken against. Friction that stays where it
+was while a foot slides elsewhere pushes a body along that no ground would."""
+_NOTHING = 1e-9
+"""Body weights: what rounding leaves of the force of a contact that is open."""
+
+_LEAVES, _SLIPS, _TURNS, _LANDS = 0, 1, 2, 3
 
 FREE, STICK, SLIDE = 0, 1, 2
 
@@ -78,13 +85,13 @@ class ContactModes:
     """(n, 2) unit vectors along which those that slide do."""
 
     @classmethod
-    def of(cls, forces: np.ndarray, velocities: np.ndarray, friction: float) -> ContactModes:
-        """Those of ``forces`` (n, 3) and contact ``velocities`` (n, 3) that obey Coulomb's law."""
+    def of(cls, forces: np.ndarray, friction: float) -> ContactModes:
+        """Those of ``forces`` (n, 3) body weights that obey Coulomb's law."""
         pull = np.linalg.norm(forces[:, 1:], axis=1)
-        pressing = forces[:, 0] > 0.0
+        pressing = forces[:, 0] > _NOTHING
         sliding = pressing & (pull >= (1.0 - 1e-6) * friction * forces[:, 0])
         kind = np.where(sliding, SLIDE, np.where(pressing, STICK, FREE))
-        return cls(kind, _unit(np.where(sliding[:, None], -forces[:, 1:], velocities[:, 1:])))
+        return cls(kind, _unit(-forces[:, 1:]))
 
 
 @dataclass(frozen=True)
@@ -94,7 +101,6 @@ class PieceSolution:
     x: np.ndarray
     """(m + 3n,)."""
     objective: float
-    modes: ContactModes
     onward: ContactModes | None
     """Those of the piece that lies beyond the bounds that hold the optimum back; None if none does."""
     nearest: ContactModes | None
@@ -117,18 +123,21 @@ def search_pieces(
 ) -> PieceSearch:
     """From the piece of ``modes``, which holds ``start`` (m + 3n,), onward as long as the objective falls.
 
-    Neighbouring pieces share the point between them, so no step is lost on an infeasible one.
+    Neighbouring pieces share the point between them, so no step is lost on an infeasible one. What slides in ``modes``
+    is held at first: feet that slide apart under a load each resist only where they came from, and no way leads from
+    there to a common push.
     """
     best: PieceSolution | None = None
     count = infeasible = 0
+    sliding, modes = modes, ContactModes(np.where(modes.kind == SLIDE, STICK, modes.kind), modes.slip)
     while count < qp_limit:
         count += 1
         solution = solve_piece(program, start, modes, solver)
         if solution is None:
             infeasible += 1
-            if best is not None or (modes.kind != SLIDE).all():
+            if best is not None or infeasible > 1 or (sliding.kind != SLIDE).all():
                 break
-            modes = ContactModes(np.where(modes.kind == SLIDE, STICK, modes.kind), modes.slip)
+            modes = sliding
             continue
         if best is not None and solution.objective >= best.objective:
             # Together the contacts went too far; the one that is pushed most may still gain.
@@ -147,8 +156,8 @@ def search_pieces(
 def solve_piece(
     program: ContactPieces, start: np.ndarray, modes: ContactModes, solver: QpSolver | str
 ) -> PieceSolution | None:
-    """Optimum of the activations in the piece of ``modes``; what ``start`` breaks of its bounds may stay broken as
-    much. None without a solution.
+    """Optimum of the activations in the piece of ``modes``; what ``start`` breaks of its bounds, up to ``_BROKEN``, may
+    stay broken as much. None without a solution.
     """
     m = program.activations
     offset, slope = _forces_of(program, modes)
@@ -176,7 +185,7 @@ def solve_piece(
     if len(active) > 1:
         most = active[[int(np.argmax(pushes[active]))]]
         nearest = _beyond(program, modes, x, contact[most], onward[most], pushes[most])
-    return PieceSolution(x, objective, modes, further, nearest)
+    return PieceSolution(x, objective, further, nearest)
 
 
 def _forces_of(program: ContactPieces, modes: ContactModes) -> tuple[np.ndarray, np.ndarray]:
@@ -198,9 +207,6 @@ def _forces_of(program: ContactPieces, modes: ContactModes) -> tuple[np.ndarray,
     return solved[:, 0], solved[:, 1:]
 
 
-_LEAVES, _SLIPS, _STOPS, _LANDS = 0, 1, 2, 3
-
-
 def _bounds(
     program: ContactPieces, modes: ContactModes, offset: np.ndarray, slope: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -216,19 +222,22 @@ def _bounds(
     narrow = friction * np.cos(np.pi / _FACES)
     for c, s in zip(np.cos(angle), np.sin(angle), strict=True):
 
-        def side(value: np.ndarray, c: float = c, s: float = s) -> np.ndarray:
+        def facet(value: np.ndarray, c: float = c, s: float = s) -> np.ndarray:
             return narrow * value[3 * stick] - c * value[3 * stick + 1] - s * value[3 * stick + 2]
 
-        parts.append((side(slope), side(offset), stick, _SLIPS))
+        parts.append((facet(slope), facet(offset), stick, _SLIPS))
     d = modes.slip[slide]
-    parts.append(
-        (
-            d[:, :1] * speed[3 * slide + 1] + d[:, 1:] * speed[3 * slide + 2],
-            d[:, 0] * speed_offset[3 * slide + 1] + d[:, 1] * speed_offset[3 * slide + 2],
-            slide,
-            _STOPS,
+    # The way it slides is near the one that its friction is taken against.
+    for side in (1.0, -1.0):
+        edge = np.sin(_WEDGE) * d + side * np.cos(_WEDGE) * d[:, ::-1] * [-1.0, 1.0]
+        parts.append(
+            (
+                edge[:, :1] * speed[3 * slide + 1] + edge[:, 1:] * speed[3 * slide + 2],
+                edge[:, 0] * speed_offset[3 * slide + 1] + edge[:, 1] * speed_offset[3 * slide + 2],
+                slide,
+                _TURNS,
+            )
         )
-    )
     parts.append((speed[3 * free], speed_offset[3 * free], free, _LANDS))
     A = np.vstack([part[0] for part in parts])
     b = np.concatenate([part[1] for part in parts])
@@ -255,8 +264,6 @@ def _beyond(
             kind[i] = FREE
         elif onward[index] == _SLIPS:
             kind[i], slip[i] = SLIDE, _unit(-forces[i : i + 1, 1:])[0]
-        elif onward[index] == _STOPS:
-            kind[i] = STICK
         elif np.linalg.norm(velocities[i, 1:]) > _SLOWEST:
             kind[i], slip[i] = SLIDE, _unit(velocities[i : i + 1, 1:])[0]
         else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,9 +23,6 @@ class Objective:
     target: np.ndarray
     """(k,) m/s."""
     weight: float
-    lifted: tuple[int, ...] = ()
-    """Nodes whose contacts ought to let go: the first guess of their state is that they separate. Stage 1 keeps last
-    step's activations, so it cannot foresee a foot that the muscles are about to lift."""
 
 
 def centre_of_mass_velocity(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
@@ -46,13 +42,6 @@ class SpinObjective:
     target: np.ndarray
     """(3,) kg m^2/s."""
     weight: float
-
-
-def lifted_contacts(contacts: ContactSet, objectives: Sequence[Objective | SpinObjective]) -> np.ndarray:
-    """(n,) bool: contacts on nodes that an objective lifts."""
-    lifted = [node for wish in objectives if isinstance(wish, Objective) for node in wish.lifted]
-    nearest = contacts.nodes[np.arange(contacts.count), np.argmax(contacts.weights, axis=1)]
-    return np.isin(nearest, lifted)
 
 
 def node_velocities(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
@@ -259,6 +248,14 @@ def part_nodes(body: SoftBody, part: BodyPart, target: np.ndarray, weight: float
         (np.full(3 * count, share), (np.arange(3 * count), columns)), shape=(3 * count, 3 * len(body.node_mass))
     )
     return Objective(f"{part.name} nodes", rows, share * np.asarray(target, float).ravel(), weight)
+
+
+def held_contacts(contacts: ContactSet, loads: np.ndarray, weight: float) -> Objective:
+    """That no contact slides, each weighted by its share of the weight in ``loads`` (n,)."""
+    shares = np.sqrt(np.repeat(loads, 3))
+    shares[::3] = 0.0
+    rows = sparse.csr_matrix(sparse.diags(shares) @ contacts.frame)
+    return Objective("hold", rows, np.zeros(3 * contacts.count), weight)
 
 
 def _cross_matrices(arms: np.ndarray) -> np.ndarray:

@@ -1,22 +1,20 @@
-"""The condensed problem of one step (Eq. 13): its cost, its rows and the linear response behind both.
+"""The program of a step as the paper writes it: contact as complementarity of pyramid forces and slips (Eq. 9, 13).
 
 See docs/concepts/locomotion.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
 
-from egs_warp.contact.detection import ContactSet, push_out_speeds, tangent_directions
-from egs_warp.fem.implicit_step import ImplicitStep
-from egs_warp.fem.step_problem import StepProblem
+from egs_warp.contact.detection import tangent_directions
 from egs_warp.locomotion.complementarity import ContactLayout
-from egs_warp.locomotion.objectives import Objective, SpinObjective
-from egs_warp.muscles.tension import MuscleTension
+from egs_warp.locomotion.contact_pieces import ContactPieces
+
+_REGULAR = 1e-7
 
 
 @dataclass(frozen=True)
@@ -39,14 +37,28 @@ class ContactProgram:
     """(rows, variables)."""
     offset: np.ndarray
     """(rows,)."""
-    reachable: tuple[np.ndarray, np.ndarray] | None = None
-    """Two (M,): bounds of the activations, if not -1 and 1."""
+    lower: np.ndarray
+    """(M,) of the activations."""
+    upper: np.ndarray
+    """(M,) of the activations."""
+
+    @classmethod
+    def of(cls, pieces: ContactPieces, directions: int) -> ContactProgram:
+        """The same step with a friction pyramid of ``directions`` edges in place of the cone."""
+        layout = ContactLayout(pieces.activations, pieces.contacts, directions)
+        spread = _spread(layout)
+        P = spread.T @ (spread.T @ pieces.P).T
+        A, offset = _contact_rows(pieces.rows @ spread, pieces.offset, layout, pieces.friction)
+        P = 0.5 * (P + P.T) + _REGULAR * np.eye(layout.variables)
+        return cls(
+            *(layout, pieces.friction, P, spread.T @ pieces.q, pieces.constant),
+            *(A, offset, pieces.lower, pieces.upper),
+        )
 
     def bounds(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of A y for contact states (n,)."""
         lower, upper = self.layout.bounds(states)
-        if self.reachable is not None:
-            lower[: self.layout.activations], upper[: self.layout.activations] = self.reachable
+        lower[: self.layout.activations], upper[: self.layout.activations] = self.lower, self.upper
         return lower - self.offset, upper - self.offset
 
     def pairs(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -58,180 +70,39 @@ class ContactProgram:
         """Value at ``y``."""
         return float(0.5 * y @ self.P @ y + self.q @ y + self.constant)
 
-    def contact_forces(self, y: np.ndarray) -> np.ndarray:
-        """(n, 3) body weights: normal and two tangents."""
-        layout = self.layout
-        tangent = y[layout.tangent].reshape(layout.contacts, layout.directions) @ tangent_directions(layout.directions)
-        return np.column_stack([np.maximum(y[layout.normal], 0.0), tangent])
+    def forces_of(self, y: np.ndarray) -> np.ndarray:
+        """(M + 3n,) activations and contact forces, as ``ContactPieces`` has them, at ``y``."""
+        return _spread(self.layout) @ y
 
 
-@dataclass(frozen=True)
-class LinearResponse:
-    """v = base + response y, linearised at the prediction (docs/concepts/locomotion.md)."""
-
-    base: np.ndarray
-    """(3N,) m/s without muscles and contact."""
-    response: np.ndarray
-    """(3N, variables)."""
-
-
-@dataclass(frozen=True)
-class CostScales:
-    """What the cost is measured in."""
-
-    speed: float
-    """sqrt(g H), m/s."""
-    activation: np.ndarray
-    """(M,) weights of a^2, a in its bounds."""
-    activation_change: np.ndarray
-    """(M,) weights of the squared change of a since the last step."""
+def _spread(layout: ContactLayout) -> sparse.csr_matrix:
+    """(M + 3n, variables) activations and forces (normal and two tangents a contact) of y."""
+    m, n, nd = layout.activations, layout.contacts, layout.directions
+    spread = np.zeros((m + 3 * n, layout.variables))
+    spread[np.arange(m), np.arange(m)] = 1.0
+    normals = m + 3 * np.arange(n)
+    spread[normals, layout.normal.start + np.arange(n)] = 1.0
+    for k, direction in enumerate(tangent_directions(nd)):
+        for t in (0, 1):
+            spread[normals + 1 + t, layout.tangent.start + nd * np.arange(n) + k] = direction[t]
+    return sparse.csr_matrix(spread)
 
 
-def linear_response(
-    step: ImplicitStep,
-    actuation: np.ndarray,
-    contacts: ContactSet,
-    velocities: np.ndarray,
-    layout: ContactLayout,
-    tension: MuscleTension,
-) -> LinearResponse:
-    """(S + dt^2 K_a) v = M v0 + dt (f + A a + W^T f_c) around p + dt ``velocities`` (N, 3).
-
-    ``actuation`` (3N, M): newtons at full activation, in the directions at p + dt ``velocities``; K_a is the stiffness
-    of the muscles at the last step's ``tension``.
-    """
-    body, dt = step.body, step.dt
-    solve = step.tangent(velocities, tension)
-    residual = step.gradient(velocities, body.node_mass[:, None] * body.gravity)
-    weights = body.weight * contacts.frame.T.toarray()
-    sources = np.hstack([dt * actuation, dt * weights, residual.reshape(-1, 1)])
-    solved = solve(sources)
-    base, solved = velocities.ravel() - solved[:, -1], solved[:, :-1]
-    contact = solved[:, layout.activations :].reshape(len(base), contacts.count, 3)
-    tangent = np.einsum("vnt,dt->vnd", contact[:, :, 1:], tangent_directions(layout.directions))
-    response = np.concatenate(
-        [
-            solved[:, : layout.activations],
-            contact[:, :, 0],
-            tangent.reshape(len(base), layout.contacts * layout.directions),
-            np.zeros((len(base), contacts.count)),
-        ],
-        axis=1,
-    )
-    return LinearResponse(base, response)
-
-
-def contact_program(
-    step: ImplicitStep,
-    linear: LinearResponse,
-    contacts: ContactSet,
-    layout: ContactLayout,
-    objectives: Sequence[Objective | SpinObjective],
-    previous: np.ndarray,
-    *,
-    friction: float,
-    push_out_cap: float,
-    scales: CostScales,
-) -> ContactProgram:
-    """The problem of one step; ``previous`` (M,) activations in their bounds, ``push_out_cap`` m/s."""
-    moments = _moment_rows(step, contacts, layout)
-    shift = push_out_speeds(contacts.gaps, step.dt, push_out_cap)
-    return program_of(
-        step, linear, contacts.frame, shift, moments, layout, objectives, previous, friction=friction, scales=scales
-    )
-
-
-def program_of(
-    step: ImplicitStep | StepProblem,
-    linear: LinearResponse,
-    frame: sparse.csr_matrix,
-    shift: np.ndarray,
-    moments: np.ndarray,
-    layout: ContactLayout,
-    objectives: Sequence[Objective | SpinObjective],
-    previous: np.ndarray,
-    *,
-    friction: float,
-    scales: CostScales,
-) -> ContactProgram:
-    """The problem of one step for contacts whose velocities are ``frame`` (3n, 3N) v and whose normal measure has the
-    constant ``shift`` (n,) m/s; ``moments`` (3, variables) is the change of angular momentum that each unknown
-    makes.
-    """
-    P, q, constant = _quadratic_cost(step, linear, moments, objectives, layout, previous, scales)
-    A, offset = contact_rows(linear, frame, shift, layout, friction, scales.speed)
-    return ContactProgram(layout, friction, P, q, constant, A, offset)
-
-
-def _moment_rows(step: ImplicitStep, contacts: ContactSet, layout: ContactLayout) -> np.ndarray:
-    """(3, variables) change of angular momentum over the step, arms at its start, for each unknown."""
-    positions = step.state.positions
-    points = np.einsum("nw,nwi->ni", contacts.weights, positions[contacts.nodes])
-    arms = points - step.body.centre_of_mass(positions)
-    torques = step.dt * step.body.weight * np.cross(arms[:, None, :], contacts.axes)
-    rows = np.zeros((3, layout.variables))
-    rows[:, layout.normal] = torques[:, 0].T
-    tangent = np.einsum("nti,dt->ndi", torques[:, 1:], tangent_directions(layout.directions))
-    rows[:, layout.tangent] = tangent.reshape(layout.contacts * layout.directions, 3).T
-    return rows
-
-
-def _quadratic_cost(
-    step: ImplicitStep | StepProblem,
-    linear: LinearResponse,
-    moments: np.ndarray,
-    objectives: Sequence[Objective | SpinObjective],
-    layout: ContactLayout,
-    previous: np.ndarray,
-    scales: CostScales,
-) -> tuple[np.ndarray, np.ndarray, float]:
-    body, state = step.body, step.state
-    P = 1e-7 * np.eye(layout.variables)
-    q = np.zeros(layout.variables)
-    constant = float(scales.activation_change @ previous**2)
-    for objective in objectives:
-        if isinstance(objective, SpinObjective):
-            gyration = np.sqrt(0.5 * np.trace(body.inertia(state.positions)) / body.mass)
-            unit = body.mass * gyration * scales.speed
-            rows = moments / unit
-            gap = (body.angular_momentum(state.positions, state.velocities) - objective.target) / unit
-        else:
-            rows = (objective.rows @ linear.response) / scales.speed
-            gap = (objective.rows @ linear.base - objective.target) / scales.speed
-        P += 2.0 * objective.weight * rows.T @ rows
-        q += 2.0 * objective.weight * rows.T @ gap
-        constant += objective.weight * float(gap @ gap)
-    m = np.arange(layout.activations)
-    P[m, m] += 2.0 * (scales.activation + scales.activation_change)
-    q[m] -= 2.0 * scales.activation_change * previous
-    return P, q, constant
-
-
-def contact_rows(
-    linear: LinearResponse,
-    frame: sparse.csr_matrix | np.ndarray,
-    shift: np.ndarray,
-    layout: ContactLayout,
-    friction: float,
-    speed_scale: float,
+def _contact_rows(
+    speeds: np.ndarray, base: np.ndarray, layout: ContactLayout, friction: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows A y + offset of ``ContactLayout``: y itself, then c, D^T u' + E lambda and mu f_n - E^T f_t (Eq. 9).
-
-    ``shift`` (n,) m/s is the constant of the normal measure c.
-    """
+    """Rows A y + offset of ``ContactLayout``: y itself, then c, D^T u' + E lambda and mu f_n - E^T f_t (Eq. 9), of
+    contact velocities ``speeds`` (3n, variables) y + ``base`` (3n,)."""
     n, nd = layout.contacts, layout.directions
-    speed = (frame @ linear.response).reshape(n, 3, layout.variables) / speed_scale
-    base = (frame @ linear.base).reshape(n, 3) / speed_scale
+    speed, base = np.asarray(speeds).reshape(n, 3, layout.variables), base.reshape(n, 3)
     table = tangent_directions(nd)
     lam = np.zeros((n, layout.variables))
     lam[np.arange(n), layout.slip.start + np.arange(n)] = 1.0
     slip = np.einsum("dt,ntv->ndv", table, speed[:, 1:]) + lam[:, None, :]
     cone = np.zeros((n, layout.variables))
-    for i in range(n):
-        cone[i, layout.normal.start + i] = friction
-        cone[i, layout.tangent.start + i * nd : layout.tangent.start + (i + 1) * nd] = -1.0
+    cone[np.arange(n), layout.normal.start + np.arange(n)] = friction
+    for k in range(nd):
+        cone[np.arange(n), layout.tangent.start + nd * np.arange(n) + k] = -1.0
     A = np.vstack([np.eye(layout.variables), speed[:, 0], slip.reshape(n * nd, layout.variables), cone])
-    offset = np.concatenate(
-        [np.zeros(layout.variables), base[:, 0] + shift / speed_scale, (base[:, 1:] @ table.T).ravel(), np.zeros(n)]
-    )
+    offset = np.concatenate([np.zeros(layout.variables), base[:, 0], (base[:, 1:] @ table.T).ravel(), np.zeros(n)])
     return A, offset

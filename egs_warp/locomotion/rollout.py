@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
-from egs_warp.contact.corrector import contact_step
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.fem.factorisation import Factorisation
-from egs_warp.fem.implicit_step import ImplicitStep
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.locomotion.objectives import Objective, SpinObjective
 from egs_warp.locomotion.recorder import Recorder
-from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
+from egs_warp.locomotion.stepper import STEPS_A_UNIT, LocomotionStepper, StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 
 FRAME_RATE = 60
@@ -44,10 +41,14 @@ class Simulation:
     """(n,) index into the trajectory's times for each frame of the video."""
 
 
-def steps_per_frame(body: SoftBody) -> int:
-    """Solver steps a frame, so that a step is at most sqrt(H / g) / 19 (docs/concepts/conventions.md)."""
-    longest = np.sqrt(body.height / np.linalg.norm(body.gravity)) / 19.0
-    return int(np.ceil(1.0 / (FRAME_RATE * longest) - 1e-3))
+def solver_steps(body: SoftBody, step: float | None = None) -> tuple[float, int]:
+    """Seconds of a solver step, and how many make a frame: steps of at most ``step`` seconds and of sqrt(H / g) / 19,
+    within which a body can be steered (docs/concepts/conventions.md). A frame is as long as a ``step`` that is longer.
+    """
+    longest = float(np.sqrt(body.height / np.linalg.norm(body.gravity))) / STEPS_A_UNIT
+    frame = max(1.0 / FRAME_RATE, step or 0.0)
+    count = int(np.ceil(frame / min(longest, step or longest) - 1e-3))
+    return frame / count, count
 
 
 def settle(stepper: LocomotionStepper) -> BodyState:
@@ -59,25 +60,12 @@ def settle(stepper: LocomotionStepper) -> BodyState:
     body = stepper.body
     state = BodyState(body.mesh.nodes.copy(), np.zeros_like(body.mesh.nodes))
     dt = 0.25 * np.sqrt(body.height / np.linalg.norm(body.gravity))
-    force = body.node_mass[:, None] * body.gravity
-    factorisation = Factorisation(body)
     memory = stepper.initial_memory()
     for _ in range(12):
-        step = ImplicitStep(body, state, dt, factorisation)
-        points = stepper.choose_contacts(step, memory)
-        result = contact_step(
-            step,
-            stepper.detector,
-            points,
-            force,
-            start_velocities=np.zeros_like(state.positions),
-            start_forces=stepper.matched_forces(memory, points),
-            push_out_cap=0.0,
-            penetration_tolerance=stepper.settings.penetration_tolerance * body.height,
-        )
+        result = stepper.passive_step(state, memory, dt)
         moved = dt * float(np.abs(result.velocities).max())
-        state = BodyState(step.end_positions(result.velocities), np.zeros_like(state.positions))
-        memory = stepper.remember(result, memory.activations)
+        state = BodyState(state.positions + dt * result.velocities, np.zeros_like(state.positions))
+        memory = replace(memory, points=result.contacts.points, forces=result.forces)
         gone = body.centre_of_mass(state.positions) - body.centre_of_mass(body.mesh.nodes)
         gives_way = moved > 0.2 * body.height or np.linalg.norm(gone) > 0.1 * body.height
         if gives_way or moved < 2e-4 * body.height:
@@ -100,12 +88,11 @@ def roll_out(
 ) -> Simulation:
     """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``.
 
-    ``step``: seconds of a solver step, if not the usual (docs/concepts/conventions.md); one longer than a
-    frame makes the frame as long. ``place`` is where the body lies in its capture; steps are written into the folder
-    that ``parts`` tells as they are done (``Recorder``). ``progress`` is told each frame done.
+    ``step``: seconds that a solver step takes at most, see ``solver_steps``. ``place`` is where the body lies in its
+    capture; steps are written into the folder that ``parts`` tells as they are done (``Recorder``). ``progress`` is
+    told each frame done.
     """
-    per_frame = steps_per_frame(stepper.body) if step is None else max(round(1.0 / (FRAME_RATE * step)), 1)
-    dt = step or 1.0 / (FRAME_RATE * per_frame)
+    dt, per_frame = solver_steps(stepper.body, step)
     state, memory = start, stepper.initial_memory()
     reports: list[StepReport] = []
     shown = [0]

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sparse
 
+from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.objectives import Objective, SpinObjective
 
-EFFORT = 0.1
+EFFORT = 1.0
 """Cost of m g H of elastic and damping energy."""
 HORIZON = 0.16
 """Of sqrt(H / g): how far ahead that energy is foreseen. One step ahead, a body that holds itself bent gains next to
@@ -69,10 +70,32 @@ def objectives_cost(
     return QuadraticCost(P, q, constant)
 
 
+def objectives_missed(
+    problem: StepProblem,
+    objectives: Sequence[Objective | SpinObjective],
+    velocities: np.ndarray,
+    torque: np.ndarray,
+    speed: float,
+) -> float:
+    """The same weighted squares of a step that ends at ``velocities`` (N, 3) under contact forces of ``torque`` (3,)
+    about the centre of mass, N m."""
+    body, state, total = problem.body, problem.state, 0.0
+    for objective in objectives:
+        if isinstance(objective, SpinObjective):
+            gyration = np.sqrt(0.5 * np.trace(problem.inertia) / body.mass)
+            momentum = body.angular_momentum(state.positions, state.velocities) + problem.dt * torque
+            gap = (momentum - objective.target) / (body.mass * gyration * speed)
+        else:
+            gap = (objective.rows @ velocities.ravel() - objective.target) / speed
+        total += objective.weight * float(gap @ gap)
+    return total
+
+
 def effort_cost(
     problem: StepProblem,
     linear: LinearStep,
     foreseen: np.ndarray,
+    factors: SparseFactors,
     *,
     weight: float = EFFORT,
     horizon: float = HORIZON,
@@ -81,14 +104,23 @@ def effort_cost(
     the body goes on at its end velocity, around ``foreseen`` (3N,) m/s.
 
     Of all the shapes in which a body does what is asked, it takes the one that strains it least, and gives back what
-    it has stored: without this, muscles work against each other.
+    it has stored: without this, muscles work against each other. What is stiff goes on only until it is slack, as in
+    one implicit step over the horizon, whose matrix ``factors`` takes: carried on at its speed, what lets go would seem
+    to be strained the other way.
     """
     body = problem.body
-    ahead = max(horizon * float(np.sqrt(body.height / np.linalg.norm(body.gravity))), problem.dt)
+    time = max(horizon * float(np.sqrt(body.height / np.linalg.norm(body.gravity))), problem.dt)
     end = problem.end_positions(foreseen.reshape(-1, 3))
-    assembly, damping = body.assembly, problem.damping
-    upper = assembly.matrix(assembly.matrix_entries(end, damping, projected=True))
-    moves = np.column_stack([ahead * linear.columns, ahead * linear.base - problem.dt * foreseen])
+    assembly, damping = body.assembly, body.assembly.damping(problem.state.positions, time)
+    entries = assembly.matrix_entries(end, damping, projected=True)
+    upper = assembly.matrix(entries)
+    implicit = time**2 * entries
+    implicit[assembly.diagonal_entries] += np.repeat(body.node_mass, 3)
+    factors.update(implicit)
+    speeds = np.column_stack([linear.columns, linear.base])
+    further = factors.solve(np.repeat(body.node_mass, 3)[:, None] * speeds)
+    moves = problem.dt * speeds + (time - problem.dt) * further
+    moves[:, -1] -= problem.dt * foreseen
     quadratic = moves.T @ (upper @ moves + sparse.triu(upper, 1).T @ moves)
     force = assembly.gradient(end, damping).ravel() @ moves
     unit = weight / (body.weight * body.height)

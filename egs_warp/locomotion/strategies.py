@@ -1,4 +1,4 @@
-"""Strategies that choose the contact states of a step's program (Eq. 13): static, QPCC, two-stage, exact.
+"""Strategies that choose the contact states of a step's program (Eq. 13), and with them the activations.
 
 See docs/concepts/locomotion.md.
 """
@@ -13,7 +13,16 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.locomotion.branch_and_bound import exact_states
-from egs_warp.locomotion.complementarity import SEPARATE, STATIC, Pivot, plain_pivots, proposed_pivots, states_of_pairs
+from egs_warp.locomotion.complementarity import (
+    SEPARATE,
+    STATIC,
+    Pivot,
+    plain_pivots,
+    proposed_pivots,
+    states_from_prediction,
+    states_of_pairs,
+)
+from egs_warp.locomotion.contact_pieces import ContactModes, ContactPieces, PieceSearch, search_pieces
 from egs_warp.locomotion.lemke import lemke
 from egs_warp.locomotion.program import ContactProgram
 from egs_warp.locomotion.solvers import QpSolution, QpSolver, QpStatus, QuadraticProgram, quadratic_program
@@ -35,16 +44,23 @@ PATIENCE = 3
 
 
 class Strategy(Enum):
-    """How the contact states are found; all solve the same programs."""
+    """How the contact states are found."""
 
+    PIECES = "pieces"
+    """Contact is what the activations make of it: from the piece that stage 1 foresees over the bounds that hold the
+    optimum back (``contact_pieces``). The only one with the exact friction cone, and with no unknowns but activations.
+    """
+    PAPER = "paper"
+    """The paper's: the QP in the states that stage 1 predicts (Eq. 12), then one contact at a time as its own
+    multipliers say."""
     STATIC = "static"
     """Every contact stays static: one QP."""
     QPCC = "qpcc"
     """From all-static, one contact at a time, as its own multipliers say (after Tan, Turk and Liu 2012)."""
     QPCC_OUR_MOVES = "qpcc-our-moves"
-    """The same from all-static with the moves of two-stage: what the moves alone are worth."""
-    TWO_STAGE = "two-stage"
-    """From the states that stage 1 predicts, several contacts at a time (the paper's Eq. 12 and 13)."""
+    """The same from all-static with the moves of relaxed: what the moves alone are worth."""
+    RELAXED = "relaxed"
+    """From where the optimum without complementarity would end up under true contact, several contacts at a time."""
     EXACT = "exact"
     """The global optimum by branch and bound: for small problems."""
 
@@ -148,6 +164,44 @@ class _Search:
         return SearchResult(point.x, self.best is None, states, objective, self.count, self.infeasible)
 
 
+@dataclass(frozen=True)
+class Foreseen:
+    """Stage 1: what known activations, first those of the last step, would bring."""
+
+    activations: np.ndarray
+    """(M,) in their bounds."""
+    forces: np.ndarray
+    """(n, 3) body weights: normal and two tangents of each contact."""
+    velocities: np.ndarray
+    """(n, 3) sqrt(g H)."""
+
+
+def search_program(
+    program: ContactPieces,
+    strategy: Strategy | str,
+    foreseen: Foreseen,
+    *,
+    directions: int,
+    qp_limit: int,
+    solver: QpSolver | str = QpSolver.OSQP,
+) -> PieceSearch:
+    """Activations and contact forces of a step's program by ``strategy`` (or its name), with at most ``qp_limit`` QPs
+    (``PATIENCE`` times as many in doubt); all but ``PIECES`` have a friction pyramid of ``directions`` edges.
+    """
+    strategy, friction = Strategy(strategy), program.friction
+    if strategy is Strategy.PIECES:
+        start = np.concatenate([foreseen.activations, foreseen.forces.ravel()])
+        modes = ContactModes.of(foreseen.forces, friction)
+        return search_pieces(program, start, modes, qp_limit=qp_limit, solver=solver)
+    paired = ContactProgram.of(program, directions)
+    predicted = states_from_prediction(
+        foreseen.forces[:, 0], foreseen.forces[:, 1:], foreseen.velocities[:, 1:], friction, directions
+    )
+    found = find_states(paired, strategy, predicted, foreseen.activations, qp_limit=qp_limit, solver=solver)
+    x = None if found.y is None else paired.forces_of(found.y)
+    return PieceSearch(x, found.objective, found.qp_count, found.infeasible)
+
+
 def find_states(
     program: ContactProgram,
     strategy: Strategy | str,
@@ -157,7 +211,7 @@ def find_states(
     qp_limit: int,
     solver: QpSolver | str = QpSolver.OSQP,
 ) -> SearchResult:
-    """Contact states and the optimum for them by ``strategy`` (or its name).
+    """Contact states and the optimum for them by ``strategy`` (or its name), which is not ``PIECES``.
 
     ``predicted`` (n,) states of stage 1 (Eq. 12); ``activations`` (M,) of the last step, in their bounds. Where a
     strategy's own first states have no solution, it starts from those that follow from ``activations``, which always
@@ -171,7 +225,7 @@ def find_states(
         return SearchResult(found.y, False, found.states, found.objective, found.qp_count, 0)
     qp = quadratic_program(program.P, program.q, program.A, solver=solver)
     search = _Search(program, qp, qp_limit)
-    if strategy is Strategy.TWO_STAGE:
+    if strategy is Strategy.RELAXED:
         _start_relaxed(search, predicted, activations)
         _move(search, together=True)
         for start in _other_starts(search, predicted):
@@ -184,11 +238,11 @@ def find_states(
             if kept[0] is not None and (search.best is None or search.best.objective > kept[0].objective):
                 search.best, search.states = kept
         return search.result()
-    search.attempt(np.full(program.layout.contacts, STATIC))
+    search.attempt(predicted if strategy is Strategy.PAPER else np.full(program.layout.contacts, STATIC))
     if search.best is None:
         search.attempt_contact(activations)
     if strategy is not Strategy.STATIC:
-        search.moves = plain_pivots if strategy is Strategy.QPCC else proposed_pivots
+        search.moves = proposed_pivots if strategy is Strategy.QPCC_OUR_MOVES else plain_pivots
         _move(search, together=False)
     return search.result()
 
@@ -211,13 +265,13 @@ def _start_relaxed(search: _Search, predicted: np.ndarray, activations: np.ndarr
     Its objective is a bound on every state's; its activations are mostly right, its forces are not.
     """
     program, layout = search.program, search.program.layout
-    lower, upper = layout.bounds(np.full(layout.contacts, STATIC))
+    lower, upper = program.bounds(np.full(layout.contacts, STATIC))
     upper[layout.activations :] = np.inf
     search.count += 1
-    relaxed = search.qp.solve(lower - program.offset, upper - program.offset)
+    relaxed = search.qp.solve(lower, upper)
     if relaxed.usable:
         search.relaxed = relaxed
-        activations = np.clip(relaxed.x[: layout.activations], -1.0, 1.0)
+        activations = np.clip(relaxed.x[: layout.activations], program.lower, program.upper)
     if not search.attempt_contact(activations):
         search.attempt(predicted)
 

@@ -11,7 +11,7 @@ from scipy.spatial.distance import squareform
 
 from egs_warp.muscles.muscle_set import MuscleSet
 
-MOST_SYNERGIES = 72
+MOST_SYNERGIES = 120
 
 
 @dataclass(frozen=True)

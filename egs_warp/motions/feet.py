@@ -12,6 +12,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from egs_warp.contact.detection import ContactSet
 from egs_warp.errors import UserError
 from egs_warp.geometry.tetmesh import TetMesh, edge_graph
 from egs_warp.locomotion.stepper import StepReport
@@ -81,13 +82,16 @@ def foot_of_node(feet: Sequence[Foot]) -> np.ndarray:
     return np.argmax([foot.leg for foot in feet], axis=0)
 
 
+def foot_of_contact(feet: Sequence[Foot], contacts: ContactSet) -> np.ndarray:
+    """(n,) index of the foot that each contact point goes with."""
+    return foot_of_node(feet)[contacts.nodes[np.arange(contacts.count), np.argmax(contacts.weights, axis=1)]]
+
+
 def foot_loads(feet: Sequence[Foot], report: StepReport | None, weight: float) -> np.ndarray:
     """(feet,) share of ``weight`` (newtons) that each foot carried in a step."""
     loads = np.zeros(len(feet))
     if report is not None:
-        contacts = report.contacts
-        nearest = contacts.nodes[np.arange(contacts.count), np.argmax(contacts.weights, axis=1)]
-        np.add.at(loads, foot_of_node(feet)[nearest], report.forces[:, 0] / weight)
+        np.add.at(loads, foot_of_contact(feet, report.contacts), report.forces[:, 0] / weight)
     return loads
 
 

@@ -78,7 +78,7 @@ class Follow:
         for key in self.keys:
             if key.part not in self.parts:
                 raise UserError(f"{key.where}: the body has no part {key.part!r}; it has {', '.join(self.parts)}")
-        self.pose = PoseFamily(self.body, place.ground, place.standing, place.touching)
+        self.pose = PoseFamily(self.body, place.ground, place.standing, place.touching, place.friction)
         self.phase = FollowPhase.FOLLOW
         self._standing = place.standing
         self._gravity = float(np.linalg.norm(self.body.gravity))
@@ -160,15 +160,13 @@ class Follow:
         balance = np.array([*(seen.base - self.pose.base_offset), self.pose.standing_height])
         rules: list[Objective | SpinObjective] = []
         velocity = self._rate / 3.0 * (balance - seen.com)
-        acceleration = (velocity - seen.velocity) / dt
-        level = self.pose.balanced_acceleration(seen, acceleration[:2], float(acceleration[2]), self._gravity)
-        velocity[:2] = seen.velocity[:2] + dt * level
+        pose = self.pose.over_base(seen.com, seen.base, seen.heading)
+        upright = self.pose.turn_towards(state, pose) * 0.7 * self._rate
+        velocity, spin = self.pose.balanced(state, seen, velocity, upright, dt)
         if not {("body", Quantity.POSITION), ("body", Quantity.VELOCITY)} & ruled:
             rules.append(centre_of_mass_velocity(self.body, self.ground.axes.T @ velocity, self.weights.com))
         if not {("body", Quantity.ORIENTATION), ("body", Quantity.ANGULAR_MOMENTUM)} & ruled:
-            pose = self.pose.over_base(seen.com, seen.base, seen.heading)
-            spin = self.body.inertia(state.positions) @ (self.pose.turn_towards(state, pose) * 0.7 * self._rate)
-            rules.append(SpinObjective(spin, self.weights.spin))
+            rules.append(SpinObjective(self.body.inertia(state.positions) @ spin, self.weights.spin))
         # The shape at rest goes along with the centre of mass.
         arms = self._standing - self.body.centre_of_mass(self._standing)
         now = state.positions - self.body.centre_of_mass(state.positions)

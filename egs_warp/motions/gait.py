@@ -8,6 +8,9 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial import ConvexHull
 
+_CARRIED_FROM, _CARRIED = 0.2, 0.6
+"""Parts of a swing: when a foot begins to be carried ahead, and for how long."""
+
 
 @dataclass(frozen=True)
 class Gait:
@@ -35,6 +38,16 @@ class Gait:
     def swings(self) -> int:
         """Swings in all."""
         return self.steps + 1
+
+    @property
+    def carried_from(self) -> float:
+        """Seconds into a swing at which the foot goes ahead."""
+        return _CARRIED_FROM * self.swing_time
+
+    @property
+    def carried_until(self) -> float:
+        """Seconds into a swing at which it is over its next footprint."""
+        return (_CARRIED_FROM + _CARRIED) * self.swing_time
 
     @property
     def distance(self) -> float:
@@ -66,13 +79,18 @@ class Gait:
         """Metres a foot is above the ground when ``progress`` (0 to 1) of its swing is over;
         it leaves and lands at rest.
         """
-        return self.lift * float(_smooth(progress / 0.2) * (1.0 - _smooth((progress - 0.65) / 0.35)))
+        return self.lift * float(_smooth(progress / 0.4) * (1.0 - _smooth((progress - 0.65) / 0.35)))
 
     @staticmethod
     def carried(progress: float) -> float:
         """Part of its way that a foot has gone when ``progress`` (0 to 1) of its swing is over; it has arrived before
         it lands, lest an early touch of the ground drag it."""
-        return float(_smooth((progress - 0.1) / 0.7))
+        return float(_smooth((progress - _CARRIED_FROM) / _CARRIED))
+
+    @staticmethod
+    def eased(progress: float) -> float:
+        """Part to which a foot is steered to its place when ``progress`` (0 to 1) of its swing is over."""
+        return float(_smooth(progress / 0.3))
 
 
 def _smooth(s: float) -> float:

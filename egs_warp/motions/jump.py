@@ -16,7 +16,7 @@ from egs_warp.locomotion.objectives import Objective, SpinObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.facing import Facing, Straight
-from egs_warp.motions.jump_plan import FURTHEST_LEAN, LEAN, JumpPlan, JumpTarget, plan_jump
+from egs_warp.motions.jump_plan import FURTHEST_LEAN, LEAN, JumpPlan, JumpTarget, plan_jump, stopping_time
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.stance import Calm, Ground, Measurement, PoseFamily, Weights
 
@@ -34,10 +34,6 @@ RUN_ON = 0.08
 on the pawn)."""
 CLEARANCE = 0.15
 """Of the height of a step: how far above it the feet are before they swing ahead."""
-AIRBORNE_POSE = 0.08
-"""Weight of the pose in the air, where nothing else can be steered and the feet have to get to their place. Much more
-crumples the body, and one so slender that it was made stiffer to stand (``SoftBody.stiffening``) buckles under less, by
-the square."""
 IN_TIME = 2.5
 """Over the time left in the air: the rate at which the pose of the landing is approached, gently at first."""
 TOUCH_DOWN = 0.06
@@ -45,6 +41,12 @@ TOUCH_DOWN = 0.06
 foot."""
 LONGEST_LANDING = 9.0
 """Of sqrt(H / g): a body that is not calm by then counts as at rest."""
+TOUCHING_DOWN = 0.5
+"""Of sqrt(H / g): the time from touch-down until balance and upright are asked for in full."""
+FLAT = 0.7
+"""Of the lean of the landing: what the body is not to be turned by at touch-down. It shears by so much less than its
+feet are ahead, and on its heels it would be thrown over them.
+"""
 BLEND = 0.3
 """Of sqrt(H / g): the time in which a phase's pose takes over from the last one's."""
 
@@ -77,12 +79,13 @@ class Jump:
             ground.origin + target.distance * ground.axes[0] + target.rise * ground.axes[2],
             ground.surface_normal,
         )
-        self.pose = PoseFamily(body, ground, place.standing, place.touching)
+        self.pose = PoseFamily(body, ground, place.standing, place.touching, place.friction)
         self._landing = PoseFamily(
             body,
             landing,
             landing.world(ground.local(place.standing)),
             landing.world(ground.local(place.touching)),
+            place.friction,
         )
         ahead = ground.axes[0] @ (place.touching - body.centre_of_mass(place.standing)).T
         self.plan = plan_jump(
@@ -100,7 +103,6 @@ class Jump:
         self._start_com = body.centre_of_mass(local)
         self._start_base = self._start_com[:2] + self.pose.base_offset
         self._time_unit = float(np.sqrt(body.height / self.gravity))
-        self._airborne_weight = max(AIRBORNE_POSE / body.stiffening**2, self.weights.pose)
         self._last_pose = self._pose_before = np.eye(3)
         self._asked: np.ndarray | None = None
         self._flew = False
@@ -154,7 +156,7 @@ class Jump:
     def _advance_phase(self, seen: Measurement, time: float, dt: float) -> None:
         # What a foot brushes on its way up is no landing.
         seen = replace(seen, touching=seen.touching and seen.velocity[2] < 0.0)
-        elapsed, plan = time - self._entered, self.plan
+        elapsed, plan = time - self._entered + 1e-9, self.plan
         following = {
             JumpPhase.SETTLE: elapsed >= 0.3 * self._time_unit,
             JumpPhase.CROUCH: elapsed >= plan.crouch_time,
@@ -202,7 +204,8 @@ class Jump:
             position, velocity = self.plan.crouch(self._start_com, elapsed)
         velocity = self._following(seen, position, velocity, dt)
         pose = self.pose.over_base(position, self._start_base)
-        return self._write(state, velocity, pose, self._upright(state, pose), dt)
+        velocity, spin = self.pose.balanced(state, seen, velocity, self._upright(state, pose), dt)
+        return self._write(state, velocity, pose, spin, dt)
 
     def _thrust(
         self, state: BodyState, seen: Measurement, elapsed: float, dt: float
@@ -222,21 +225,23 @@ class Jump:
         short = self._asked - seen.velocity[:2] if self._asked is not None else np.zeros(2)
         most = np.linalg.norm(change)
         short *= min(1.0, most / max(float(np.linalg.norm(short)), 1e-12))
-        velocity = self._balanced(seen, np.array([*(seen.velocity[:2] + change + short), up]), dt)
-        self._asked = velocity[:2]
-        upright = self.pose.over_base(landing, self._base_of_landing(), self.facing.turned)
+        velocity = np.array([*(seen.velocity[:2] + change + short), up])
+        flat = self._base_of_landing() - FLAT * np.array([self.plan.landing_lag, 0.0])
+        upright = self.pose.over_base(landing, flat, self.facing.turned)
         # From what keeps it upright to what brings it to the landing's tilt by then.
         share = min(elapsed / plan.thrust_time, 1.0)
         tilt = share * self.pose.turn_towards(state, upright) / plan.flight_time
         standing = self.pose.over_base(position, self._start_base, self.facing.turned)
         tilt = tilt + (1.0 - share) * self._upright(state, standing)
         spin = self.facing.thrust_spin(tilt, state, self.ground.axes[2], plan.flight_time)
+        velocity, spin = self.pose.balanced(state, seen, velocity, spin, dt)
+        self._asked = velocity[:2]
         return self._write(state, velocity, standing, spin, dt)
 
     def _fly(self, state: BodyState, seen: Measurement, dt: float) -> list[Objective | SpinObjective]:
         touch_down, left = self._touch_down(seen, dt)
         heading = self.facing.turned - self.facing.turn
-        pose = self.pose.over_base(touch_down, self._foothold(state, seen, touch_down), heading)
+        pose = self.pose.over_base(touch_down, self._foothold(state, seen, touch_down, left), heading)
         # Nothing turns a body in the air; a foot that lags on the ground must not push any more.
         momentum = self.body.angular_momentum(state.positions, state.velocities)
         spin = np.linalg.solve(self.body.inertia(state.positions), momentum)
@@ -249,25 +254,24 @@ class Jump:
         goal = np.array([*(seen.base - self.pose.base_offset), self._start_com[2]])
         acceleration = rate**2 * (goal - seen.com) - 2.0 * rate * seen.velocity
         acceleration[2] = max(acceleration[2], -0.8 * self.gravity)
-        # Sideways the capture point com + v sqrt(h/g) is steered to its place over the base.
-        pendulum = self.gravity / seen.com[2]
-        capture = seen.com[:2] + seen.velocity[:2] / np.sqrt(pendulum)
-        acceleration[:2] = -2.0 * pendulum * (capture - goal[:2]) + pendulum * (seen.com[:2] - goal[:2])
-        velocity = self._balanced(seen, seen.velocity + dt * acceleration, dt)
+        acceleration[:2] = self.pose.caught(seen, goal[:2])
+        velocity = seen.velocity + dt * acceleration
         heading = self.facing.landed_heading(self.pose, state.positions)
-        pose = self.pose.over_base(seen.com + dt * velocity, seen.base, heading)
-        return self._write(state, velocity, pose, self._upright(state, pose), dt)
+        # Upright, wherever the centre of mass is now: a body that leans with it is never called back.
+        pose = self.pose.over_base(np.array([*goal[:2], seen.com[2] + dt * velocity[2]]), seen.base, heading)
+        upright = self._landed_share(state.time + dt) * self._upright(state, pose)
+        velocity, spin = self.pose.balanced(state, seen, velocity, upright, dt)
+        return self._write(state, velocity, pose, spin, dt)
+
+    def _landed_share(self, time: float) -> float:
+        """How much is asked for at ``time`` s of what a standing body is asked for."""
+        share = min((time - self._entered) / (TOUCHING_DOWN * self._time_unit), 1.0)
+        return share * share * (3.0 - 2.0 * share)
 
     def _following(self, seen: Measurement, position: np.ndarray, velocity: np.ndarray, dt: float) -> np.ndarray:
-        """(3,) m/s that follows a reference ``position`` (3,) with its ``velocity`` (3,) as well as the feet can."""
+        """(3,) m/s that follows a reference ``position`` (3,) with its ``velocity`` (3,)."""
         rate = 6.0 / self._time_unit
-        return self._balanced(seen, velocity + rate * (position - velocity * dt - seen.com), dt)
-
-    def _balanced(self, seen: Measurement, velocity: np.ndarray, dt: float) -> np.ndarray:
-        """``velocity`` (3,) with its horizontal change kept within what the feet can give."""
-        acceleration = (velocity - seen.velocity) / dt
-        level = self.pose.balanced_acceleration(seen, acceleration[:2], float(acceleration[2]), self.gravity)
-        return np.array([*(seen.velocity[:2] + dt * level), velocity[2]])
+        return velocity + rate * (position - velocity * dt - seen.com)
 
     def _upright(self, state: BodyState, pose: np.ndarray) -> np.ndarray:
         """(3,) rad/s that turns a standing body to ``pose`` (3, 3)."""
@@ -297,12 +301,13 @@ class Jump:
         left = min(max((speed + np.sqrt(speed**2 + 2.0 * self.gravity * gap)) / self.gravity, dt), latest)
         return np.array([*(seen.com[:2] + seen.velocity[:2] * left), self._start_com[2]]), left
 
-    def _foothold(self, state: BodyState, seen: Measurement, touch_down: np.ndarray) -> np.ndarray:
-        """(2,) where to put the feet: the target, if the body that comes in so can stop over it."""
+    def _foothold(self, state: BodyState, seen: Measurement, touch_down: np.ndarray, left: float) -> np.ndarray:
+        """(2,) where to put the feet in ``left`` s: the target, if the body that comes in so can stop over it."""
         if seen.velocity[2] > 0.0 and self.ground.local(state.positions)[:, 2].min() < CLEARANCE * self.target.rise:
             # Feet that swing ahead before they are higher than the step would strike it.
             return touch_down[:2] + seen.base - seen.com[:2]
-        capture_time = np.sqrt(self.pose.standing_height / self.gravity)
+        falling = max(left * self.gravity - seen.velocity[2], 0.0)
+        capture_time = stopping_time(self.pose.standing_height, falling, self.gravity)
         capture = touch_down[:2] + seen.velocity[:2] * capture_time + self.pose.base_offset
         low, high = self.pose.support_low, self.pose.support_high
         goal = self._start_base - RUN_ON * self._time_unit * seen.velocity[:2]
@@ -326,9 +331,14 @@ class Jump:
         if np.abs(rate).max() > 5.0 / self._time_unit:
             rate = np.zeros((3, 3))
         self._last_pose = pose
+        # What comes down is to be stopped by the ground: asked for free fall, muscles would pull the feet away.
+        falling = self.phase is JumpPhase.FLIGHT and float(com_velocity[2]) < 0.0
         follow, weights = 6.0 / self._time_unit, self.weights
+        if self.phase is JumpPhase.LAND or falling:
+            share = 0.0 if falling else weights.landing
+            weights = replace(weights, com=share * weights.com, up=share * weights.up, spin=share * weights.spin)
         if left is not None:
-            follow, weights = min(IN_TIME / left, follow), replace(weights, pose=self._airborne_weight)
+            follow, weights = min(IN_TIME / left, follow), replace(weights, pose=weights.airborne)
         return self.pose.objectives(
             state,
             com_velocity=com_velocity,

@@ -8,13 +8,16 @@ import numpy as np
 
 CARRIED = 2.0
 """Speed ahead at the end of a crouch, in leans over its time: 2 is a steady acceleration, 0 a stop."""
-LEAN = 0.2
+LEAN = 0.15
 """Of the distance: how far the weight is put ahead before take-off. With it over the middle of the feet a push forward
 would turn the body backward."""
 FURTHEST_LEAN = 0.35
 """Of the way from under the centre of mass to the front of the feet."""
 DEEPEST_CROUCH = 0.26
 """Of the height of the centre of mass, deeper ones crush elements to a fifth; a higher jump thrusts harder instead."""
+PUSH = 2.4
+"""Of gravity: mean acceleration of a thrust. A harder one takes a shallower crouch, which strains a stiff body less.
+"""
 ONSET, RAMP = 0.3, 0.4
 """Share of its full strength with which a thrust begins, where the crouch has left it, and share of its time until it
 is reached.
@@ -38,6 +41,7 @@ class JumpPlan:
     crouch_depth: float
     extension: float
     crouch_time: float
+    """A whole number of steps: what is asked goes over into the thrust without a jolt."""
     thrust_time: float
     flight_time: float
     speed_up: float
@@ -95,6 +99,18 @@ def ramped(share: float) -> tuple[float, float]:
     return speed / whole, way / whole
 
 
+def stopping_time(com_height: float, fall_speed: float, gravity: float) -> float:
+    """Seconds t such that a body that lands at speed v ahead, with its feet v t ahead of its centre of mass, comes to
+    rest over them.
+
+    Landing without spin, the ground's push goes through the centre of mass at ``com_height`` h above feet d ahead: to
+    stop ``fall_speed`` w it takes w d / h off the speed ahead, and what is left is stopped by the capture point,
+    (v - w d / h) sqrt(h / g) = d.
+    """
+    pendulum = np.sqrt(com_height / gravity)
+    return float(pendulum / (1.0 + fall_speed * pendulum / com_height))
+
+
 def plan_jump(
     target: JumpTarget,
     *,
@@ -115,7 +131,7 @@ def plan_jump(
     extension = min(0.04 * height, 0.25 * target.height)
     rise = target.height - extension
     speed_up = np.sqrt(2.0 * gravity * rise) + 0.5 * gravity * step
-    acceleration = 1.6 * gravity
+    acceleration = PUSH * gravity
     stroke = max(speed_up**2 / (2.0 * acceleration), extension + 0.02 * height)
     # Every step goes its whole way at the speed of its end: half a step's way more than the thrust itself.
     stroke += 0.5 * speed_up * step
@@ -123,15 +139,14 @@ def plan_jump(
     way = crouch_depth + extension - 0.5 * speed_up * step
     thrust_time = max(way / (ramped(1.0)[1] * speed_up), 2.0 * step)
     flight_time = np.sqrt(2.0 * rise / gravity) + np.sqrt(2.0 * max(rise - target.rise, 0.0) / gravity)
-    # A body that comes in with speed v stops over its base if that is ahead by v sqrt(h/g) (the capture point); the
-    # front of the footprint helps.
-    capture_time = np.sqrt(com_height / (1.3 * gravity))
+    # The front of the footprint helps a body that comes in to stop over its base.
+    capture_time = stopping_time(com_height, np.sqrt(2.0 * gravity * max(rise - target.rise, 0.0)), gravity)
     footprint_help = min(0.3 * support_ahead, 0.5 * target.distance * capture_time / flight_time)
     speed_forward = (target.distance - lean + footprint_help) / (flight_time + capture_time + 0.5 * thrust_time)
     return JumpPlan(
         crouch_depth=float(crouch_depth),
         extension=float(extension),
-        crouch_time=float(1.1 * time_unit),
+        crouch_time=float(np.ceil(1.1 * time_unit / step) * step),
         thrust_time=float(thrust_time),
         flight_time=float(flight_time),
         speed_up=float(speed_up),

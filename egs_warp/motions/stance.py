@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.sparse as sparse
 from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.body import BodyState, SoftBody
@@ -19,15 +20,30 @@ CALM = 0.03
 """Speed of the centre of mass, in sqrt(g H), below which a standing body is calm."""
 CALM_TIME = 0.3
 """Of sqrt(H / g): for how long a body is calm before it is at rest."""
+MARGIN = 0.95
+"""Of the footprint: where the centre of pressure may be."""
+GRIP = 0.95
+"""Of what friction could give at most: asked for more, feet slide, and what else is asked falls short."""
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of a motion's objectives; speeds are compared in sqrt(g H)."""
+    """Weights of a motion's objectives; speeds are compared in sqrt(g H).
 
-    com: float = 2.0
-    spin: float = 5.0
+    What is asked for is what happens, since contact forces come as they are planned: balance goes before effort.
+    """
+
+    com: float = 600.0
+    """Of the centre of mass, along the ground."""
+    up: float = 600.0
+    """Of the centre of mass, up."""
+    spin: float = 600.0
     pose: float = 0.02
+    airborne: float = 2.0
+    """Of the pose in the air, where nothing else can be steered and the feet have to get to their place."""
+    landing: float = 0.1
+    """Share of ``com``, ``up`` and ``spin`` that is asked for from touch-down on: what is left is to come to rest,
+    at no given time."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +64,11 @@ class Measurement:
     """Normal contact forces, body weights."""
     heading: float
     """Radians about z, from the start."""
+    support: np.ndarray
+    """(2, 2) metres: least and largest coordinates along the ground of what the body can press on now."""
+    swing: np.ndarray
+    """(2,) m/s: what the spin about the centre of mass adds to its speed along the ground in the momentum about the
+    feet."""
 
 
 @dataclass(frozen=True)
@@ -110,9 +131,13 @@ class PoseFamily:
     See docs/concepts/motions.md.
     """
 
-    def __init__(self, body: SoftBody, ground: Ground, standing: np.ndarray, touching: np.ndarray) -> None:
-        """``standing`` (N, 3): nodes at rest; ``touching`` (k, 3): points of the body on the ground then."""
-        self.body, self.ground = body, ground
+    def __init__(
+        self, body: SoftBody, ground: Ground, standing: np.ndarray, touching: np.ndarray, friction: float
+    ) -> None:
+        """``standing`` (N, 3): nodes at rest; ``touching`` (k, 3): points of the body on the ground then; ``friction``:
+        Coulomb coefficient."""
+        self.body, self.ground, self.friction = body, ground, friction
+        self._normal = ground.axes @ ground.surface_normal
         local = ground.local(standing)
         self._arms = (local - body.centre_of_mass(local)) @ ground.axes
         self.standing_height = float(body.centre_of_mass(local)[2])
@@ -123,24 +148,65 @@ class PoseFamily:
         self.support_low = np.minimum(footprint.min(axis=0), -0.01 * body.height)
         self.support_high = np.maximum(footprint.max(axis=0), 0.01 * body.height)
 
-    def balanced_acceleration(
-        self, seen: Measurement, wanted: np.ndarray, up: float, gravity: float, *, margin: float = 0.8
-    ) -> np.ndarray:
-        """(2,) the horizontal acceleration nearest to ``wanted`` (2,) m/s^2 that the feet can give without tipping the
-        body.
+    def balanced(
+        self, state: BodyState, seen: Measurement, velocity: np.ndarray, spin: np.ndarray, dt: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The end velocity (3,) m/s of the centre of mass, ground axes, and spin (3,) rad/s, world axes, nearest to
+        those asked for that feet can bring about without tipping or sliding.
 
-        The centre of pressure com - h a / (g + ``up``) stays within ``margin`` of the footprint (linear inverted
-        pendulum).
+        About the feet the momentum m h (v + swing) changes by the weight times the way from the centre of pressure to
+        the centre of mass, so that centre, kept within the footprint, bounds the sum of both; friction bounds the one.
         """
-        lever = max(seen.com[2], 0.3 * self.standing_height) / max(gravity + up, 0.2 * gravity)
-        pressure = seen.com[:2] - lever * wanted
-        place = seen.base - self.base_offset
+        gravity = float(np.linalg.norm(self.body.gravity))
+        up = max(gravity + (velocity[2] - seen.velocity[2]) / dt, 0.2 * gravity)
+        height = self._lever(seen.com)
+        level = velocity[:2] - seen.velocity[:2]
+        inertia = self.body.inertia(state.positions)
+        turn = self._swing(inertia @ spin, height) - seen.swing
+
+        def within_grip(change: np.ndarray) -> np.ndarray:
+            push = np.array([*(change / dt), 0.0])
+            return change * min(1.0, _share_in_cone(push, np.array([0.0, 0.0, up]), self._normal, GRIP * self.friction))
+
+        level = within_grip(level)
+        pressure = seen.com[:2] - height / up * (level + turn) / dt
+        middle, reach = seen.support.mean(axis=0), 0.5 * MARGIN * (seen.support[1] - seen.support[0])
         # Never ask for a fall: some push either way stays allowed even where the centre of mass is past the edge.
         slack = 0.04 * self.body.height
-        low = np.minimum(place + margin * self.support_low, seen.com[:2] - slack)
-        high = np.maximum(place + margin * self.support_high, seen.com[:2] + slack)
-        pressure = np.clip(pressure, low, high)
-        return (seen.com[:2] - pressure) / lever
+        low = np.minimum(middle - reach, seen.com[:2] - slack)
+        high = np.maximum(middle + reach, seen.com[:2] + slack)
+        both = (seen.com[:2] - np.clip(pressure, low, high)) * up / height * dt
+        # Each gives way as its objective weighs it, speeds as they are, spins with the radius of gyration; what
+        # friction denies the one, the other takes.
+        share = 1.0 / (1.0 + 0.5 * np.trace(inertia) / (self.body.mass * height**2))
+        level = within_grip(level + share * (both - level - turn))
+        turn = both - level
+        swing = seen.swing + turn
+        momentum = self.ground.axes @ inertia @ spin
+        momentum[:2] = self.body.mass * height * np.array([-swing[1], swing[0]])
+        return (
+            np.array([*(seen.velocity[:2] + level), velocity[2]]),
+            np.linalg.solve(inertia, self.ground.axes.T @ momentum),
+        )
+
+    def caught(self, seen: Measurement, goal: np.ndarray) -> np.ndarray:
+        """(2,) m/s^2 along the ground that brings a body that falls like a pendulum to rest over ``goal`` (2,).
+
+        The capture point, of the momentum about the feet, is steered to it.
+        """
+        gravity = float(np.linalg.norm(self.body.gravity))
+        pendulum = gravity / self._lever(seen.com)
+        capture = seen.com[:2] + (seen.velocity[:2] + seen.swing) / np.sqrt(pendulum)
+        return -2.0 * pendulum * (capture - goal) + pendulum * (seen.com[:2] - goal)
+
+    def _lever(self, com: np.ndarray) -> float:
+        """Metres: height of the centre of mass ``com`` (3,), ground coordinates, over the feet."""
+        return max(float(com[2]), 0.3 * self.standing_height)
+
+    def _swing(self, momentum: np.ndarray, height: float) -> np.ndarray:
+        """(2,) of ``Measurement``, of an angular ``momentum`` (3,), world axes."""
+        turning = self.ground.axes @ momentum / (self.body.mass * height)
+        return np.array([turning[1], -turning[0]])
 
     def _base(self, local: np.ndarray) -> np.ndarray:
         return (self._sole_share @ local)[:2]
@@ -150,15 +216,27 @@ class PoseFamily:
         local = self.ground.local(state.positions)
         forces = report.forces[:, 0].sum() if report is not None else self.body.weight
         turn = self.ground.axes @ self.rotation(state.positions) @ self.ground.axes.T
+        com = self.body.centre_of_mass(local)
+        momentum = self.body.angular_momentum(state.positions, state.velocities)
         return Measurement(
-            com=self.body.centre_of_mass(local),
+            com=com,
             velocity=self.ground.axes @ self.body.centre_of_mass(state.velocities),
             base=self._base(local),
             sole_height=report.min_gap if report is not None else 0.0,
             touching=bool(forces > 1e-6 * self.body.weight),
             load=float(forces / self.body.weight),
             heading=float(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])),
+            support=self._support(local, report),
+            swing=self._swing(momentum, self._lever(com)),
         )
+
+    def _support(self, local: np.ndarray, report: StepReport | None) -> np.ndarray:
+        """(2, 2) of ``Measurement``: the whole footprint where nothing is on the ground."""
+        if report is None or report.contacts.count == 0:
+            return self._base(local) - self.base_offset + np.stack([self.support_low, self.support_high])
+        contacts = report.contacts
+        places = np.einsum("cw,cwi->ci", contacts.weights, local[contacts.nodes])[:, :2]
+        return np.stack([places.min(axis=0), places.max(axis=0)])
 
     def rotation(self, positions: np.ndarray) -> np.ndarray:
         """(3, 3) best-fit rotation from the standing pose, world axes."""
@@ -213,15 +291,40 @@ class PoseFamily:
         pose_velocity = velocity + self._arms @ pose_rate.T + follow * (wanted - arms)
         momentum = body.inertia(state.positions) @ spin
         return [
-            centre_of_mass_velocity(body, velocity, weights.com),
+            *self._balance(velocity, weights),
             SpinObjective(momentum, weights.spin),
             straining_velocities(body, state.positions, pose_velocity, weights.pose),
+        ]
+
+    def _balance(self, velocity: np.ndarray, weights: Weights) -> list[Objective]:
+        """``velocity`` (3,) of the centre of mass, world axes."""
+        both = centre_of_mass_velocity(self.body, velocity, weights.com)
+        if weights.up == weights.com:
+            return [both]
+        level, up = self.ground.axes[:2], self.ground.axes[2:]
+        return [
+            replace(both, rows=sparse.csr_matrix(level @ both.rows), target=level @ velocity),
+            replace(both, rows=sparse.csr_matrix(up @ both.rows), target=up @ velocity, weight=weights.up),
         ]
 
     def turn_towards(self, state: BodyState, pose: np.ndarray) -> np.ndarray:
         """(3,) rotation vector, world axes, from the measured best-fit rotation to that of ``pose``."""
         wanted = best_turn(self.body.node_mass, self._arms, self._arms @ pose.T)
         return Rotation.from_matrix(wanted @ self.rotation(state.positions).T).as_rotvec()
+
+
+def _share_in_cone(push: np.ndarray, held: np.ndarray, normal: np.ndarray, friction: float) -> float:
+    """Largest s for which ``held`` + s ``push`` (3,) is in the friction cone about ``normal`` (3,); 0 where ``held`` is
+    not; infinite where ``push`` never leaves it."""
+    wide = 1.0 + friction**2
+    a = float(push @ push - wide * (push @ normal) ** 2)
+    b = float(push @ held - wide * (push @ normal) * (held @ normal))
+    c = float(held @ held - wide * (held @ normal) ** 2)
+    if c > 0.0:
+        return 0.0
+    if a <= 0.0:
+        return float("inf")
+    return (float(np.sqrt(b * b - a * c)) - b) / a
 
 
 def sole_shares(body: SoftBody, ground: Ground, standing: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ See docs/concepts/motions.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -19,12 +19,13 @@ from egs_warp.locomotion.objectives import (
     Objective,
     SpinObjective,
     centre_of_mass_velocity,
+    held_contacts,
     node_velocities,
     part_nodes,
 )
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.feet import feet_around, find_feet, foot_loads
+from egs_warp.motions.feet import feet_around, find_feet, foot_loads, foot_of_contact
 from egs_warp.motions.footfalls import Footfalls, footfalls
 from egs_warp.motions.gait import Gait, Passage, nearest_in_hull
 from egs_warp.motions.sequence import Place
@@ -64,11 +65,12 @@ class WalkPlan:
 class WalkControl:
     """Weights of the objectives (speeds are compared in sqrt(g H)) and gains of the feedback."""
 
-    com: float = 6.0
-    spin: float = 5.0
-    pose: float = 0.1
-    swing: float = 2.0
-    support: float = 0.5
+    com: float = 600.0
+    spin: float = 600.0
+    pose: float = 1.0
+    swing: float = 40.0
+    support: float = 1000.0
+    """Of contact points that stand and would slide, each by its share of the weight."""
     balance: float = 3.0
     """How far the centre of pressure goes for each metre that the divergent part of the motion is off."""
     turn_rate: float = 4.0
@@ -121,6 +123,8 @@ class Walk:
         self._entered: float | None = None
         self._places = self._soles.copy()
         """(4, 3) where each foot stands, or was lifted from."""
+        self.swinging: tuple[int, ...] = ()
+        """The feet in the air."""
         self._late = 0
 
     def _plan_passages(self) -> dict[WalkPhase, Passage]:
@@ -160,11 +164,6 @@ class Walk:
         """What the feet did between two states of a trajectory."""
         return footfalls(trajectory, self.feet, stride=self.gait.stride, first=first, last=last)
 
-    @property
-    def swinging(self) -> tuple[int, ...]:
-        """The feet in the air."""
-        return self.pairs[self.swing % 2] if self.phase is WalkPhase.SWING else ()
-
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[Objective | SpinObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
         body, axes, control = self.body, self.ground.axes, self.control
@@ -182,20 +181,24 @@ class Walk:
             centre_of_mass_velocity(body, com_velocity @ axes, control.com),
             SpinObjective(body.inertia(state.positions) @ (spin @ axes), control.spin),
             node_velocities(body, follow * (next_pose - local) @ axes, control.pose),
-            *(self._foot_objective(index, local, before, after, elapsed, dt) for index in range(len(self.feet))),
+            *(self._foot_objective(index, local, before, after, elapsed, dt) for index in self.swinging),
+            *([self._hold(report, elapsed)] if report is not None else []),
         ]
 
     def _advance_phase(self, local: np.ndarray, report: StepReport | None, time: float) -> None:
         if self._entered is None:
             self._entered = time
         elapsed, gait = time - self._entered + 1e-9, self.gait
-        if self.phase is WalkPhase.SWING and elapsed >= gait.swing_time:
+        if self.swinging and elapsed >= gait.carried_until:
             loads = foot_loads(self.feet, report, self.body.weight)
-            landed = all(loads[foot] > LOADED for foot in self.swinging)
-            if landed or elapsed >= 2.0 * gait.swing_time:
-                self._late += not landed
+            for index in self.swinging:
+                if loads[index] > LOADED:
+                    self._stands(index, local)
+        if self.phase is WalkPhase.SWING and elapsed >= gait.swing_time:
+            if not self.swinging or elapsed >= 2.0 * gait.swing_time:
+                self._late += bool(self.swinging)
                 for index in self.swinging:
-                    self._places[index] = self._on_ground(index, local[self.feet[index].sole, :2].mean(axis=0))
+                    self._stands(index, local)
                 last = self.swing == gait.swings - 1
                 self.phase, self._entered = WalkPhase.GATHER if last else WalkPhase.STAND, time
         elif (self.phase is WalkPhase.STAND and elapsed >= gait.double_time) or (
@@ -203,8 +206,14 @@ class Walk:
         ):
             self.phase, self._entered = WalkPhase.SWING, time
             self.swing += 1
+            self.swinging = self.pairs[self.swing % 2]
         elif self.phase is WalkPhase.GATHER and elapsed >= self._passages[self.phase].duration + self._time_unit:
             self.phase = WalkPhase.REST
+
+    def _stands(self, index: int, local: np.ndarray) -> None:
+        """Foot ``index`` has landed where it is."""
+        self.swinging = tuple(foot for foot in self.swinging if foot != index)
+        self._places[index] = self._on_ground(index, local[self.feet[index].sole, :2].mean(axis=0))
 
     def _com_reference(self, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
         """Place and velocity (2,) of the centre of mass ``elapsed`` seconds into the phase."""
@@ -267,13 +276,20 @@ class Walk:
         self, index: int, local: np.ndarray, before: np.ndarray, after: np.ndarray, elapsed: float, dt: float
     ) -> Objective:
         sole, part, control = self.feet[index].sole, self._parts[index], self.control
-        if index not in self.swinging:
-            return part_nodes(self.body, part, np.zeros((len(sole), 3)), control.support)
         error = before[index] - self._soles[index] + self._standing[sole] - local[sole]
-        velocity = (control.foot_share * error + after[index] - before[index]) / dt
-        wish = part_nodes(self.body, part, velocity @ self.ground.axes, control.swing)
-        rising = elapsed < 0.5 * self.gait.swing_time
-        return replace(wish, lifted=tuple(np.flatnonzero(self.feet[index].leg > 0.9))) if rising else wish
+        # The sole that stood is not the flat one that swings: torn straight in the first step, it would drag.
+        share = control.foot_share * self.gait.eased(elapsed / self.gait.swing_time)
+        velocity = (share * error + after[index] - before[index]) / dt
+        return part_nodes(self.body, part, velocity @ self.ground.axes, control.swing)
+
+    def _hold(self, report: StepReport, elapsed: float) -> Objective:
+        """What stands does not slide, nor does what is lifted before it goes ahead."""
+        contacts = report.contacts
+        ahead = self.swinging if elapsed > self.gait.carried_from else ()
+        stands = ~np.isin(foot_of_contact(self.feet, contacts), ahead)
+        return held_contacts(
+            contacts, np.where(stands, report.forces[:, 0], 0.0) / self.body.weight, self.control.support
+        )
 
     def _pose(self, com: np.ndarray, targets: np.ndarray) -> np.ndarray:
         """(N, 3) the standing shape with its feet at ``targets`` (4, 3) and its centre of mass at ``com`` (3,)."""

@@ -35,25 +35,18 @@ class MuscleTension:
     def _columns(self) -> sparse.csr_matrix:
         return self.rows.T.tocsr()
 
-    def energy(self, positions: np.ndarray) -> float:
-        """V at node positions (N, 3), joules."""
-        return float(self.tensions @ np.linalg.norm(self.rows @ positions, axis=1))
-
     def forces(self, positions: np.ndarray) -> np.ndarray:
         """(N, 3) newtons, minus the derivative of V."""
         vectors = self.rows @ positions
         lengths = np.linalg.norm(vectors, axis=1)
         return -(self._columns @ ((self.tensions / np.where(lengths > 0.0, lengths, 1.0))[:, None] * vectors))
 
-    def stiffness(self, positions: np.ndarray, *, pulling_only: bool = False) -> TensionStiffness:
-        """The second derivative of V at ``positions``;
-        ``pulling_only`` leaves out segments that push, which makes it semi-definite.
-        """
+    def stiffness(self, positions: np.ndarray) -> TensionStiffness:
+        """The second derivative of V at ``positions``."""
         vectors = self.rows @ positions
         lengths = np.linalg.norm(vectors, axis=1)
         held = np.where(lengths > 0.0, lengths, 1.0)
-        tensions = np.maximum(self.tensions, 0.0) if pulling_only else self.tensions
-        return TensionStiffness(self.rows, self._columns, vectors / held[:, None], tensions / held)
+        return TensionStiffness(self.rows, vectors / held[:, None], self.tensions / held)
 
 
 @dataclass(frozen=True)
@@ -62,20 +55,12 @@ class TensionStiffness:
 
     rows: sparse.csr_matrix
     """(M, N)."""
-    columns: sparse.csr_matrix
-    """(N, M), its transpose."""
     directions: np.ndarray
     """(M, 3) u."""
     rates: np.ndarray
     """(M,) T / L, N/m."""
 
-    def product(self, x: np.ndarray) -> np.ndarray:
-        """(N, 3) K x for ``x`` (N, 3)."""
-        d = self.rows @ x
-        along = np.sum(d * self.directions, axis=1, keepdims=True)
-        return self.columns @ (self.rates[:, None] * (d - along * self.directions))
-
-    def factors(self, *, least: float = 1e-3) -> tuple[np.ndarray, np.ndarray]:
+    def factors(self, *, least: float) -> tuple[np.ndarray, np.ndarray]:
         """U (3N, 2m) and rates (2m,) with K = U diag(rates) U^T: two directions across each of the m segments whose
         rate is above ``least`` of the largest.
         """

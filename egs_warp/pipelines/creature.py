@@ -16,7 +16,7 @@ from egs_warp.fem.body import DEFAULT_SAG, BodyState, SoftBody, make_body
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
-from egs_warp.locomotion.rollout import FRAME_RATE, settle, steps_per_frame
+from egs_warp.locomotion.rollout import settle, solver_steps
 from egs_warp.locomotion.stepper import LocomotionSettings, LocomotionStepper
 from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame
 from egs_warp.meshing.cage import Cage, cage_of_body
@@ -216,7 +216,7 @@ def first_place(creature: Creature, forward: np.ndarray | None = None, *, step: 
     """Where the creature stands at the start; ``forward`` (3,) is the way of its motions in the capture, else the long
     axis of its footprint.
 
-    ``step``: seconds of a solver step, if not the usual (docs/concepts/body.md).
+    ``step``: seconds that a solver step takes at most, see ``solver_steps``.
     """
     body, start = creature.body, creature.start
     up = -body.gravity / np.linalg.norm(body.gravity)
@@ -229,7 +229,7 @@ def first_place(creature: Creature, forward: np.ndarray | None = None, *, step: 
         Ground.on(GROUND, ahead, body.centre_of_mass(start.positions), up=up),
         start.positions,
         creature.stepper.detector.points_within(start.positions, 0.01 * body.height),
-        step or 1.0 / (FRAME_RATE * steps_per_frame(body)),
+        solver_steps(body, step)[0],
         creature.solids,
         creature.geometry.friction,
     )

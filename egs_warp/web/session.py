@@ -18,7 +18,7 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.fem.body import DEFAULT_SAG, BodyState
-from egs_warp.locomotion.rollout import FRAME_RATE, steps_per_frame
+from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.motions.script import MOST_MOTIONS
 from egs_warp.motions.sequence import Place
 from egs_warp.pipelines.creature import Creature, changed_creature, first_place
@@ -79,7 +79,7 @@ class Session:
         self.sag, self.friction = self.options.sag, creature.geometry.friction
         self.state, self.report = creature.start, None
         self._memory = creature.stepper.initial_memory()
-        self._dt = 1.0 / (FRAME_RATE * steps_per_frame(creature.body))
+        self._dt, _ = solver_steps(creature.body)
         self._place = self._first_place(creature)
         self.steering = Steering(self._place, self._tell)
         self._spring: Spring | None = None

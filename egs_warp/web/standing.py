@@ -19,7 +19,7 @@ class Stand:
 
     def __init__(self, place: Place) -> None:
         self.body = place.body
-        self.pose = PoseFamily(place.body, place.ground, place.standing, place.touching)
+        self.pose = PoseFamily(place.body, place.ground, place.standing, place.touching, place.friction)
         self._gravity = float(np.linalg.norm(place.body.gravity))
         self._time_unit = float(np.sqrt(place.body.height / self._gravity))
         self._height = self.pose.standing_height
@@ -40,21 +40,19 @@ class Stand:
         rate = _RATE / self._time_unit
         goal = np.array([*(seen.base - self.pose.base_offset), self._height])
         acceleration = rate**2 * (goal - seen.com) - 2.0 * rate * seen.velocity
-        # The capture point com + v sqrt(h/g) is steered to its place over the feet.
-        pendulum = self._gravity / max(seen.com[2], 0.3 * self._height)
-        capture = seen.com[:2] + seen.velocity[:2] / np.sqrt(pendulum)
-        acceleration[:2] = -2.0 * pendulum * (capture - goal[:2]) + pendulum * (seen.com[:2] - goal[:2])
+        acceleration[:2] = self.pose.caught(seen, goal[:2])
         acceleration[2] = max(acceleration[2], -0.8 * self._gravity)
-        level = self.pose.balanced_acceleration(seen, acceleration[:2], float(acceleration[2]), self._gravity)
-        velocity = seen.velocity + dt * np.array([*level, acceleration[2]])
+        velocity = seen.velocity + dt * acceleration
         heading = self.pose.sole_heading(state.positions)
         pose = self.pose.over_base(seen.com + dt * velocity, seen.base, heading)
+        upright = self.pose.turn_towards(state, pose) * 4.0 / self._time_unit
+        velocity, spin = self.pose.balanced(state, seen, velocity, upright, dt)
         return self.pose.objectives(
             state,
             com_velocity=velocity,
             pose=pose,
             pose_rate=np.zeros((3, 3)),
-            spin=self.pose.turn_towards(state, pose) * 4.0 / self._time_unit,
+            spin=spin,
             follow=6.0 / self._time_unit,
             weights=Weights(),
         )

@@ -1,93 +1,272 @@
-"""Velocities and contact forces sought together (Eq. 4, 8, 9): what contact, friction and both momenta ask for."""
+"""Velocities and contact forces sought together (Eq. 4, 8, 9): what contact, friction and both momenta ask for; bodies
+that fall, rest, slide, hold on a slope, and come out of the ground.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from egs_warp.contact.coupled_step import ContactResponse, CoupledResult, CoupledSolver
-from egs_warp.contact.detection import ContactDetector, ContactGeometry
-from egs_warp.contact.points import ContactPoints
-from egs_warp.deformation.embedding import embed_points
+from egs_warp.contact.coupled_step import ContactResponse, CoupledResult
 from egs_warp.fem.body import BodyState, SoftBody, make_body
-from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.tetmesh import TetMesh
 from tests.support.meshes import block_mesh
+from tests.support.passive import PassiveBody, base_places, passive_body
 
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
-DT, FRICTION = 1 / 60, 0.5
+DT = 1 / 60
 
 
-class Block:
-    """A soft block with a grid of contact points under its base."""
+def block(
+    friction: float = 0.5,
+    *,
+    sag: float = 0.05,
+    damping_ratio: float = 0.05,
+    mesh: TetMesh | None = None,
+    slope: float = 0.0,
+    lift: float = 0.0,
+) -> PassiveBody:
+    """A soft block with 25 contact points under its base and four at its top, ``lift`` metres above a floor that falls
+    off to +x by ``slope`` radians: gravity is turned in its place.
+    """
+    level = make_body(mesh or block_mesh(), FLOOR, sag=sag, damping_ratio=damping_ratio, device="cpu")
+    gravity = 9.81 * np.array([np.sin(slope), 0.0, -np.cos(slope)])
+    body = SoftBody(level.mesh, level.assembly, level.node_mass, gravity, level.height)
+    nodes = body.mesh.nodes
+    top = [0.0, 0.0, nodes[:, 2].max()]
+    state = BodyState(nodes + lift * FLOOR.normal, np.zeros_like(nodes))
+    places = np.concatenate([base_places(body), base_places(body, 2) + top])
+    return passive_body(body, places, plane=FLOOR, friction=friction, state=state)
 
-    def __init__(self) -> None:
-        mesh = block_mesh()
-        self.body: SoftBody = make_body(mesh, FLOOR, device="cpu")
-        side = np.linspace(-mesh.nodes[:, 0].max(), mesh.nodes[:, 0].max(), 5)
-        soles = embed_points(mesh, np.array([[x, y, 0.0] for x in side for y in side]), device="cpu")
-        geometry = ContactGeometry(mesh, (FLOOR,), FRICTION, soles.tets.numpy(), soles.weights.numpy(), 0, 0.0)
-        height = self.body.height
-        self.points = ContactPoints(geometry, near=0.01 * height, lower=1e-3 * height)
-        self.solver = CoupledSolver(
-            ContactDetector(geometry, device="cpu"),
-            self.points,
-            SparseFactors(self.body.assembly.upper_pattern),
-            push_out_cap=0.05,
-            penetration_tolerance=5e-3 * height,
-        )
-        self.before, self.forces = np.zeros(0, int), np.zeros((0, 3))
 
-    def step(self, state: BodyState) -> tuple[StepProblem, CoupledResult]:
-        problem, detector = StepProblem(self.body, state, DT), self.solver.detector
-        gaps, _ = detector.gaps(problem.end_positions(state.velocities + DT * self.body.gravity))
-        chosen = self.points.choose(self.before, self.forces[:, 0] > 0.0, gaps)
-        contacts = detector.contact_set(chosen, state.positions)
-        tangent = problem.tangent(self.solver.factors, state.velocities, None)
-        start = self.points.matched(chosen, self.before, self.forces)
-        result = self.solver.solve(
-            ContactResponse.of(tangent, contacts), None, velocities=state.velocities, forces=start
-        )
-        self.before, self.forces = result.contacts.points, result.forces
-        return problem, result
+def assert_obeys(standing: PassiveBody, before: BodyState, problem: StepProblem, result: CoupledResult) -> None:
+    """Contact, Coulomb's law with the velocities that are kept, maximal dissipation, and both momenta."""
+    body, friction = standing.body, standing.solver.detector.geometry.friction
+    contacts, forces = result.contacts, result.forces
+    assert result.converged and result.residual < 1e-8
+    speed = (contacts.frame @ result.velocities.ravel()).reshape(-1, 3)
+    measure = speed[:, 0] + standing.solver.shift(contacts, problem.dt)
+    scale = np.sqrt(9.81 * body.height)
+    if contacts.count:
+        assert measure.min() > -1e-6 * scale and forces[:, 0].min() >= 0.0
+        assert np.abs(np.minimum(measure / scale, forces[:, 0] / body.weight)).max() < 1e-6
+        slip, pull = np.linalg.norm(speed[:, 1:], axis=1), np.linalg.norm(forces[:, 1:], axis=1)
+        assert (pull <= friction * forces[:, 0] * (1 + 1e-9) + 1e-12).all()
+        sliding = slip > 1e-4 * scale
+        assert np.allclose(pull[sliding], friction * forces[sliding, 0], atol=1e-6 * body.weight)
+        along = (forces[:, 1:] * speed[:, 1:]).sum(axis=1)
+        assert np.allclose(along[sliding], -(pull * slip)[sliding], rtol=1e-4, atol=1e-6 * body.weight * scale)
+    nodal = (contacts.frame.T @ forces.ravel()).reshape(-1, 3)
+    gained = body.mass * (body.centre_of_mass(result.velocities) - body.centre_of_mass(before.velocities))
+    total = nodal.sum(axis=0) + body.mass * body.gravity
+    assert np.abs(gained - problem.dt * total).max() < 1e-7 * problem.unit
+    arms = before.positions - body.centre_of_mass(before.positions)
+    turned = body.angular_momentum(problem.end_positions(result.velocities), result.velocities)
+    turned = turned - body.angular_momentum(before.positions, before.velocities)
+    torque = problem.dt * np.cross(arms, nodal).sum(axis=0)
+    assert np.abs(turned - torque).max() < 1e-7 * problem.unit * body.height
 
 
 @pytest.mark.parametrize("push", [0.0, 0.5])
 def test_a_block_comes_to_rest_and_every_step_obeys(push: float) -> None:
-    """Dropped by 2 %, pushed sideways or not: contact and Coulomb's law with the stored velocities, both momenta."""
-    block = Block()
-    body = block.body
-    nodes = body.mesh.nodes + [0.0, 0.0, 0.02 * body.height]
-    state = BodyState(nodes, np.tile([push, 0.3 * push, 0.0], (len(nodes), 1)))
+    """Eq. (4), Eq. (9): dropped by 2 %, pushed sideways or not."""
+    falling = block(lift=0.02)
+    body = falling.body
+    falling.state.velocities[:] = [push, 0.3 * push, 0.0]
+    scale = np.sqrt(9.81 * body.height)
     for _ in range(60):
-        problem, result = block.step(state)
-        assert result.converged and result.residual < 1e-8
-        contacts, forces = result.contacts, result.forces
-        speed = (contacts.frame @ result.velocities.ravel()).reshape(-1, 3)
-        measure = speed[:, 0] + block.solver.shift(contacts, DT)
-        scale = np.sqrt(9.81 * body.height)
-        if contacts.count:
-            assert measure.min() > -1e-6 * scale and forces[:, 0].min() >= 0.0
-            assert np.abs(np.minimum(measure / scale, forces[:, 0] / body.weight)).max() < 1e-6
-            slip, friction = np.linalg.norm(speed[:, 1:], axis=1), np.linalg.norm(forces[:, 1:], axis=1)
-            assert (friction <= FRICTION * forces[:, 0] * (1 + 1e-9) + 1e-12).all()
-            sliding = slip > 1e-4 * scale
-            assert np.allclose(friction[sliding], FRICTION * forces[sliding, 0], atol=1e-6 * body.weight)
-            # Friction does no work on what slides.
-            assert ((forces[:, 1:] * speed[:, 1:]).sum(axis=1) <= 1e-7 * body.weight * scale).all()
-        nodal = (contacts.frame.T @ forces.ravel()).reshape(-1, 3)
-        gained = body.mass * (body.centre_of_mass(result.velocities) - body.centre_of_mass(state.velocities))
-        assert np.abs(gained - DT * (nodal.sum(axis=0) + body.mass * body.gravity)).max() < 1e-7 * problem.unit
-        arms = state.positions - body.centre_of_mass(state.positions)
-        after = BodyState(problem.end_positions(result.velocities), result.velocities, state.time + DT)
-        turned = body.angular_momentum(after.positions, after.velocities)
-        turned = turned - body.angular_momentum(state.positions, state.velocities)
-        torque = DT * np.cross(arms, nodal).sum(axis=0)
-        assert np.abs(turned - torque).max() < 1e-7 * problem.unit * body.height
-        state = after
+        before = falling.state
+        problem, result = falling.advance(DT)
+        assert_obeys(falling, before, problem, result)
     # The pushed block still sways when its base has come to rest.
+    speed = (result.contacts.frame @ result.velocities.ravel()).reshape(-1, 3)
     assert np.abs(speed[:, 1:]).max() < 5e-3 * scale
     if push == 0.0:
-        assert forces[:, 0].sum() == pytest.approx(body.weight, rel=3e-3)
-        assert np.abs(state.velocities).max() < 5e-3 * scale
+        assert falling.forces[:, 0].sum() == pytest.approx(body.weight, rel=3e-3)
+        assert np.abs(falling.state.velocities).max() < 5e-3 * scale
+
+
+def test_an_oblique_spinning_impact_obeys() -> None:
+    """Eq. (4), Eq. (9): contact, friction and both momenta where everything moves."""
+    thrown = block(0.8, lift=0.03)
+    body, x = thrown.body, thrown.state.positions
+    v = np.array([1.5, 0.3, -1.0]) + np.cross([0.5, -1.0, 2.0], x - body.centre_of_mass(x))
+    thrown.state, touched, slid = BodyState(x, v), 0, 0
+    for _ in range(15):
+        before = thrown.state
+        problem, result = thrown.advance(DT)
+        assert_obeys(thrown, before, problem, result)
+        pressed = result.forces[:, 0] > 1e-3 * body.weight
+        slip = np.linalg.norm((result.contacts.frame @ result.velocities.ravel()).reshape(-1, 3)[:, 1:], axis=1)
+        touched += result.forces[:, 0].max(initial=0.0) > 0.1 * body.weight
+        slid += bool((slip[pressed] > 1e-3).any())
+    assert touched >= 3 and slid >= 1
+
+
+def test_dropped_body_comes_to_rest_without_gaining_energy() -> None:
+    """Eq. (4), Eq. (9): dropped from H/2 with muscles off, no step adds more than 1e-7 m g H,
+    and it ends at rest on its base.
+    """
+    falling = block(0.8, lift=0.5)
+    body, gaps_of = falling.body, falling.solver.detector.gaps
+    unit = body.weight * body.height
+    energies, deepest = [body.mechanical_energy(falling.state.positions, falling.state.velocities)], 0.0
+    for _ in range(150):
+        _, result = falling.advance(DT)
+        assert result.converged
+        state = falling.state
+        energies.append(body.mechanical_energy(state.positions, state.velocities))
+        gaps, _ = gaps_of(state.positions)
+        deepest = min(deepest, gaps.min())
+        gap = np.maximum(gaps[result.contacts.points], 0.0)
+        assert (result.forces[:, 0] * gap).max(initial=0.0) <= 1e-4 * unit
+    gains = np.diff(energies) / unit
+    assert gains.max() < 1e-7
+    assert deepest > -1e-3 * body.height
+    assert energies[-1] < energies[0] - 0.45 * unit
+    assert np.abs(falling.state.velocities).max() < 1e-2
+    assert falling.forces[:, 0].sum() == pytest.approx(body.weight, rel=0.02)
+    up = body.best_fit_rotation(falling.state.positions)[:, 2]
+    assert up[2] > np.cos(np.radians(2.0))
+
+
+@pytest.mark.parametrize("degrees", [15.0, 21.0, 22.6, 30.0])
+def test_block_on_an_incline_sticks_or_slides(degrees: float) -> None:
+    """Eq. (9), closed form: with mu = 0.4 (21.8 degrees) it sticks or slides with a = g (sin - mu cos).
+
+    The block is stiff and flat (it must not tip), starts at rest, and its mean over 20 steps is taken.
+    """
+    angle, friction = np.radians(degrees), 0.4
+    moving = block(friction, sag=0.002, mesh=block_mesh(4, 4, 3, (0.8, 0.8, 0.3)), slope=angle)
+    body, speeds = moving.body, []
+    for _ in range(40):
+        before = moving.state
+        problem, result = moving.advance(DT)
+        assert_obeys(moving, before, problem, result)
+        speeds.append(body.centre_of_mass(moving.state.velocities)[0])
+    measured = (speeds[-1] - speeds[19]) / (20 * DT)
+    expected = max(9.81 * (np.sin(angle) - friction * np.cos(angle)), 0.0)
+    assert measured == pytest.approx(expected, rel=1e-4, abs=1e-4)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 15.0])
+def test_a_resting_body_neither_sinks_nor_creeps(degrees: float) -> None:
+    """Eq. (8), Eq. (9): on level ground and on a slope that it holds on; its forces carry the weight."""
+    resting = block(0.5, sag=0.01, damping_ratio=0.5, slope=np.radians(degrees))
+    body = resting.body
+    for _ in range(200):
+        _, result = resting.advance(DT)
+        assert result.converged
+    start, gaps = resting.state, resting.solver.detector.gaps(resting.state.positions)[0]
+    for _ in range(120):
+        _, result = resting.advance(DT)
+        assert result.converged
+    moved = np.abs(resting.state.positions - start.positions).max()
+    assert moved < 1e-6 * body.height
+    assert gaps.min() > -2e-3 * body.height
+    net = resting.solver.detector.contact_set(resting.points, start.positions).frame.T @ resting.forces.ravel()
+    assert np.allclose(net.reshape(-1, 3).sum(axis=0), -body.mass * body.gravity, atol=1e-4 * body.weight)
+
+
+def test_a_sliding_block_stops_and_stays() -> None:
+    """Eq. (9): from speed v a stiff flat block slides v^2 / (2 mu g), less half a step's way, and then sticks."""
+    friction, speed = 0.5, 1.5
+    sliding = block(friction, sag=0.002, mesh=block_mesh(4, 4, 3, (0.8, 0.8, 0.3)))
+    body = sliding.body
+    for _ in range(30):
+        sliding.advance(DT / 2)
+    start = body.centre_of_mass(sliding.state.positions)[0]
+    sliding.state.velocities[:] += [speed, 0.0, 0.0]
+    for _ in range(120):
+        before = sliding.state
+        problem, result = sliding.advance(DT / 2)
+        assert_obeys(sliding, before, problem, result)
+    way = body.centre_of_mass(sliding.state.positions)[0] - start
+    # Implicit Euler counts each step's lower speed, so the way is short by v dt / 2.
+    assert way == pytest.approx(speed**2 / (2 * friction * 9.81) - 0.25 * speed * DT, rel=0.02)
+    assert np.abs(sliding.state.velocities).max() < 1e-2
+
+
+@pytest.mark.parametrize("depth", [0.006, 0.02, 0.3])
+def test_a_sunk_body_comes_out_gently_to_the_tolerance(depth: float) -> None:
+    """Eq. (8): points deeper than the tolerance rise by a fifth of the excess a step, at most at the cap; those that
+    are not keep their depth.
+    """
+    sunk = block(sag=0.002, lift=-depth)
+    height = sunk.body.height
+    tolerance, cap = sunk.solver.penetration_tolerance, sunk.solver.push_out_cap
+    for _ in range(3):
+        gaps, _ = sunk.solver.detector.gaps(sunk.state.positions)
+        _, result = sunk.advance(DT)
+        assert result.converged
+        rise = (result.contacts.frame @ result.velocities.ravel())[::3]
+        wanted = np.minimum(0.2 * np.maximum(-gaps[result.contacts.points] - tolerance, 0.0) / DT, cap)
+        pressed = result.forces[:, 0] > 0.0
+        assert pressed.sum() >= 4
+        np.testing.assert_allclose(rise[pressed], wanted[pressed], rtol=0, atol=1e-6 * np.sqrt(9.81 * height))
+        assert (rise >= wanted - 1e-6 * np.sqrt(9.81 * height)).all()
+    for _ in range(200):
+        sunk.advance(DT)
+    gaps, _ = sunk.solver.detector.gaps(sunk.state.positions)
+    assert gaps.min() > -1.05 * tolerance
+
+
+def test_points_that_would_sink_join_the_set() -> None:
+    """A step that starts with one corner in its set ends with every point above the tolerance."""
+    falling = block()
+    x, solver = falling.state.positions, falling.solver
+    problem = StepProblem(falling.body, BodyState(x, np.tile([0.0, 0.0, -1.0], (len(x), 1))), DT)
+    contacts = solver.detector.contact_set(np.array([0]), x)
+    response = ContactResponse.of(problem.tangent(solver.factors, problem.start, None), contacts)
+    result = solver.solve(response, None, velocities=problem.start, forces=np.zeros((1, 3)))
+    assert result.converged and result.contacts.count > 4 and result.contacts.points[0] == 0
+    assert len(set(result.contacts.points)) == result.contacts.count
+    gaps, _ = solver.detector.gaps(problem.end_positions(result.velocities))
+    assert gaps.min() >= -solver.penetration_tolerance
+
+
+def test_a_response_is_the_linear_answer_of_the_step() -> None:
+    """Eq. (8): columns of known points are kept, and forces bring about what the tangent says of their impulse."""
+    standing = block()
+    x, solver = standing.state.positions @ Rotation.from_rotvec([0.0, 0.1, 0.2]).as_matrix().T, standing.solver
+    problem = StepProblem(standing.body, BodyState(x, np.zeros_like(x)), DT)
+    tangent = problem.tangent(solver.factors, problem.start, None)
+    contacts = solver.detector.contact_set(np.array([0, 7, 13, 24]), x)
+    response = ContactResponse.of(tangent, contacts)
+    forces = np.random.default_rng(0).standard_normal((4, 3))
+    moved = tangent.solve(DT * (contacts.frame.T @ forces.ravel()))
+    np.testing.assert_allclose(response.columns @ forces.ravel(), moved, rtol=0, atol=1e-12 * np.abs(moved).max())
+    speeds = contacts.frame @ moved
+    np.testing.assert_allclose(response.delassus @ forces.ravel(), speeds, rtol=0, atol=1e-12 * np.abs(speeds).max())
+    again = ContactResponse.of(tangent, contacts, response.columns)
+    np.testing.assert_array_equal(again.delassus, response.delassus)
+
+
+def test_foreseen_forces_press_and_rub_no_more_than_they_may() -> None:
+    """In place of the paper's penalties (Eq. 10, 11) stage 1 has exact contact: zero or pressing, within Coulomb's
+    cone, straight against the slip, whatever the free velocities.
+    """
+    standing = block()
+    solver, x = standing.solver, standing.state.positions
+    problem = StepProblem(standing.body, standing.state, DT)
+    contacts = solver.detector.contact_set(np.arange(0, 25, 3), x)
+    response = ContactResponse.of(problem.tangent(solver.factors, problem.start, None), contacts)
+    kinds = set()
+    for seed in range(8):
+        pace = 0.6 if seed % 2 else 0.02
+        free = np.random.default_rng(seed).standard_normal(x.shape) * [pace, pace, 0.1] - [0.0, 0.0, 0.05 * seed]
+        forces = response.forces(free.ravel(), solver.shift(contacts, DT), 0.5, np.zeros((contacts.count, 3)))
+        speed = (contacts.frame @ free.ravel() + response.delassus @ forces.ravel()).reshape(-1, 3)
+        slip, pull = np.linalg.norm(speed[:, 1:], axis=1), np.linalg.norm(forces[:, 1:], axis=1)
+        assert forces[:, 0].min() >= 0.0 and speed[:, 0].min() > -1e-6
+        assert (forces[:, 0] * speed[:, 0]).max() < 1e-6 * standing.body.weight
+        assert (pull <= 0.5 * forces[:, 0] + 1e-9).all()
+        sliding = (slip > 1e-4) & (forces[:, 0] > 0.0)
+        np.testing.assert_allclose(pull[sliding], 0.5 * forces[sliding, 0], rtol=1e-6, atol=1e-9)
+        along = (forces[:, 1:] * speed[:, 1:]).sum(axis=1)
+        np.testing.assert_allclose(along[sliding], -(pull * slip)[sliding], rtol=1e-4)
+        kinds |= set(np.where(forces[:, 0] == 0.0, "free", np.where(sliding, "slides", "sticks")).tolist())
+    assert kinds == {"free", "slides", "sticks"}

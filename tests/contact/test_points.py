@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from egs_warp.contact.detection import ContactGeometry
-from egs_warp.contact.points import MOST_AT_REST, MOST_REGIONS, ContactPoints
+from egs_warp.contact.points import MOST_AT_REST, ContactPoints
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.geometry.plane import Plane
 from tests.support.meshes import block_mesh
@@ -32,14 +32,13 @@ def gaps_of(geometry: ContactGeometry, tilt: float = 0.0) -> np.ndarray:
     return places[:, 2] + tilt * places[:, 0]
 
 
-def test_few_points_and_fewer_regions_one_a_cell(geometry: ContactGeometry) -> None:
+def test_few_points_one_a_cell(geometry: ContactGeometry) -> None:
     points = ContactPoints(geometry, near=NEAR, lower=1e-3)
     gaps = gaps_of(geometry)
     chosen = points.choose(np.zeros(0, int), np.zeros(0, bool), gaps)
     assert 4 <= len(chosen) <= MOST_AT_REST
     cells = points.cell_from_point[chosen]
     assert len(np.unique(cells)) == len(cells)
-    assert len(np.unique(points.region_from_point[chosen])) <= MOST_REGIONS
     for point, cell in zip(chosen, cells, strict=True):
         assert gaps[point] == gaps[points.cell_from_point == cell].min()
 

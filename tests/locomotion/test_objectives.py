@@ -10,6 +10,8 @@ import pytest
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from egs_warp.contact.detection import ContactDetector, ContactGeometry
+from egs_warp.deformation.embedding import embed_points
 from egs_warp.fem.body import BodyState, make_body
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.objectives import (
@@ -18,6 +20,7 @@ from egs_warp.locomotion.objectives import (
     Coordinates,
     base_area,
     centre_of_mass_velocity,
+    held_contacts,
     node_velocities,
     part_acceleration,
     part_angular_momentum,
@@ -187,6 +190,24 @@ def test_area_rows_are_the_rate_of_the_area_of_the_base() -> None:
     rate = rate_of(lambda x: np.array([hull(x).volume]), state, v)
     assert np.allclose(perimeter * (objective.rows @ v.ravel()), rate, rtol=1e-6)
     assert objective.target[0] * perimeter == pytest.approx(5.0 * (0.2 - hull(state.positions).volume))
+
+
+def test_what_is_held_costs_the_squared_slip_of_each_contact_by_its_load() -> None:
+    """On a slope, so that along the ground is not along an axis; what leaves the ground along its normal costs
+    nothing."""
+    floor = Plane(np.array([0.1, -0.2, 1.0]) / np.sqrt(1.05), 0.3)
+    nodes = BODY.mesh.nodes
+    embedding = embed_points(BODY.mesh, nodes[nodes[:, 2] == 0.0], device="cpu")
+    geometry = ContactGeometry(BODY.mesh, (floor,), 0.8, embedding.tets.numpy(), embedding.weights.numpy(), 0, 0.0)
+    contacts = ContactDetector(geometry, device="cpu").contact_set(np.arange(4), nodes)
+    loads = np.array([0.5, 0.2, 0.0, 0.3])
+    objective = held_contacts(contacts, loads, 7.0)
+    assert objective.weight == 7.0 and not objective.target.any()
+    v = np.random.default_rng(9).standard_normal(nodes.shape)
+    moved = np.einsum("cw,cwi->ci", contacts.weights, v[contacts.nodes])
+    slid = moved - np.outer(moved @ floor.normal, floor.normal)
+    gap = objective.rows @ v.ravel()
+    assert gap @ gap == pytest.approx(loads @ (slid**2).sum(axis=1))
 
 
 def test_node_rows_of_a_part_are_a_mean_square() -> None:

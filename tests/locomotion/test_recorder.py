@@ -23,7 +23,7 @@ def same(a: Trajectory, b: Trajectory) -> bool:
 
 def test_parts_on_disk_are_what_memory_would_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("egs_warp.locomotion.recorder._STEPS_A_PART", 7)
-    run = slide("two-stage")
+    run = slide()
     on_disk, in_memory = run.recorder(folder=lambda: tmp_path / "parts"), run.recorder()
     for report in run.reports[:6]:
         on_disk.add([report])
@@ -49,7 +49,7 @@ def test_parts_on_disk_are_what_memory_would_hold(tmp_path: Path, monkeypatch: p
 
 def test_a_part_that_is_missing_or_of_another_schema_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("egs_warp.locomotion.recorder._STEPS_A_PART", 7)
-    run = slide("two-stage")
+    run = slide()
     recorder = run.recorder(folder=lambda: tmp_path)
     for report in run.reports:
         recorder.add([report])
@@ -62,7 +62,7 @@ def test_a_part_that_is_missing_or_of_another_schema_is_told(tmp_path: Path, mon
 
 
 def test_all_that_acts_on_the_body_is_written_down() -> None:
-    run = slide("coupled")
+    run = slide()
     frame = BodyFrame(np.eye(3)[[1, 2, 0]], np.array([1.0, 2.0, 3.0]), 4.0)
     recorder: Recorder = run.recorder(frame=frame)
     recorder.add(run.reports)
@@ -83,7 +83,7 @@ def test_all_that_acts_on_the_body_is_written_down() -> None:
 
 def test_each_contact_names_its_plane_among_parallel_ones() -> None:
     """A block whose one half is lifted over a step: treads have one normal, risers another."""
-    run = slide("two-stage")
+    run = slide()
     body, flat = run.stepper.body, run.stepper.geometry
     step = (Plane(np.array([0.0, 0.0, 1.0]), -0.2), Plane(np.array([-1.0, 0.0, 0.0]), 0.05))
     planes = (*flat.planes, *step)

@@ -1,4 +1,4 @@
-"""The cost of a step against what it says of positions and velocities, by differences."""
+"""The cost of a step against what it says of positions and velocities, by differences (Eq. 13)."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from egs_warp.fem.body import BodyState, make_body
+from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.objectives import SpinObjective, centre_of_mass_velocity
@@ -45,37 +46,57 @@ def test_objectives_are_weighted_squares_of_what_is_missed() -> None:
     assert value(objectives_cost(problem, linear, objectives, speed), x) == pytest.approx(expected, rel=1e-10)
 
 
+def moved_on(problem: StepProblem, linear: LinearStep, foreseen: np.ndarray, time: float, x: np.ndarray) -> np.ndarray:
+    """(N, 3) where the body is after ``time`` s: the step's way, and from there as one implicit step would go on."""
+    end = problem.end_positions(foreseen.reshape(-1, 3))
+    entries = BODY.assembly.matrix_entries(
+        end, BODY.assembly.damping(problem.state.positions, time), factor=time**2, projected=True
+    )
+    upper = BODY.assembly.matrix(entries).toarray()
+    implicit = upper + np.triu(upper, 1).T + np.diag(np.repeat(BODY.node_mass, 3))
+    speeds = linear.base + linear.columns @ x
+    further = np.linalg.solve(implicit, np.repeat(BODY.node_mass, 3) * speeds)
+    return problem.state.positions + (DT * speeds + (time - DT) * further).reshape(-1, 3)
+
+
 def test_effort_is_the_energy_ahead_and_convex() -> None:
     """Value, slope and curvature at the unknowns that bring about what is foreseen, by differences of the energy."""
     problem, linear, foreseen = example()
     horizon = 0.16
-    ahead = horizon * np.sqrt(BODY.height / 9.81)
-    cost = effort_cost(problem, linear, foreseen, weight=0.1, horizon=horizon)
+    time = horizon * np.sqrt(BODY.height / 9.81)
+    factors = SparseFactors(BODY.assembly.upper_pattern)
+    damping = BODY.assembly.damping(problem.state.positions, time)
     unit = 0.1 / (BODY.weight * BODY.height)
+    cost = effort_cost(problem, linear, foreseen, factors, weight=0.1, horizon=horizon)
+    assert np.linalg.eigvalsh(cost.P).min() >= -1e-12 * np.abs(cost.P).max()
+    # About the end that is foreseen the model is the energy, to second order.
+    assert np.linalg.norm(cost.P) > 0.0
+    still = LinearStep(0.0 * foreseen, 1e-2 * linear.columns, linear.torques)
+    rest = np.zeros_like(foreseen)
+    modelled = effort_cost(problem, still, rest, factors, weight=0.1, horizon=horizon)
 
     def energy(x: np.ndarray) -> float:
-        moved = ahead * (linear.base + linear.columns @ x) - DT * foreseen
-        end = problem.end_positions(foreseen.reshape(-1, 3)) + moved.reshape(-1, 3)
-        return unit * BODY.assembly.energy(end, problem.damping)
+        return unit * BODY.assembly.energy(moved_on(problem, still, rest, time, x), damping)
 
-    # Where the expansion is made: the start and what is foreseen alone.
-    still = LinearStep(DT / ahead * foreseen, linear.columns, linear.torques)
-    at_centre = effort_cost(problem, still, foreseen, weight=0.1, horizon=horizon)
-    end = problem.end_positions(foreseen.reshape(-1, 3))
-    assert at_centre.constant == pytest.approx(unit * BODY.assembly.energy(end, problem.damping), rel=1e-9)
-    step = 1e-4
+    assert modelled.constant == pytest.approx(energy(np.zeros(4)), rel=1e-9)
+    step = 1e-3
     for k in range(4):
         along = step * np.eye(4)[k]
-        moved = (ahead * linear.columns @ along).reshape(-1, 3)
-        slope = (
-            BODY.assembly.energy(end + moved, problem.damping) - BODY.assembly.energy(end - moved, problem.damping)
-        ) / (2.0 * step)
-        assert at_centre.q[k] == pytest.approx(unit * slope, rel=1e-5)
-    assert np.linalg.eigvalsh(cost.P).min() >= -1e-12 * np.abs(cost.P).max()
-    # Near by, the model is the energy.
-    x = 1e-3 * np.ones(4)
-    small = LinearStep(DT / ahead * foreseen, 0.01 * linear.columns, linear.torques)
-    modelled = value(effort_cost(problem, small, foreseen, weight=0.1, horizon=horizon), x)
-    moved = (ahead * 0.01 * linear.columns @ x).reshape(-1, 3)
-    assert modelled == pytest.approx(unit * BODY.assembly.energy(end + moved, problem.damping), rel=1e-7)
-    assert np.isfinite(energy(x))
+        assert modelled.q[k] == pytest.approx((energy(along) - energy(-along)) / (2.0 * step), rel=1e-5)
+    x = 1e-2 * np.ones(4)
+    assert value(modelled, x) == pytest.approx(energy(x), rel=1e-6)
+
+
+def test_what_lets_go_is_foreseen_slack_not_strained_the_other_way() -> None:
+    """A stretched body whose end velocity takes it to its rest shape within the step: carried on at that speed it would
+    be strained by twice as much."""
+    nodes = BODY.mesh.nodes
+    stretch = 0.02 * (nodes - nodes.mean(axis=0)) * [0.0, 0.0, 1.0]
+    problem = StepProblem(BODY, BodyState(nodes + stretch, np.zeros_like(nodes)), DT)
+    back = (-stretch / DT).ravel()
+    linear = LinearStep(back, np.zeros((back.size, 1)), np.zeros((3, 1)))
+    factors = SparseFactors(BODY.assembly.upper_pattern)
+    horizon = 3.0 * DT / np.sqrt(BODY.height / 9.81)
+    effort = effort_cost(problem, linear, back, factors, weight=1.0, horizon=horizon).constant
+    carried_on = nodes - 2.0 * stretch
+    assert effort < 0.5 * BODY.assembly.energy(carried_on) / (BODY.weight * BODY.height)

@@ -55,6 +55,16 @@ def test_a_swinging_foot_leaves_and_lands_at_rest() -> None:
     assert heights[moving].min() > 0.3 * GAIT.lift
 
 
+def test_a_foot_is_steered_bit_by_bit_and_goes_ahead_only_when_it_is_up() -> None:
+    """Not at all where the swing begins, wholly before it is carried far; carried between the two times that are
+    told."""
+    steered = [GAIT.eased(s) for s in (0.0, 0.1, 0.2, 0.3, 1.0)]
+    assert steered[0] == 0.0 and steered[3:] == [1.0, 1.0] and np.all(np.diff(steered[:4]) > 0.0)
+    assert GAIT.carried(GAIT.carried_from / GAIT.swing_time) == 0.0
+    assert GAIT.carried(GAIT.carried_until / GAIT.swing_time) == pytest.approx(1.0)
+    assert 0.0 < GAIT.carried(0.5 * (GAIT.carried_from + GAIT.carried_until) / GAIT.swing_time) < 1.0
+
+
 def test_a_passage_meets_its_ends() -> None:
     """Places and velocities at both ends; the velocity is the rate of the place; outside it stays at the ends."""
     rng = np.random.default_rng(0)

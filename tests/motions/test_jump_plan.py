@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from egs_warp.motions.jump_plan import JumpTarget, plan_jump
+from egs_warp.motions.jump_plan import LEAN, JumpTarget, plan_jump
 
 GRAVITY, STEP = 9.81, 1 / 60
 
@@ -27,7 +27,7 @@ def test_a_body_that_does_as_planned_reaches_height_and_distance(target: JumpTar
         support_ahead=ahead,
         gravity=GRAVITY,
         step=STEP,
-        lean=0.2 * target.distance,
+        lean=LEAN * target.distance,
     )
 
     # Thrust: from rest at the bottom of the crouch, a push that grows and then stays, to take-off stretched by the
@@ -46,14 +46,15 @@ def test_a_body_that_does_as_planned_reaches_height_and_distance(target: JumpTar
     assert pushes[800] == pytest.approx(0.65 * full, rel=2e-3)
     assert np.allclose(pushes[1601:], full, rtol=1e-6)
     push = plan.speed_up**2 / (2.0 * way)
-    deepest = 0.26 * com_height
-    shallow = plan.crouch_depth < deepest
+    least, deepest = plan.extension + 0.02 * height, 0.26 * com_height
     assert 0.0 < plan.extension < target.height and plan.crouch_depth > 0.0
-    # At 1.6 g, and harder where the crouch is as deep as the body can.
-    if shallow:
-        assert push == pytest.approx(1.6 * GRAVITY, rel=1e-6)
+    # At 2.4 g; harder where the crouch is as deep as the body can, less hard where it is as shallow as a thrust needs.
+    if plan.crouch_depth > deepest - 1e-9:
+        assert plan.crouch_depth == pytest.approx(deepest) and push > 2.4 * GRAVITY
+    elif way < least + 1e-9:
+        assert way == pytest.approx(least) and push < 2.4 * GRAVITY
     else:
-        assert plan.crouch_depth == pytest.approx(deepest) and push > 1.6 * GRAVITY
+        assert push == pytest.approx(2.4 * GRAVITY, rel=1e-6)
 
     # Flight: up to the asked height, down to where the stretched body stands on what it lands on.
     z, speed, apex, time = plan.extension, plan.speed_up, 0.0, 0.0
@@ -65,24 +66,32 @@ def test_a_body_that_does_as_planned_reaches_height_and_distance(target: JumpTar
     assert time == pytest.approx(plan.flight_time, abs=1.5 * STEP)
 
     # Way: the lean, half the speed while thrusting, all of it in flight; the rest is what the feet are put down ahead
-    # of the body.
+    # of the body. What the crouch has left of speed ahead is not counted: the plan's own path is a little longer.
     way = plan.lean + plan.speed_forward * (0.5 * plan.thrust_time + plan.flight_time)
     assert way + plan.landing_lag == pytest.approx(target.distance, rel=1e-9)
-    assert plan.lean == pytest.approx(0.2 * target.distance)
+    assert plan.lean == pytest.approx(LEAN * target.distance)
+    path = moves[-1][0][0] + plan.speed_forward * plan.flight_time + plan.landing_lag
+    assert target.distance - 1e-9 <= path <= 1.05 * target.distance
 
-    # Landing: over feet 1.3 times as loaded as at rest the body comes to a stop. In a jump ahead they push from 0.3 of
-    # the way to their front, which saves the body that much of its way.
-    fall_rate = np.sqrt(1.3 * GRAVITY / com_height)
-    pivot = plan.speed_forward / fall_rate - plan.landing_lag
-    assert pivot == pytest.approx(0.3 * ahead if target.distance else 0.0, abs=1e-12)
-    path = solve_ivp(
+    # Landing: one push through the centre of mass stops the fall and takes off speed ahead; over the feet that push,
+    # as a linear inverted pendulum, the body comes to a stop. In a jump ahead they push from 0.3 of the way to their
+    # front, in a short one from less, which saves the body that much of its way.
+    fall = np.sqrt(2.0 * GRAVITY * (target.height - plan.extension - target.rise))
+    fall_rate = np.sqrt(GRAVITY / com_height)
+    capture_time = 1.0 / (fall_rate + fall / com_height)
+    pivot = plan.speed_forward * capture_time - plan.landing_lag
+    assert pivot == pytest.approx(min(0.3 * ahead, 0.5 * target.distance * capture_time / plan.flight_time), abs=1e-12)
+    leg = np.array([-plan.landing_lag - pivot, com_height])
+    landed = np.array([plan.speed_forward, -fall]) + fall / com_height * leg
+    assert landed[1] == pytest.approx(0.0, abs=1e-12)
+    stop = solve_ivp(
         lambda _, y: [y[1], fall_rate**2 * (y[0] - pivot)],
         (0.0, 5.0 / fall_rate),
-        [-plan.landing_lag, plan.speed_forward],
+        [-plan.landing_lag, landed[0]],
         rtol=1e-10,
         atol=1e-12,
     )
-    stopped = np.abs(path.y[:, -1] - [pivot, 0.0]) / np.maximum(np.abs(path.y[:, 0] - [pivot, 0.0]), 1e-9)
+    stopped = np.abs(stop.y[:, -1] - [pivot, 0.0]) / np.maximum(np.abs(stop.y[:, 0] - [pivot, 0.0]), 1e-9)
     assert stopped.max() < 1.01 * np.exp(-5.0)
 
 
@@ -90,3 +99,15 @@ def test_a_given_lean_is_kept() -> None:
     shared = {"height": 1.0, "com_height": 0.5, "support_ahead": 0.2}
     plan = plan_jump(JumpTarget(0.5, 0.3), **shared, gravity=GRAVITY, step=STEP, lean=0.09)
     assert plan.lean == 0.09
+
+
+@pytest.mark.parametrize("step", [1 / 30, 1 / 60, 1 / 90])
+def test_a_crouch_goes_over_into_its_thrust_in_whole_steps(step: float) -> None:
+    """Otherwise its last step would ask for less than its whole way: a jolt against the motion."""
+    plan = plan_jump(
+        JumpTarget(0.5, 0.2), height=1.0, com_height=0.45, support_ahead=0.2, gravity=GRAVITY, step=step, lean=0.1
+    )
+    steps = plan.crouch_time / step
+    assert steps == pytest.approx(round(steps)) and 1.1 <= plan.crouch_time * np.sqrt(GRAVITY) < 1.1 + 3.2 * step
+    for before, after in zip(plan.crouch(np.zeros(3), plan.crouch_time), plan.thrust(np.zeros(3), 0.0), strict=True):
+        assert before == pytest.approx(after, abs=1e-12)

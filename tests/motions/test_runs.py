@@ -33,7 +33,7 @@ def assert_audit(trajectory: Trajectory, reports: Sequence[StepReport]) -> None:
     """Both momenta, energy, friction, penetration and complementarity within the bounds of the design."""
     bounds = audit(trajectory, newton_unconverged=sum(not report.converged for report in reports))
     assert bounds.momentum_residual <= 1e-5 and bounds.angular_momentum_residual <= 1e-4
-    assert bounds.energy_residual <= 1e-6 and bounds.friction_gap <= 1e-5 and bounds.contact_velocity <= 0.1
+    assert bounds.energy_residual <= 1e-6 and bounds.friction_gap <= 1e-5 and bounds.contact_velocity <= 1e-6
     assert bounds.cone_violation <= 1e-4 and bounds.penetration <= 0.01 and bounds.complementarity_gap <= 1e-4
     assert bounds.inverted_elements == 0 and bounds.newton_unconverged == 0
 

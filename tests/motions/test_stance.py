@@ -1,4 +1,4 @@
-"""What the feet can give: accelerations that do not tip the body, against a search over all of them."""
+"""What the feet can give: ends of a step that do not tip the body, against a search over all of them."""
 
 from __future__ import annotations
 
@@ -7,47 +7,126 @@ import pytest
 
 from egs_warp.fem.body import BodyState
 from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import PoseFamily
+from egs_warp.motions.stance import MARGIN, Measurement, PoseFamily, _share_in_cone
 
-GRAVITY, EDGE = 9.81, 0.2
+GRAVITY, EDGE, DT = 9.81, 0.2, 1 / 60
 
 
-@pytest.mark.parametrize("wanted", [(0.3, -0.2), (9.0, 0.5), (-4.0, -20.0)])
-@pytest.mark.parametrize("up", [0.0, 6.0, -5.0])
-@pytest.mark.parametrize("margin", [0.6, 0.9])
-def test_the_nearest_acceleration_that_does_not_tip(
-    place: Place, wanted: tuple[float, float], up: float, margin: float
+def stood(
+    place: Place, friction: float, moved: tuple[float, float, float]
+) -> tuple[PoseFamily, BodyState, Measurement]:
+    """The body with all above its soles ``moved``, at rest."""
+    pose = PoseFamily(place.body, place.ground, place.standing, place.touching, friction)
+    positions = place.standing + np.array(moved) * (place.standing[:, 2:] > 1e-9)
+    state = BodyState(positions, np.zeros_like(positions))
+    return pose, state, pose.measure(state, None)
+
+
+def swing(place: Place, state: BodyState, seen: Measurement, spin: np.ndarray) -> np.ndarray:
+    """(2,) m/s that a ``spin`` (3,) adds to the speed in the momentum about the feet."""
+    momentum = place.ground.axes @ place.body.inertia(state.positions) @ spin / (place.body.mass * seen.com[2])
+    return np.array([momentum[1], -momentum[0]])
+
+
+@pytest.mark.parametrize("wanted", [(0.005, -0.003), (0.3, 0.01), (-0.1, -0.4)])
+@pytest.mark.parametrize("turning", [(0.0, 0.0, 0.3), (0.4, -2.0, 0.0)])
+@pytest.mark.parametrize("up", [0.0, 0.1, -0.08])
+def test_the_nearest_end_of_a_step_that_does_not_tip(
+    place: Place, wanted: tuple[float, float], turning: tuple[float, float, float], up: float
 ) -> None:
-    """The ground's force on a body that neither turns nor tips points through its centre of mass, from inside the
-    footprint.
-    """
-    pose = PoseFamily(place.body, place.ground, place.standing, place.touching)
-    positions = place.standing + np.array([0.05, -0.03, 0.1]) * (place.standing[:, 2:] > 1e-9)
-    seen = pose.measure(BodyState(positions, np.zeros_like(positions)), None)
-    com = place.ground.local(place.body.centre_of_mass(positions))
-
-    def pressure(level: np.ndarray) -> np.ndarray:
-        """(..., 2) where the line of the force (level, g + up) through the centre of mass meets the floor."""
-        return com[:2] - com[2] * level / (GRAVITY + up)
-
-    got = pose.balanced_acceleration(seen, np.array(wanted), up, GRAVITY, margin=margin)
+    """About the point where the ground pushes, within the footprint, m h (v + swing) changes by its distance from the
+    centre of mass times the load; of all ends that do, the one whose velocity and spin miss least."""
+    pose, state, seen = stood(place, 1e3, (0.05, -0.03, 0.1))
+    asked, spin = np.array([*wanted, up]), np.array(turning)
+    velocity, turned = pose.balanced(state, seen, asked, spin, DT)
+    load, height = GRAVITY + up / DT, seen.com[2]
     middle = place.ground.local(place.touching)[:, :2].mean(axis=0)
-    assert np.abs(pressure(got) - middle).max() <= margin * EDGE + 1e-9
-    line = np.linspace(-30.0, 30.0, 601)
-    levels = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    stands = levels[np.abs(pressure(levels) - middle).max(axis=1) <= margin * EDGE]
-    nearest = np.linalg.norm(stands - wanted, axis=1).min()
-    spacing = line[1] - line[0]
-    assert nearest - 2.0 * spacing < np.linalg.norm(got - wanted) <= nearest + 1e-9
+
+    def pressure(change: np.ndarray) -> np.ndarray:
+        return seen.com[:2] - height / load * change / DT
+
+    change = velocity[:2] + swing(place, state, seen, turned)
+    assert np.abs(pressure(change) - middle).max() <= MARGIN * EDGE + 1e-9
+    assert velocity[2] == up
+    axis = place.ground.axes[2]
+    inertia = place.body.inertia(state.positions)
+    assert axis @ inertia @ turned == pytest.approx(axis @ inertia @ spin, abs=1e-9)
+    # By search, one axis after the other: v and swing with the radius of gyration.
+    gyration = 0.5 * np.trace(inertia) / (place.body.mass * height**2)
+    line = np.linspace(-1.0, 1.0, 2001)
+    for k in (0, 1):
+        level, turn = np.meshgrid(line, line, indexing="ij")
+        stands = np.abs(seen.com[k] - height / load * (level + turn) / DT - middle[k]) <= MARGIN * EDGE
+        target = swing(place, state, seen, spin)[k]
+        missed = (level - wanted[k]) ** 2 + (turn - target) ** 2 / gyration
+        got = (velocity[k] - wanted[k]) ** 2 + (swing(place, state, seen, turned)[k] - target) ** 2 / gyration
+        assert np.sqrt(got) <= np.sqrt(missed[stands].min()) + 1e-9
+        assert np.sqrt(got) >= np.sqrt(missed[stands].min()) - 5e-3
 
 
-def test_the_usual_margin_stays_inside_the_feet_and_a_falling_body_may_be_pushed_either_way(place: Place) -> None:
-    pose = PoseFamily(place.body, place.ground, place.standing, place.touching)
-    still = np.zeros_like(place.standing)
-    seen = pose.measure(BodyState(place.standing, still), None)
-    hard = pose.balanced_acceleration(seen, np.array([100.0, -100.0]), 0.0, GRAVITY)
-    assert hard * [1.0, -1.0] == pytest.approx(np.full(2, 0.8 * EDGE * GRAVITY / 0.5), rel=0.02)
-    past = place.standing + np.array([0.5, 0.0, 0.0]) * (place.standing[:, 2:] > 1e-9)
-    falling = pose.measure(BodyState(past, still), None)
-    ways = [pose.balanced_acceleration(falling, np.array([x, 0.0]), 0.0, GRAVITY)[0] for x in (-100.0, 100.0)]
-    assert ways[0] < -0.5 and ways[1] > 0.5
+def test_what_feet_can_give_is_asked_for_as_it_is_and_a_falling_body_may_be_pushed_either_way(place: Place) -> None:
+    pose, state, seen = stood(place, 1e3, (0.0, 0.0, 0.0))
+    asked, spin = np.array([0.01, -0.005, 0.02]), np.array([0.01, 0.02, 0.5])
+    velocity, turned = pose.balanced(state, seen, asked, spin, DT)
+    np.testing.assert_allclose(velocity, asked, atol=1e-12)
+    np.testing.assert_allclose(turned, spin, atol=1e-12)
+    pose, state, seen = stood(place, 1e3, (0.5, 0.0, 0.0))
+    ways = [pose.balanced(state, seen, np.array([x, 0.0, 0.0]), np.zeros(3), DT)[0][0] for x in (-2.0, 2.0)]
+    assert ways[0] < -0.5 * DT and ways[1] > 0.5 * DT
+
+
+@pytest.mark.parametrize("up", [0.0, 0.25])
+def test_no_more_is_asked_than_friction_gives(place: Place, up: float) -> None:
+    """Coulomb: what is asked keeps its way and is 0.95 of what the ground's friction could do; less is asked as it
+    is."""
+    pose, state, seen = stood(place, 0.05, (0.0, 0.0, 0.0))
+    wanted = np.array([0.009, -0.012])
+    most = 0.95 * 0.05 * (GRAVITY + up / DT) * DT
+    got, _ = pose.balanced(state, seen, np.array([*(10.0 * wanted), up]), np.zeros(3), DT)
+    assert got[:2] == pytest.approx(most * wanted / 0.015)
+    little, _ = pose.balanced(state, seen, np.array([*(0.1 * wanted), up]), np.zeros(3), DT)
+    assert little[:2] == pytest.approx(0.1 * wanted)
+
+
+@pytest.mark.parametrize("way", [(1.0, 0.0), (-1.0, 0.0), (0.6, -0.8)])
+def test_on_a_slope_friction_gives_less_uphill(way: tuple[float, float]) -> None:
+    """What is asked for is on the cone about the ground's normal: uphill that is weight x tan(friction angle - slope),
+    by hand."""
+    friction, slope = 0.3, np.radians(8.0)
+    rising = np.array([-np.sin(slope), 0.0, np.cos(slope)])
+    push, weight = np.array([*way, 0.0]), np.array([0.0, 0.0, 2.0])
+    share = _share_in_cone(push, weight, rising, friction)
+    force = weight + share * push
+    assert np.linalg.norm(np.cross(force, rising)) == pytest.approx(friction * force @ rising)
+    angle = np.arctan(friction)
+    by_hand = {(1.0, 0.0): np.tan(angle - slope), (-1.0, 0.0): np.tan(angle + slope)}
+    assert share == pytest.approx(2.0 * by_hand.get(way, share / 2.0))
+    assert _share_in_cone(push, weight, rising, 0.1) == 0.0
+    assert _share_in_cone(weight, weight, rising, friction) == np.inf
+
+
+@pytest.mark.parametrize("spin", [(0.0, -2.0, 0.0), (1.5, 1.0, 0.2)])
+def test_what_friction_denies_the_speed_the_spin_takes(place: Place, spin: tuple[float, float, float]) -> None:
+    """On a slippery ground, too, the centre of pressure asked for is within the footprint."""
+    pose, state, seen = stood(place, 0.3, (0.05, -0.03, 0.1))
+    velocity, turned = pose.balanced(state, seen, np.array([0.3, 0.01, 0.0]), np.array(spin), DT)
+    change = velocity[:2] + swing(place, state, seen, turned)
+    middle = place.ground.local(place.touching)[:, :2].mean(axis=0)
+    pressure = seen.com[:2] - seen.com[2] / GRAVITY * change / DT
+    assert np.linalg.norm(velocity[:2]) <= 0.3 * GRAVITY * DT
+    assert np.abs(pressure - middle).max() <= MARGIN * EDGE + 1e-9
+
+
+def test_a_body_that_turns_forward_is_caught_further_ahead(place: Place) -> None:
+    """The capture point is that of the momentum about the feet: at rest over its place nothing is asked, and spin
+    counts as the speed that has the same momentum."""
+    pose, state, seen = stood(place, 1.0, (0.0, 0.0, 0.0))
+    np.testing.assert_allclose(pose.caught(seen, seen.com[:2]), 0.0, atol=1e-12)
+    ahead = BodyState(state.positions, np.broadcast_to(0.1 * place.ground.axes[0], state.positions.shape))
+    forward = pose.caught(pose.measure(ahead, None), seen.com[:2])
+    assert forward[0] == pytest.approx(-0.2 * np.sqrt(GRAVITY / seen.com[2]), rel=1e-9)
+    arms = state.positions - place.body.centre_of_mass(state.positions)
+    turning = BodyState(state.positions, np.cross(0.5 * place.ground.axes[1], arms))
+    caught = pose.caught(pose.measure(turning, None), seen.com[:2])
+    same = swing(place, state, seen, 0.5 * place.ground.axes[1])
+    np.testing.assert_allclose(caught, -2.0 * np.sqrt(GRAVITY / seen.com[2]) * same, atol=1e-9)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from egs_warp.errors import UserError
-from egs_warp.fem.body import BodyState
+from egs_warp.fem.body import DEFAULT_SAG, BodyState
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.recorder import Recorder
@@ -19,17 +19,17 @@ from tests.support.meshes import UP, coarse_stool, figure, stool
 from tests.support.places import DT
 
 
-def stiff(
+def standing(
     mesh: TetMesh, *, forward: np.ndarray, up: np.ndarray = UP, settled: bool = True
 ) -> tuple[LocomotionStepper, Place, BodyState]:
-    """A stiff, strong body of ``mesh`` on its lowest nodes; ``up`` (3,) is against gravity."""
-    made = coarse_creature(mesh, forward=forward, up=up, sag=0.01, strength=20.0, settled=settled)
+    """A body of ``mesh``, as stiff and strong as captures are, on its lowest nodes; ``up`` (3,) is against gravity."""
+    made = coarse_creature(mesh, forward=forward, up=up, sag=DEFAULT_SAG, settled=settled)
     return made.stepper, made.place, made.start
 
 
 def test_a_walk_goes_along_its_feet_and_refuses_other_bodies() -> None:
     """The way forward is turned to the nearest side of the feet; a body on two feet is told that a walk needs four."""
-    _, place, _ = stiff(stool(), forward=np.array([0.9, 0.3, 0.0]), settled=False)
+    _, place, _ = standing(stool(), forward=np.array([0.9, 0.3, 0.0]), settled=False)
     walk = Walk(place, 3, 0.08)
     assert np.allclose(walk.ground.axes[0], [1.0, 0.0, 0.0], atol=1e-9)
     for pair in walk.pairs:
@@ -40,7 +40,7 @@ def test_a_walk_goes_along_its_feet_and_refuses_other_bodies() -> None:
     strides_out = Walk(place, 3, 0.8)
     assert strides_out.gait.step_length == pytest.approx(0.5 * min(foot.length for foot in strides_out.feet))
     assert strides_out.notes()[0].startswith("steps of 1.00 body heights were asked; the legs are long enough for 0.3")
-    _, place, _ = stiff(figure(), forward=np.array([1.0, 0.0, 0.0]), settled=False)
+    _, place, _ = standing(figure(), forward=np.array([1.0, 0.0, 0.0]), settled=False)
     with pytest.raises(UserError, match="walk: a walk needs four separate feet, the body has 2"):
         Walk(place, 4, 0.1)
 
@@ -51,7 +51,7 @@ def test_a_coarse_stool_takes_a_step(slope: float) -> None:
     is met, the audit holds."""
     tilt = np.radians(slope)
     up = np.array([np.sin(tilt), 0.0, np.cos(tilt)])
-    stepper, place, state = stiff(coarse_stool(), forward=np.array([1.0, 0.0, 0.0]), up=up)
+    stepper, place, state = standing(coarse_stool(), forward=np.array([1.0, 0.0, 0.0]), up=up)
     body, start, walk = stepper.body, state, Walk(place, 1, 0.06)
     reports: list[StepReport] = []
     memory, air = stepper.initial_memory(), 0.0

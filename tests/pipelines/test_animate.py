@@ -83,7 +83,7 @@ def test_a_run_that_is_cut_off_leaves_its_steps(
 ) -> None:
     """What was simulated is read from the parts; the next run moves them aside."""
     monkeypatch.setattr("egs_warp.locomotion.recorder._STEPS_A_PART", 7)
-    slid = slide("two-stage")
+    slid = slide()
 
     def interrupted(*_: object, parts: Callable[[], Path], **__: object) -> None:
         recorder = slid.recorder(folder=parts)

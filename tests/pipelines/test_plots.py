@@ -19,7 +19,7 @@ def picture(path: Path) -> np.ndarray:
 
 
 def test_the_same_run_gives_the_same_bytes_and_another_another_picture(tmp_path: Path) -> None:
-    t = slide("coupled").trajectory()
+    t = slide().trajectory()
     books = ledger(t)
     planned = np.full((len(t.time), 3), np.nan)
     planned[3:9] = [0.1, 0.0, 0.9]

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from egs_warp.contact.detection import tangent_directions
 from egs_warp.locomotion.complementarity import SEPARATE, ContactLayout
-from egs_warp.locomotion.program import ContactProgram, LinearResponse, contact_rows
+from egs_warp.locomotion.contact_pieces import ContactPieces
+from egs_warp.locomotion.program import ContactProgram
 from egs_warp.locomotion.solvers import QpSolver, quadratic_program
 
 FRICTION = 0.8
@@ -19,15 +19,15 @@ FRICTION = 0.8
 class SmallProblem:
     """A program and the mechanics behind it; units of weight and speed are 1."""
 
+    pieces: ContactPieces
     program: ContactProgram
-    linear: LinearResponse
-    frame: np.ndarray
-    """(3n, d) contact velocities of d generalised velocities."""
     shift: np.ndarray
 
     def velocities(self, y: np.ndarray) -> np.ndarray:
         """(n, 3) of the contacts."""
-        return (self.frame @ (self.linear.base + self.linear.response @ y)).reshape(-1, 3)
+        velocities = (self.pieces.rows @ self.program.forces_of(y) + self.pieces.offset).reshape(-1, 3)
+        velocities[:, 0] -= self.shift
+        return velocities
 
 
 def small_problem(
@@ -44,27 +44,25 @@ def small_problem(
     ``frame`` replaces J.
     """
     rng = np.random.default_rng(seed)
-    layout = ContactLayout(activations, contacts, directions)
     if frame is None:
         frame = rng.standard_normal((3 * contacts, freedoms))
         frame[0::3, 0] = 2.0
     freedoms = frame.shape[1]
     base = rng.standard_normal(freedoms) - 1.5 * np.eye(freedoms)[0]
-    push = frame.T.reshape(freedoms, contacts, 3)
-    table = tangent_directions(directions)
-    tangent = np.einsum("vnt,dt->vnd", push[:, :, 1:], table).reshape(freedoms, -1)
-    zeros = np.zeros((freedoms, contacts))
-    response = np.hstack([rng.standard_normal((freedoms, activations)), push[:, :, 0], tangent, zeros])
+    response = np.hstack([rng.standard_normal((freedoms, activations)), frame.T])
     shift = rng.uniform(-0.1, 0.3, contacts)
     wanted = rng.standard_normal((4, freedoms))
     rows, gap = wanted @ response, wanted @ base - rng.standard_normal(4)
-    P = 2.0 * rows.T @ rows + 1e-7 * np.eye(layout.variables)
+    P = 2.0 * rows.T @ rows
     m = np.arange(activations)
     P[m, m] += 1e-3
-    linear = LinearResponse(base, response)
-    A, offset = contact_rows(linear, frame, shift, layout, FRICTION, 1.0)
-    program = ContactProgram(layout, FRICTION, P, 2.0 * rows.T @ gap, float(gap @ gap), A, offset)
-    return SmallProblem(program, linear, frame, shift)
+    offset = frame @ base
+    offset[::3] += shift
+    pieces = ContactPieces(
+        *(P, 2.0 * rows.T @ gap, float(gap @ gap), frame @ response, offset, FRICTION),
+        *(-np.ones(activations), np.ones(activations)),
+    )
+    return SmallProblem(pieces, ContactProgram.of(pieces, directions), shift)
 
 
 def all_states(layout: ContactLayout) -> list[np.ndarray]:

@@ -7,6 +7,7 @@ import numpy as np
 from egs_warp.contact.terrain import Solid
 from egs_warp.fem.body import make_body
 from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.stance import Ground
 from tests.support.meshes import block_mesh
@@ -16,9 +17,9 @@ FORWARD = np.array([1.0, 0.0, 0.0])
 DT = 1 / 60
 
 
-def block_place() -> Place:
-    """A block of 0.4 x 0.4 x 1 metres that stands on z = 0 and faces +x."""
-    mesh = block_mesh()
+def block_place(mesh: TetMesh | None = None) -> Place:
+    """A block of 0.4 x 0.4 x 1 metres, irregular inside, or another ``mesh`` that stands on z = 0 and faces +x."""
+    mesh = mesh or block_mesh()
     body = make_body(mesh, FLOOR, device="cpu")
     standing = mesh.nodes - [0.0, 0.0, mesh.nodes[:, 2].min()]
     ground = Ground.on(FLOOR, FORWARD, body.centre_of_mass(standing))

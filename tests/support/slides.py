@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from egs_warp.fem.body import BodyState
-from egs_warp.locomotion.coupled_stepper import CoupledStepper
 from egs_warp.locomotion.objectives import SpinObjective, centre_of_mass_velocity, node_velocities
 from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.stepper import LocomotionSettings, LocomotionStepper, StepReport
@@ -18,14 +17,12 @@ from tests.support.creatures import coarse_creature
 from tests.support.meshes import block_mesh
 from tests.support.places import DT, FORWARD
 
-STEPPERS = {"two-stage": LocomotionStepper, "coupled": CoupledStepper}
-
 
 @dataclass(frozen=True)
 class Slide:
     """What was simulated."""
 
-    stepper: LocomotionStepper | CoupledStepper
+    stepper: LocomotionStepper
     start: BodyState
     reports: tuple[StepReport, ...]
 
@@ -46,11 +43,11 @@ class Slide:
 
 
 @cache
-def slide(name: str) -> Slide:
-    """24 steps by the stepper of this ``name``, in air that drags."""
+def slide() -> Slide:
+    """24 steps in air that drags."""
     made = coarse_creature(block_mesh(), forward=FORWARD)
     body, muscles, geometry = made.stepper.body, made.stepper.muscles, made.stepper.geometry
-    stepper = STEPPERS[name](body, muscles, geometry, settings=LocomotionSettings(drag=0.3), device="cpu")
+    stepper = LocomotionStepper(body, muscles, geometry, settings=LocomotionSettings(drag=0.3), device="cpu")
     positions = made.start.positions + np.array([0.0, 0.0, 0.01])
     arms = positions - body.centre_of_mass(positions)
     start = BodyState(positions, np.array([0.8, 0.2, -0.5]) + np.cross([0.5, 0.3, 1.0], arms))

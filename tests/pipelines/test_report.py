@@ -1,0 +1,19 @@
+"""What the report sums up."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+
+from egs_warp.locomotion.stepper import StepReport
+from egs_warp.pipelines.report import StageTime, stage_times
+
+
+def test_a_frame_without_a_stage_spends_no_time_in_it() -> None:
+    """Frames of two, one and one steps, of which only the last asks again."""
+    spent = [{"foresee": 3.0}, {"foresee": 5.0}, {"foresee": 1.0}, {"foresee": 6.0, "again": 9.0}]
+    steps = [cast(StepReport, SimpleNamespace(milliseconds=stages)) for stages in spent]
+    timing = stage_times(steps, np.array([0, 2, 3, 4]), {"render": [2.0, 4.0], "split": []})
+    assert timing == {"foresee": StageTime(5.0, 8.0), "again": StageTime(3.0, 9.0), "render": StageTime(3.0, 4.0)}

@@ -1,0 +1,84 @@
+"""A body without muscles of its own, stepped as the engine steps it: contact found, forces and velocities solved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from egs_warp.contact.coupled_step import ContactResponse, CoupledResult, CoupledSolver
+from egs_warp.contact.detection import ContactDetector, ContactGeometry
+from egs_warp.contact.points import ContactPoints
+from egs_warp.deformation.embedding import embed_points
+from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.step_problem import StepProblem
+from egs_warp.geometry.plane import Plane
+from egs_warp.muscles.tension import MuscleTension
+
+ABYSS = Plane(np.array([0.0, 0.0, 1.0]), 1e9)
+"""A ground that nothing reaches."""
+
+
+@dataclass
+class PassiveBody:
+    """Its state and its contacts from step to step."""
+
+    body: SoftBody
+    solver: CoupledSolver
+    state: BodyState
+    points: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
+    """(n,) of the last step."""
+    forces: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    """(n, 3) newtons."""
+
+    def advance(
+        self, dt: float, tension: MuscleTension | None = None, *, drag: float = 0.0
+    ) -> tuple[StepProblem, CoupledResult]:
+        """One step of ``dt`` seconds."""
+        body, state, solver = self.body, self.state, self.solver
+        problem = StepProblem(body, state, dt, drag)
+        gaps, _ = solver.detector.gaps(problem.end_positions(state.velocities + dt * body.gravity))
+        chosen = solver.points.choose(self.points, self.forces[:, 0] > 0.0, gaps)
+        contacts = solver.detector.contact_set(chosen, state.positions)
+        tangent = problem.tangent(solver.factors, problem.start, tension)
+        start = solver.points.matched(chosen, self.points, self.forces)
+        response = ContactResponse.of(tangent, contacts)
+        result = solver.solve(response, tension, velocities=problem.start, forces=start)
+        self.state = BodyState(problem.end_positions(result.velocities), result.velocities, state.time + dt)
+        self.points, self.forces = result.contacts.points, result.forces
+        return problem, result
+
+
+def passive_body(
+    body: SoftBody,
+    places: np.ndarray | None = None,
+    *,
+    plane: Plane = ABYSS,
+    friction: float = 0.5,
+    state: BodyState | None = None,
+    tolerance: float = 1e-8,
+) -> PassiveBody:
+    """``body`` over ``plane`` with contact points at ``places`` (P, 3) of its rest shape, one at its middle if it is to
+    fly; at rest unless ``state`` is given.
+    """
+    nodes = body.mesh.nodes
+    middle = body.mesh.nodes[body.mesh.tets[len(body.mesh.tets) // 2]].mean(axis=0)
+    soles = embed_points(body.mesh, middle[None] if places is None else places, device="cpu")
+    geometry = ContactGeometry(body.mesh, (plane,), friction, soles.tets.numpy(), soles.weights.numpy(), 0, 0.0)
+    height = body.height
+    solver = CoupledSolver(
+        ContactDetector(geometry, device="cpu"),
+        ContactPoints(geometry, near=0.01 * height, lower=1e-3 * height),
+        SparseFactors(body.assembly.upper_pattern),
+        push_out_cap=0.05 * float(np.sqrt(np.linalg.norm(body.gravity) * height)),
+        penetration_tolerance=5e-3 * height,
+        tolerance=tolerance,
+    )
+    return PassiveBody(body, solver, state or BodyState(nodes, np.zeros_like(nodes)))
+
+
+def base_places(body: SoftBody, count: int = 5) -> np.ndarray:
+    """(count^2, 3) grid under a box that stands on z = 0."""
+    (x, y, _), (left, front, _) = body.mesh.nodes.max(axis=0), body.mesh.nodes.min(axis=0)
+    return np.array([[a, b, 0.0] for a in np.linspace(left, x, count) for b in np.linspace(front, y, count)])
