@@ -44,6 +44,26 @@ class SpinObjective:
     weight: float
 
 
+@dataclass(frozen=True)
+class LoadObjective:
+    """weight times the squared share of the weight that each contact of some nodes carries.
+
+    A contact that holds does so whatever its nodes are asked to do: what is to be lifted is unloaded first.
+    """
+
+    nodes: np.ndarray
+    """(k,)."""
+    weight: float
+
+    def loads(self, contacts: ContactSet) -> np.ndarray:
+        """(3n,) 1 for the normal force of each contact nearest to one of the nodes."""
+        nearest = contacts.nodes[np.arange(contacts.count), np.argmax(contacts.weights, axis=1)]
+        return np.outer(np.isin(nearest, self.nodes), [1.0, 0.0, 0.0]).ravel()
+
+
+AnyObjective = Objective | SpinObjective | LoadObjective
+
+
 def node_velocities(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
     """Velocities (N, 3) of all nodes, each weighted by its share of the mass: a pose to move towards."""
     shares = np.sqrt(np.repeat(body.node_mass / body.mass, 3))

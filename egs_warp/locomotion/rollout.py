@@ -12,7 +12,7 @@ import numpy as np
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.geometry.body_frame import BodyFrame
-from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.stepper import STEPS_A_UNIT, LocomotionStepper, StepReport
 from egs_warp.locomotion.trajectory import Trajectory
@@ -26,7 +26,7 @@ REST_FRAMES = 20
 class Motion(Protocol):
     """Anything that writes objectives from the measured state."""
 
-    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[Objective | SpinObjective]:
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Objectives of the step of ``dt`` seconds that starts at ``state``; ``report`` is of the step before."""
         ...
 

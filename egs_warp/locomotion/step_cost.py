@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sparse
 
+from egs_warp.contact.detection import ContactSet
 from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.objectives import AnyObjective, LoadObjective, SpinObjective
 
 EFFORT = 1.0
 """Cost of m g H of elastic and damping energy."""
@@ -49,13 +50,21 @@ class QuadraticCost:
 
 
 def objectives_cost(
-    problem: StepProblem, linear: LinearStep, objectives: Sequence[Objective | SpinObjective], speed: float
+    problem: StepProblem,
+    linear: LinearStep,
+    contacts: ContactSet,
+    objectives: Sequence[AnyObjective],
+    speed: float,
 ) -> QuadraticCost:
     """The weighted squares that a motion asks for, in units of ``speed`` m/s, sqrt(g H)."""
     body, state = problem.body, problem.state
     count = linear.columns.shape[1]
     P, q, constant = np.zeros((count, count)), np.zeros(count), 0.0
     for objective in objectives:
+        if isinstance(objective, LoadObjective):
+            loads = np.flatnonzero(objective.loads(contacts)) + count - 3 * contacts.count
+            P[loads, loads] += 2.0 * objective.weight
+            continue
         if isinstance(objective, SpinObjective):
             gyration = np.sqrt(0.5 * np.trace(problem.inertia) / body.mass)
             unit = body.mass * gyration * speed
@@ -72,15 +81,17 @@ def objectives_cost(
 
 def objectives_missed(
     problem: StepProblem,
-    objectives: Sequence[Objective | SpinObjective],
+    objectives: Sequence[AnyObjective],
     velocities: np.ndarray,
     torque: np.ndarray,
     speed: float,
 ) -> float:
     """The same weighted squares of a step that ends at ``velocities`` (N, 3) under contact forces of ``torque`` (3,)
-    about the centre of mass, N m."""
+    about the centre of mass, N m; loads are left out."""
     body, state, total = problem.body, problem.state, 0.0
     for objective in objectives:
+        if isinstance(objective, LoadObjective):
+            continue
         if isinstance(objective, SpinObjective):
             gyration = np.sqrt(0.5 * np.trace(problem.inertia) / body.mass)
             momentum = body.angular_momentum(state.positions, state.velocities) + problem.dt * torque

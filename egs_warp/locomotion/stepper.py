@@ -15,7 +15,7 @@ from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.contact_pieces import ContactPieces
-from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.step_cost import LinearStep, QuadraticCost, effort_cost, objectives_cost, objectives_missed
 from egs_warp.locomotion.strategies import Foreseen, Strategy, search_program
@@ -163,7 +163,7 @@ class LocomotionStepper:
         self,
         state: BodyState,
         memory: StepMemory,
-        objectives: Sequence[Objective | SpinObjective],
+        objectives: Sequence[AnyObjective],
         dt: float,
     ) -> tuple[BodyState, StepMemory, list[StepReport]]:
         """One step of ``dt``; one that does not converge is done again in halves under the same activations, since what
@@ -201,7 +201,7 @@ class LocomotionStepper:
         return self._finish(problem, _Plan(activations, foreseen, forces, 0, 0), result, clock)
 
     def step(
-        self, state: BodyState, memory: StepMemory, objectives: Sequence[Objective | SpinObjective], dt: float
+        self, state: BodyState, memory: StepMemory, objectives: Sequence[AnyObjective], dt: float
     ) -> tuple[BodyState, StepMemory, StepReport]:
         """Detect, foresee, program, solve, report."""
         clock = _Clock()
@@ -240,7 +240,7 @@ class LocomotionStepper:
     def _missed(
         self,
         problem: StepProblem,
-        objectives: Sequence[Objective | SpinObjective],
+        objectives: Sequence[AnyObjective],
         contacts: ContactSet,
         velocities: np.ndarray,
         forces: np.ndarray,
@@ -282,7 +282,7 @@ class LocomotionStepper:
         forces: np.ndarray,
         memory: StepMemory,
         under: np.ndarray,
-        objectives: Sequence[Objective | SpinObjective],
+        objectives: Sequence[AnyObjective],
         clock: _Clock,
     ) -> _Plan:
         """Activations, and what the step's tangent makes of them; ``foreseen`` and ``forces`` are those ``under``
@@ -319,7 +319,7 @@ class LocomotionStepper:
         forces: np.ndarray,
         activations: np.ndarray,
         under: np.ndarray,
-        objectives: Sequence[Objective | SpinObjective],
+        objectives: Sequence[AnyObjective],
     ) -> StepProgram:
         """What is asked of the step, linear about the ``foreseen`` velocities (N, 3) and contact ``forces`` (n, 3) that
         the activations ``under`` (M,) would bring; ``activations`` (M,) are last step's.
@@ -338,7 +338,7 @@ class LocomotionStepper:
         )
         previous = self.synergies.mean(activations / self.muscles.bounds)
         cost = (
-            objectives_cost(problem, linear, objectives, self.speed_scale)
+            objectives_cost(problem, linear, contacts, objectives, self.speed_scale)
             + effort_cost(problem, linear, foreseen.ravel(), self._horizon_factors)
             + self._activation_cost(problem.dt, previous, linear.columns.shape[1])
         )

@@ -13,9 +13,9 @@ from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
 from egs_warp.geometry.frames import best_turn
 from egs_warp.locomotion.objectives import (
+    AnyObjective,
     BodyPart,
     Coordinates,
-    Objective,
     SpinObjective,
     centre_of_mass_velocity,
     node_velocities,
@@ -126,7 +126,7 @@ class Follow:
             return turn_between(np.array(key.value), reached)
         return reached - np.array(key.value)
 
-    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
         if self._began is None:
             self._began = state.time
@@ -155,10 +155,10 @@ class Follow:
 
     def _standing_objectives(
         self, state: BodyState, report: StepReport | None, dt: float, ruled: set[tuple[str, Quantity]]
-    ) -> list[Objective | SpinObjective]:
+    ) -> list[AnyObjective]:
         seen = self.pose.measure(state, report)
         balance = np.array([*(seen.base - self.pose.base_offset), self.pose.standing_height])
-        rules: list[Objective | SpinObjective] = []
+        rules: list[AnyObjective] = []
         velocity = self._rate / 3.0 * (balance - seen.com)
         pose = self.pose.over_base(seen.com, seen.base, seen.heading)
         upright = self.pose.turn_towards(state, pose) * 0.7 * self._rate
@@ -174,7 +174,7 @@ class Follow:
         rules.append(node_velocities(self.body, drift + self._rate * (arms - now), self.weights.pose))
         return rules
 
-    def _keyed(self, channel: Channel, state: BodyState, elapsed: float, dt: float) -> Objective | SpinObjective:
+    def _keyed(self, channel: Channel, state: BodyState, elapsed: float, dt: float) -> AnyObjective:
         part, body, whole = self.parts[channel.part], self.body, channel.part == "body"
         axes = Coordinates(self.ground.axes, False)
         value, rate = channel.at(elapsed + dt)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from egs_warp.fem.body import BodyState
-from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.jump import Jump
@@ -46,7 +46,7 @@ class Hop:
         """Whether the jump is at rest."""
         return self.jump.resting
 
-    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """Those of the jump."""
         return self.jump.objectives(state, report, dt)
 

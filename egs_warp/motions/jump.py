@@ -12,7 +12,7 @@ from enum import Enum
 import numpy as np
 
 from egs_warp.fem.body import BodyState
-from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.facing import Facing, Straight
@@ -139,7 +139,7 @@ class Jump:
         }
         return [f"{phase.value} took too long: {named[phase]}" for phase in self._overran]
 
-    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
         seen = self.pose.measure(state, report)
         self.facing.see(seen.heading + (self.facing.turn if self.left_ground else 0.0))
@@ -196,9 +196,7 @@ class Jump:
         low = seen.com[2] < self._start_com[2] + TOUCH_DOWN * self.body.height
         return seen.touching and seen.velocity[2] < 0.0 and (low or seen.load > 1.0)
 
-    def _crouch(
-        self, state: BodyState, seen: Measurement, elapsed: float, dt: float
-    ) -> list[Objective | SpinObjective]:
+    def _crouch(self, state: BodyState, seen: Measurement, elapsed: float, dt: float) -> list[AnyObjective]:
         position, velocity = self._start_com, np.zeros(3)
         if self.phase is JumpPhase.CROUCH:
             position, velocity = self.plan.crouch(self._start_com, elapsed)
@@ -207,9 +205,7 @@ class Jump:
         velocity, spin = self.pose.balanced(state, seen, velocity, self._upright(state, pose), dt)
         return self._write(state, velocity, pose, spin, dt)
 
-    def _thrust(
-        self, state: BodyState, seen: Measurement, elapsed: float, dt: float
-    ) -> list[Objective | SpinObjective]:
+    def _thrust(self, state: BodyState, seen: Measurement, elapsed: float, dt: float) -> list[AnyObjective]:
         """Along the ground the speed that brings the centre of mass from where it is to where it shall touch down."""
         plan = self.plan
         position, velocity = plan.thrust(self._start_com, elapsed)
@@ -238,7 +234,7 @@ class Jump:
         self._asked = velocity[:2]
         return self._write(state, velocity, standing, spin, dt)
 
-    def _fly(self, state: BodyState, seen: Measurement, dt: float) -> list[Objective | SpinObjective]:
+    def _fly(self, state: BodyState, seen: Measurement, dt: float) -> list[AnyObjective]:
         touch_down, left = self._touch_down(seen, dt)
         heading = self.facing.turned - self.facing.turn
         pose = self.pose.over_base(touch_down, self._foothold(state, seen, touch_down, left), heading)
@@ -249,7 +245,7 @@ class Jump:
         velocity = seen.velocity - np.array([0.0, 0.0, self.gravity * dt])
         return self._write(state, velocity, pose, spin, dt, left=left)
 
-    def _land(self, state: BodyState, seen: Measurement, dt: float) -> list[Objective | SpinObjective]:
+    def _land(self, state: BodyState, seen: Measurement, dt: float) -> list[AnyObjective]:
         rate = self.plan.landing_rate
         goal = np.array([*(seen.base - self.pose.base_offset), self._start_com[2]])
         acceleration = rate**2 * (goal - seen.com) - 2.0 * rate * seen.velocity
@@ -322,7 +318,7 @@ class Jump:
         dt: float,
         *,
         left: float | None = None,
-    ) -> list[Objective | SpinObjective]:
+    ) -> list[AnyObjective]:
         """``left``: seconds before the landing, of a body in the air."""
         # Where a phase begins with another pose than the last ended with, the way between them is gone in some steps.
         share = min((state.time + dt - self._entered) / (BLEND * self._time_unit), 1.0)

@@ -10,7 +10,7 @@ import numpy as np
 
 from egs_warp.contact.terrain import Solid, surface_above
 from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.stance import Ground, heading_between, sole_shares
@@ -72,7 +72,7 @@ class BodyMotion(Protocol):
         """Whether it has come to its end."""
         ...
 
-    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[Objective | SpinObjective]:
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Objectives of the step of ``dt`` seconds that starts at ``state``; ``report`` is of the step before."""
         ...
 
@@ -127,7 +127,7 @@ class MotionSequence:
     def _resting(self) -> bool:
         return bool(self.done) and self.done[-1].motion.resting
 
-    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[Objective | SpinObjective]:
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``, from the motion whose turn it is."""
         if self._parts and (not self.done or self._resting):
             place = self._place.now(state.positions) if self.done else self._place

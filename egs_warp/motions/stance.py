@@ -11,7 +11,13 @@ from scipy.spatial.transform import Rotation
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.geometry.frames import best_turn
 from egs_warp.geometry.plane import Plane
-from egs_warp.locomotion.objectives import Objective, SpinObjective, centre_of_mass_velocity, straining_velocities
+from egs_warp.locomotion.objectives import (
+    AnyObjective,
+    Objective,
+    SpinObjective,
+    centre_of_mass_velocity,
+    straining_velocities,
+)
 from egs_warp.locomotion.stepper import StepReport
 
 SOLE = 0.06
@@ -277,7 +283,7 @@ class PoseFamily:
         spin: np.ndarray,
         follow: float,
         weights: Weights,
-    ) -> list[Objective | SpinObjective]:
+    ) -> list[AnyObjective]:
         """Objectives for a step: centre-of-mass velocity (3,) in ground axes, angular velocity ``spin`` (3,) in world
         axes, and a pose.
 

@@ -15,7 +15,9 @@ from scipy.spatial.transform import Rotation
 from egs_warp.fem.body import BodyState
 from egs_warp.geometry.frames import best_turn
 from egs_warp.locomotion.objectives import (
+    AnyObjective,
     BodyPart,
+    LoadObjective,
     Objective,
     SpinObjective,
     centre_of_mass_velocity,
@@ -25,7 +27,7 @@ from egs_warp.locomotion.objectives import (
 )
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.feet import feet_around, find_feet, foot_loads, foot_of_contact
+from egs_warp.motions.feet import feet_around, find_feet, foot_loads, foot_of_contact, foot_of_node
 from egs_warp.motions.footfalls import Footfalls, footfalls
 from egs_warp.motions.gait import Gait, Passage, nearest_in_hull
 from egs_warp.motions.sequence import Place
@@ -71,6 +73,8 @@ class WalkControl:
     swing: float = 40.0
     support: float = 1000.0
     """Of contact points that stand and would slide, each by its share of the weight."""
+    unload: float = 100.0
+    """Of what contact points of a foot carry that is lifted."""
     balance: float = 3.0
     """How far the centre of pressure goes for each metre that the divergent part of the motion is off."""
     turn_rate: float = 4.0
@@ -116,6 +120,8 @@ class Walk:
         self._legs = np.array([foot.leg for foot in feet])
         self._leg_mass = self._legs @ body.node_mass / body.mass
         self._parts = [BodyPart.of(body, f"foot {index}", foot.sole) for index, foot in enumerate(feet)]
+        self._near = [np.flatnonzero(foot_of_node(feet) == index) for index in range(len(feet))]
+        """Nodes that go with each foot."""
         self._start_com = body.centre_of_mass(self._standing)
         self._passages = self._plan_passages()
         self.phase = WalkPhase.SHIFT
@@ -164,7 +170,7 @@ class Walk:
         """What the feet did between two states of a trajectory."""
         return footfalls(trajectory, self.feet, stride=self.gait.stride, first=first, last=last)
 
-    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[Objective | SpinObjective]:
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
         body, axes, control = self.body, self.ground.axes, self.control
         local = self.ground.local(state.positions)
@@ -182,6 +188,7 @@ class Walk:
             SpinObjective(body.inertia(state.positions) @ (spin @ axes), control.spin),
             node_velocities(body, follow * (next_pose - local) @ axes, control.pose),
             *(self._foot_objective(index, local, before, after, elapsed, dt) for index in self.swinging),
+            *(self._let_go(index, elapsed) for index in self.swinging if elapsed < self.gait.carried_until),
             *([self._hold(report, elapsed)] if report is not None else []),
         ]
 
@@ -281,6 +288,9 @@ class Walk:
         share = control.foot_share * self.gait.eased(elapsed / self.gait.swing_time)
         velocity = (share * error + after[index] - before[index]) / dt
         return part_nodes(self.body, part, velocity @ self.ground.axes, control.swing)
+
+    def _let_go(self, index: int, elapsed: float) -> LoadObjective:
+        return LoadObjective(self._near[index], self.control.unload * self.gait.eased(elapsed / self.gait.swing_time))
 
     def _hold(self, report: StepReport, elapsed: float) -> Objective:
         """What stands does not slide, nor does what is lifted before it goes ahead."""

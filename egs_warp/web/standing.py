@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from egs_warp.fem.body import BodyState
-from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.stance import CALM, Calm, PoseFamily, Weights
@@ -32,7 +32,7 @@ class Stand:
         """Whether it stands calmly."""
         return self._resting
 
-    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
         seen = self.pose.measure(state, report)
         slow = bool(np.linalg.norm(seen.velocity) <= CALM * np.sqrt(self._gravity * self.body.height))
@@ -63,7 +63,7 @@ class Lie:
 
     resting = True
 
-    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """None."""
         return []
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
-from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.repertoire import REPERTOIRE
 from egs_warp.motions.request import MotionRequest
@@ -167,7 +167,7 @@ class Steering:
         forward = self.place.now(positions).ground.axes[0, :2]
         return forward / max(float(np.linalg.norm(forward)), 1e-12)
 
-    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[Objective | SpinObjective]:
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``, from the motion whose turn it is."""
         if self._has_fallen(state):
             if not isinstance(self._motion, Lie):

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet
+from egs_warp.deformation.embedding import embed_points
 from egs_warp.fem.body import BodyState, make_body
 from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.plane import Plane
-from egs_warp.locomotion.objectives import SpinObjective, centre_of_mass_velocity
+from egs_warp.locomotion.objectives import LoadObjective, SpinObjective, centre_of_mass_velocity
 from egs_warp.locomotion.step_cost import LinearStep, QuadraticCost, effort_cost, objectives_cost
 from tests.support.meshes import block_mesh
 
@@ -17,12 +19,22 @@ BODY = make_body(block_mesh(), Plane(np.array([0.0, 0.0, 1.0]), 0.0), device="cp
 DT = 1 / 60
 
 
-def example() -> tuple[StepProblem, LinearStep, np.ndarray]:
+def two_contacts() -> ContactSet:
+    """Of two corners of the block."""
+    soles = embed_points(BODY.mesh, BODY.mesh.nodes[BODY.mesh.nodes[:, 2] == 0.0][[0, -1]], device="cpu")
+    floor = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+    geometry = ContactGeometry(BODY.mesh, (floor,), 0.8, soles.tets.numpy(), soles.weights.numpy(), 0, 0.0)
+    return ContactDetector(geometry, device="cpu").contact_set(np.arange(2), BODY.mesh.nodes)
+
+
+def example(unknowns: int = 4) -> tuple[StepProblem, LinearStep, np.ndarray]:
     rng = np.random.default_rng(0)
     nodes = BODY.mesh.nodes
     state = BodyState(nodes + 0.005 * rng.standard_normal(nodes.shape), 0.1 * rng.standard_normal(nodes.shape))
     linear = LinearStep(
-        0.1 * rng.standard_normal(nodes.size), 0.1 * rng.standard_normal((nodes.size, 4)), rng.standard_normal((3, 4))
+        0.1 * rng.standard_normal(nodes.size),
+        0.1 * rng.standard_normal((nodes.size, unknowns)),
+        rng.standard_normal((3, unknowns)),
     )
     return StepProblem(BODY, state, DT), linear, 0.1 * rng.standard_normal(nodes.size)
 
@@ -32,18 +44,20 @@ def value(cost: QuadraticCost, x: np.ndarray) -> float:
 
 
 def test_objectives_are_weighted_squares_of_what_is_missed() -> None:
-    problem, linear, _ = example()
+    problem, linear, _ = example(7)
     rng = np.random.default_rng(1)
-    x, target, momentum = rng.standard_normal(4), rng.standard_normal(3), rng.standard_normal(3)
-    objectives = [centre_of_mass_velocity(BODY, target, 2.0), SpinObjective(momentum, 5.0)]
+    x, target, momentum = rng.standard_normal(7), rng.standard_normal(3), rng.standard_normal(3)
+    contacts = two_contacts()
+    lifted = LoadObjective(contacts.nodes[1, [int(np.argmax(contacts.weights[1]))]], 7.0)
+    objectives = [centre_of_mass_velocity(BODY, target, 2.0), SpinObjective(momentum, 5.0), lifted]
     speed = float(np.sqrt(9.81 * BODY.height))
     velocities = (linear.base + linear.columns @ x).reshape(-1, 3)
     missed = (BODY.centre_of_mass(velocities) - target) / speed
     after = BODY.angular_momentum(problem.state.positions, problem.state.velocities) + linear.torques @ x
     gyration = np.sqrt(0.5 * np.trace(BODY.inertia(problem.state.positions)) / BODY.mass)
     turned = (after - momentum) / (BODY.mass * gyration * speed)
-    expected = 2.0 * missed @ missed + 5.0 * turned @ turned
-    assert value(objectives_cost(problem, linear, objectives, speed), x) == pytest.approx(expected, rel=1e-10)
+    expected = 2.0 * missed @ missed + 5.0 * turned @ turned + 7.0 * x[4] ** 2  # x is an activation and two forces
+    assert value(objectives_cost(problem, linear, contacts, objectives, speed), x) == pytest.approx(expected, rel=1e-10)
 
 
 def moved_on(problem: StepProblem, linear: LinearStep, foreseen: np.ndarray, time: float, x: np.ndarray) -> np.ndarray:

@@ -14,7 +14,12 @@ from egs_warp.contact.detection import ContactGeometry
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.fem.body import BodyState, SoftBody, make_body
 from egs_warp.geometry.plane import Plane
-from egs_warp.locomotion.objectives import Objective, SpinObjective, centre_of_mass_velocity, node_velocities
+from egs_warp.locomotion.objectives import (
+    AnyObjective,
+    SpinObjective,
+    centre_of_mass_velocity,
+    node_velocities,
+)
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.stepper import LocomotionSettings, LocomotionStepper, StepMemory, StepReport
 from egs_warp.locomotion.strategies import PATIENCE, Strategy
@@ -52,7 +57,7 @@ def muscular_block(
     return LocomotionStepper(body, attach_fibres(mesh, fibres), geometry, settings=settings, device=device)
 
 
-def hop(body: SoftBody, step: int) -> list[Objective | SpinObjective]:
+def hop(body: SoftBody, step: int) -> list[AnyObjective]:
     """Down for six steps, then up and forwards, kept upright."""
     velocity = np.array([0.0, 0.0, -0.4]) if step < 6 else np.array([0.1, 0.0, 0.25 * (step - 5)])
     pose = np.tile(velocity, (len(body.mesh.nodes), 1))
@@ -195,7 +200,7 @@ class LateStepper(LocomotionStepper):
     longest = 0.0
 
     def step(
-        self, state: BodyState, memory: StepMemory, objectives: Sequence[Objective | SpinObjective], dt: float
+        self, state: BodyState, memory: StepMemory, objectives: Sequence[AnyObjective], dt: float
     ) -> tuple[BodyState, StepMemory, StepReport]:
         return self._judged(*super().step(state, memory, objectives, dt))
 

@@ -7,7 +7,7 @@ import pytest
 
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
-from egs_warp.locomotion.objectives import Objective, SpinObjective
+from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.jump import Jump
@@ -48,7 +48,7 @@ class Waits:
     def resting(self) -> bool:
         return self.steps >= 3
 
-    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[Objective | SpinObjective]:
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         self.steps += 1
         return []
 
