@@ -70,6 +70,11 @@ class ContactSet:
         """n."""
         return len(self.points)
 
+    @property
+    def nearest(self) -> np.ndarray:
+        """(n,) the node that each point goes with most."""
+        return self.nodes[np.arange(self.count), np.argmax(self.weights, axis=1)]
+
     def end_gaps(self, dt: float, velocities: np.ndarray) -> np.ndarray:
         """(n,) gap after a step of ``dt`` with nodal end velocities (N, 3)."""
         return self.gaps + dt * (self.frame @ velocities.ravel())[0::3]

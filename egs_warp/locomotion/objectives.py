@@ -57,8 +57,7 @@ class LoadObjective:
 
     def loads(self, contacts: ContactSet) -> np.ndarray:
         """(3n,) 1 for the normal force of each contact nearest to one of the nodes."""
-        nearest = contacts.nodes[np.arange(contacts.count), np.argmax(contacts.weights, axis=1)]
-        return np.outer(np.isin(nearest, self.nodes), [1.0, 0.0, 0.0]).ravel()
+        return np.outer(np.isin(contacts.nearest, self.nodes), [1.0, 0.0, 0.0]).ravel()
 
 
 AnyObjective = Objective | SpinObjective | LoadObjective

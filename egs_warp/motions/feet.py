@@ -84,7 +84,7 @@ def foot_of_node(feet: Sequence[Foot]) -> np.ndarray:
 
 def foot_of_contact(feet: Sequence[Foot], contacts: ContactSet) -> np.ndarray:
     """(n,) index of the foot that each contact point goes with."""
-    return foot_of_node(feet)[contacts.nodes[np.arange(contacts.count), np.argmax(contacts.weights, axis=1)]]
+    return foot_of_node(feet)[contacts.nearest]
 
 
 def foot_loads(feet: Sequence[Foot], report: StepReport | None, weight: float) -> np.ndarray:

@@ -130,7 +130,7 @@ class Walk:
         self._places = self._soles.copy()
         """(4, 3) where each foot stands, or was lifted from."""
         self.swinging: tuple[int, ...] = ()
-        """The feet in the air."""
+        """The feet that are lifted, carried and set down."""
         self._late = 0
 
     def _plan_passages(self) -> dict[WalkPhase, Passage]:
@@ -290,6 +290,7 @@ class Walk:
         return part_nodes(self.body, part, velocity @ self.ground.axes, control.swing)
 
     def _let_go(self, index: int, elapsed: float) -> LoadObjective:
+        """A foot is unloaded bit by bit before it rises."""
         return LoadObjective(self._near[index], self.control.unload * self.gait.eased(elapsed / self.gait.swing_time))
 
     def _hold(self, report: StepReport, elapsed: float) -> Objective:
