@@ -142,7 +142,7 @@ def make_body(
 
 def _held_stiffness(assembly: ElasticAssembly, free: np.ndarray) -> tuple[sparse.csc_matrix, np.ndarray]:
     """Stiffness at rest of the ``free`` (N,) nodes, and the indices of their coordinates."""
-    upper = assembly.matrix(assembly.matrix_entries(assembly.mesh.nodes))
+    upper = assembly.matrix(assembly.hessian_entries(assembly.mesh.nodes))
     kept = np.flatnonzero(np.repeat(free, 3))
     return (upper + sparse.triu(upper, 1).T).tocsc()[kept][:, kept], kept
 

@@ -179,7 +179,7 @@ class ElasticAssembly:
         )
         return self._node_gradients.numpy().copy()
 
-    def matrix_entries(
+    def hessian_entries(
         self, positions: np.ndarray, damping: Damping | None = None, *, factor: float = 1.0, projected: bool = False
     ) -> np.ndarray:
         """Entries of ``factor`` times the second derivative of ``energy`` in the order of ``upper_pattern``.

@@ -90,7 +90,7 @@ class StepProblem:
         """(N, 3) newtons, minus the forces of elasticity, damping and muscles at the end of ``velocities`` (N, 3)."""
         end = self.end_positions(velocities)
         gradient = self.body.assembly.gradient(end, self.damping)
-        return gradient if tension is None else gradient - tension.forces(end)
+        return gradient if tension is None else gradient + tension.gradient(end)
 
     def spin(self, internal_gradient: np.ndarray) -> np.ndarray:
         """(3,) rad/s that the step gives back: the rigid turn whose momentum implicit Euler would have eaten."""
@@ -112,7 +112,7 @@ class StepProblem:
         definite = factors.update(self._entries(velocities, projected=False))
         across, rates = np.zeros((len(self.turns), 0)), np.zeros(0)
         if tension is not None:
-            across, rates = tension.stiffness(self.end_positions(velocities)).factors(least=_NEGLIGIBLE)
+            across, rates = tension.hessian(self.end_positions(velocities)).factors(least=_NEGLIGIBLE)
         if factors.ready and len(rates) > 0:
             through = factors.solve(across)
             small = across.T @ through
@@ -132,7 +132,7 @@ class StepProblem:
         """Upper entries of S = (1 + dt alpha) M + dt C + dt^2 K at the end of ``velocities``."""
         assembly = self.body.assembly
         end = self.end_positions(velocities)
-        entries = assembly.matrix_entries(end, self.damping, factor=self.dt**2, projected=projected)
+        entries = assembly.hessian_entries(end, self.damping, factor=self.dt**2, projected=projected)
         entries[assembly.diagonal_entries] += (1.0 + self.dt * self.drag) * np.repeat(self.body.node_mass, 3)
         return entries
 

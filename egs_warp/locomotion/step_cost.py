@@ -123,7 +123,7 @@ def effort_cost(
     time = max(horizon * float(np.sqrt(body.height / np.linalg.norm(body.gravity))), problem.dt)
     end = problem.end_positions(foreseen.reshape(-1, 3))
     assembly, damping = body.assembly, body.assembly.damping(problem.state.positions, time)
-    entries = assembly.matrix_entries(end, damping, projected=True)
+    entries = assembly.hessian_entries(end, damping, projected=True)
     upper = assembly.matrix(entries)
     implicit = time**2 * entries
     implicit[assembly.diagonal_entries] += np.repeat(body.node_mass, 3)

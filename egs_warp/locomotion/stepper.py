@@ -20,8 +20,8 @@ from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.step_cost import LinearStep, QuadraticCost, effort_cost, objectives_cost, objectives_missed
 from egs_warp.locomotion.strategies import Foreseen, Strategy, search_program
 from egs_warp.locomotion.synergies import find_synergies
-from egs_warp.muscles.muscle_set import MuscleColumns, MuscleSet
-from egs_warp.muscles.tension import MuscleTension
+from egs_warp.muscles.muscle_set import MuscleSet
+from egs_warp.muscles.tension import MuscleTension, muscle_columns
 
 _ORDINARY_STRENGTH = 4.0
 STEPS_A_UNIT = 19.0
@@ -131,7 +131,6 @@ class LocomotionStepper:
         )
         self.time_unit = float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
         self.speed_scale = float(np.sqrt(np.linalg.norm(body.gravity) * body.height))
-        self._columns = MuscleColumns(muscles, device=device or "cpu")
         self._factors = SparseFactors(body.assembly.upper_pattern)
         self._horizon_factors = SparseFactors(body.assembly.upper_pattern)
         self.solver = CoupledSolver(
@@ -144,7 +143,7 @@ class LocomotionStepper:
         rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
         problem = StepProblem(body, rest, self.time_unit / STEPS_A_UNIT)
         tangent = problem.tangent(self._factors, rest.velocities, None)
-        full = self._columns.sparse(rest.positions).toarray() * muscles.bounds
+        full = muscle_columns(muscles, rest.positions).toarray() * muscles.bounds
         self.synergies = find_synergies(muscles, tangent.solve(full), body.node_mass)
 
     def initial_memory(self) -> StepMemory:
@@ -326,7 +325,7 @@ class LocomotionStepper:
         """
         problem, members = response.tangent.problem, self.synergies.members
         contacts, weight, m = response.contacts, self.body.weight, self.synergies.count
-        each = self._columns.sparse(problem.end_positions(foreseen)).toarray() * self.muscles.bounds
+        each = muscle_columns(self.muscles, problem.end_positions(foreseen)).toarray() * self.muscles.bounds
         # Without muscles and contact, in their stiffness at last step's tension.
         free = problem.residual(foreseen, None).ravel()
         solved = response.tangent.solve(np.column_stack([problem.dt * (members.T @ each.T).T, free]))

@@ -9,16 +9,13 @@ from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sp
-import warp as wp
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
-from egs_warp.kernels.muscles.columns import muscle_columns_kernel, muscle_entries_kernel
 from egs_warp.muscles.attachments import attachment_rows
 from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.layout import is_legged, lay_fibres
 from egs_warp.muscles.skeleton import skeleton
-from egs_warp.precision import Vec3, real
 
 _MIN_AUTOMATIC_EDGES = 0.25
 """An automatic fibre with a segment shorter than this many mean edges is left out: its ends share their nodes."""
@@ -88,67 +85,6 @@ class MuscleSet:
     def lengths(self, positions: np.ndarray) -> np.ndarray:
         """(M,) metres, current length of each segment for node positions (N, 3)."""
         return np.linalg.norm(self.difference_rows @ positions, axis=1)
-
-
-class MuscleColumns:
-    """A(p) of Eq. (7) with its constant part kept on a device, so that each step only sends positions.
-
-    Column j is k_j (B_i^T u - B_k^T u), with u the unit vector from end i to end k.
-    """
-
-    def __init__(self, muscles: MuscleSet, *, device: str = "cpu") -> None:
-        rows = muscles.difference_rows
-        self.device = device
-        self.shape = (3 * muscles.node_count, muscles.segment_count)
-        self._constants = [
-            wp.array(rows.indptr.astype(np.int32), dtype=wp.int32, device=device),
-            wp.array(rows.indices.astype(np.int32), dtype=wp.int32, device=device),
-            wp.array(rows.data, dtype=real, device=device),
-            wp.array(muscles.stiffness, dtype=real, device=device),
-        ]
-        self._entries = wp.zeros(rows.nnz, dtype=Vec3, device=device)
-        # One entry of the segment-by-node pattern holds three rows of the column: x, y and z of its node.
-        self._csc_indices = (3 * rows.indices[:, None] + np.arange(3)).ravel().astype(np.int32)
-        self._csc_starts = (3 * rows.indptr).astype(np.int32)
-
-    def launch_dense(self, positions: wp.array, columns_out: wp.array) -> None:
-        """Write A(p) into ``columns_out`` (3N, M) float64, from ``positions`` (N,) vec3d, both on this device.
-
-        The pattern never changes, so only the entries of touched nodes are written: zero ``columns_out`` once.
-        """
-        wp.launch(
-            muscle_columns_kernel,
-            dim=self.shape[1],
-            inputs=[positions, *self._constants],
-            outputs=[columns_out],
-            device=self.device,
-        )
-
-    def dense(self, positions: np.ndarray) -> np.ndarray:
-        """A(p), (3N, M) float64: newtons on each node's axes for each metre of activation; a_j > 0 contracts."""
-        columns = wp.zeros(self.shape, dtype=real, device=self.device)
-        self.launch_dense(self._upload(positions), columns)
-        return columns.numpy()
-
-    def sparse(self, positions: np.ndarray) -> sp.csc_matrix:
-        """A(p) as compressed sparse columns, same entries as ``dense``."""
-        wp.launch(
-            muscle_entries_kernel,
-            dim=self.shape[1],
-            inputs=[self._upload(positions), *self._constants],
-            outputs=[self._entries],
-            device=self.device,
-        )
-        entries = self._entries.numpy().reshape(-1).copy()
-        return sp.csc_matrix((entries, self._csc_indices, self._csc_starts), shape=self.shape)
-
-    def _upload(self, positions: np.ndarray) -> wp.array:
-        return wp.array(np.ascontiguousarray(positions, dtype=np.float64), dtype=Vec3, device=self.device)
-
-
-def muscle_columns(muscles: MuscleSet, positions: np.ndarray, *, device: str = "cpu") -> np.ndarray:
-    """A(p) of Eq. (7), (3N, M) float64, for node positions (N, 3); in a loop keep a ``MuscleColumns`` instead."""
-    return MuscleColumns(muscles, device=device).dense(positions)
 
 
 def attach_fibres(

@@ -1,4 +1,4 @@
-"""Muscles that pull along the line between their ends while the body moves: an energy, not a dead load."""
+"""From an activation to the force on each node (Eq. 7): an energy while the body moves, columns for the program."""
 
 from __future__ import annotations
 
@@ -9,6 +9,31 @@ import numpy as np
 import scipy.sparse as sparse
 
 from egs_warp.muscles.muscle_set import MuscleSet
+
+
+def lines(rows: sparse.csr_matrix, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(M, 3) vectors in metres between the ends of segments with difference ``rows`` (M, N) at node ``positions``
+    (N, 3), and their lengths (M,); a segment whose ends coincide has length 1, so that it pulls nothing.
+    """
+    vectors = rows @ positions
+    lengths = np.linalg.norm(vectors, axis=1)
+    return vectors, np.where(lengths > 0.0, lengths, 1.0)
+
+
+def muscle_columns(muscles: MuscleSet, positions: np.ndarray) -> sparse.csc_matrix:
+    """A(p) of Eq. (7), (3N, M): newtons on each node's axes for each metre of activation, at node ``positions`` (N, 3).
+
+    Column j is k_j (B_i^T u - B_k^T u), u the unit vector from end i to end k: a_j > 0 contracts.
+    """
+    rows = muscles.difference_rows
+    vectors, lengths = lines(rows, positions)
+    pulls = -muscles.stiffness[:, None] * (vectors / lengths[:, None])
+    entries = rows.data[:, None] * np.repeat(pulls, np.diff(rows.indptr), axis=0)
+    # One entry of a segment's row is three of its column: x, y and z of the node.
+    nodes = (3 * rows.indices[:, None] + np.arange(3)).ravel()
+    return sparse.csc_matrix(
+        (entries.ravel(), nodes, 3 * rows.indptr), shape=(3 * muscles.node_count, len(rows.indptr) - 1)
+    )
 
 
 @dataclass(frozen=True)
@@ -32,25 +57,22 @@ class MuscleTension:
         return cls(muscles.difference_rows, muscles.stiffness * activations)
 
     @cached_property
-    def _columns(self) -> sparse.csr_matrix:
+    def _ends(self) -> sparse.csr_matrix:
         return self.rows.T.tocsr()
 
-    def forces(self, positions: np.ndarray) -> np.ndarray:
-        """(N, 3) newtons, minus the derivative of V."""
-        vectors = self.rows @ positions
-        lengths = np.linalg.norm(vectors, axis=1)
-        return -(self._columns @ ((self.tensions / np.where(lengths > 0.0, lengths, 1.0))[:, None] * vectors))
+    def gradient(self, positions: np.ndarray) -> np.ndarray:
+        """(N, 3) newtons: the derivative of V by the positions, minus the force of the muscles."""
+        vectors, lengths = lines(self.rows, positions)
+        return self._ends @ ((self.tensions / lengths)[:, None] * vectors)
 
-    def stiffness(self, positions: np.ndarray) -> TensionStiffness:
+    def hessian(self, positions: np.ndarray) -> TensionHessian:
         """The second derivative of V at ``positions``."""
-        vectors = self.rows @ positions
-        lengths = np.linalg.norm(vectors, axis=1)
-        held = np.where(lengths > 0.0, lengths, 1.0)
-        return TensionStiffness(self.rows, vectors / held[:, None], self.tensions / held)
+        vectors, lengths = lines(self.rows, positions)
+        return TensionHessian(self.rows, vectors / lengths[:, None], self.tensions / lengths)
 
 
 @dataclass(frozen=True)
-class TensionStiffness:
+class TensionHessian:
     """K = sum_j T_j / L_j D_j^T (I - u_j u_j^T) D_j, never formed: the ends are spread over dozens of nodes."""
 
     rows: sparse.csr_matrix

@@ -33,7 +33,7 @@ def likely_poses(body: SoftBody) -> list[np.ndarray]:
     heights = nodes @ up
     free = heights > heights.min() + 0.05 * body.height
     kept = np.flatnonzero(np.repeat(free, 3))
-    upper = body.assembly.matrix(body.assembly.matrix_entries(nodes))
+    upper = body.assembly.matrix(body.assembly.hessian_entries(nodes))
     stiffness = (upper + sparse.triu(upper, 1).T).tocsc()[kept][:, kept]
     mass = sparse.diags(np.repeat(body.node_mass, 3)[kept]).tocsc()
     _, modes = sparse_linalg.eigsh(stiffness, k=MODES, M=mass, sigma=0.0, v0=np.ones(len(kept)))

@@ -39,7 +39,7 @@ def test_material_follows_from_height() -> None:
 
 def test_damping_ratio_of_the_first_mode(body: SoftBody) -> None:
     """Eq. (6): beta = 2 zeta / omega_1, omega_1 from a dense eigenvalue problem of the body held at its base."""
-    upper = body.assembly.matrix(body.assembly.matrix_entries(body.mesh.nodes))
+    upper = body.assembly.matrix(body.assembly.hessian_entries(body.mesh.nodes))
     free = np.repeat(body.mesh.nodes[:, 2] > 0.05 * body.height, 3)
     stiffness = (upper + sparse.triu(upper, 1).T).toarray()[free][:, free]
     omega = np.sqrt(dense.eigh(stiffness, np.diag(np.repeat(body.node_mass, 3)[free]), eigvals_only=True)[0])

@@ -60,15 +60,15 @@ def test_hessian_is_derivative_of_gradient(bent: Bent, damped: bool) -> None:
     """
     assembly, x, damping = bent
     damping = damping if damped else None
-    matrix = full(assembly, assembly.matrix_entries(x, damping))
+    matrix = full(assembly, assembly.hessian_entries(x, damping))
     direction = np.random.default_rng(3).standard_normal(x.shape)
     h = 1e-6
     change = (assembly.gradient(x + h * direction, damping) - assembly.gradient(x - h * direction, damping)) / (2 * h)
     assert np.abs(matrix @ direction.ravel() - change.ravel()).max() < 1e-6 * np.abs(change).max()
-    projected = np.linalg.eigvalsh(full(assembly, assembly.matrix_entries(x, damping, projected=True)))
+    projected = np.linalg.eigvalsh(full(assembly, assembly.hessian_entries(x, damping, projected=True)))
     assert projected.min() > -1e-9 * projected.max()
     assert np.allclose(
-        assembly.matrix_entries(x, damping, factor=0.3), 0.3 * assembly.matrix_entries(x, damping), rtol=1e-12
+        assembly.hessian_entries(x, damping, factor=0.3), 0.3 * assembly.hessian_entries(x, damping), rtol=1e-12
     )
 
 
@@ -83,8 +83,8 @@ def test_projected_hessian_clamps_each_element(device: str) -> None:
         x = corners @ (np.diag(rng.uniform(0.3, 1.6, 3)) + 0.3 * rng.standard_normal((3, 3))).T
         if np.linalg.det((x[1:] - x[0]).T) < 0.05:
             continue
-        true = full(assembly, assembly.matrix_entries(x))
-        projected = full(assembly, assembly.matrix_entries(x, projected=True))
+        true = full(assembly, assembly.hessian_entries(x))
+        projected = full(assembly, assembly.hessian_entries(x, projected=True))
         # The projection is taken in deformation-gradient space: pull both back there.
         pull = np.kron(np.linalg.pinv(weights), np.eye(3))
         values, vectors = np.linalg.eigh(pull.T @ true @ pull)

@@ -112,7 +112,7 @@ def test_an_indefinite_stiffness_is_projected_and_keeps_the_momenta(body: SoftBo
     """Squashed to 40 % in a long step the true S has negative pivots; a definite one near it has the momenta, too."""
     squashed = BodyState(body.mesh.nodes * [1.1, 1.1, 0.4], np.zeros_like(body.mesh.nodes))
     problem, factors = StepProblem(body, squashed, 1.0), SparseFactors(body.assembly.upper_pattern)
-    entries = body.assembly.matrix_entries(squashed.positions, problem.damping, factor=1.0)
+    entries = body.assembly.hessian_entries(squashed.positions, problem.damping, factor=1.0)
     entries[body.assembly.diagonal_entries] += np.repeat(body.node_mass, 3)
     assert not factors.update(entries)
     tangent = problem.tangent(factors, squashed.velocities, None)

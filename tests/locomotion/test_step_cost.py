@@ -63,7 +63,7 @@ def test_objectives_are_weighted_squares_of_what_is_missed() -> None:
 def moved_on(problem: StepProblem, linear: LinearStep, foreseen: np.ndarray, time: float, x: np.ndarray) -> np.ndarray:
     """(N, 3) where the body is after ``time`` s: the step's way, and from there as one implicit step would go on."""
     end = problem.end_positions(foreseen.reshape(-1, 3))
-    entries = BODY.assembly.matrix_entries(
+    entries = BODY.assembly.hessian_entries(
         end, BODY.assembly.damping(problem.state.positions, time), factor=time**2, projected=True
     )
     upper = BODY.assembly.matrix(entries).toarray()

@@ -14,8 +14,8 @@ from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.plane import Plane
 from egs_warp.muscles.fibres import Fibre, FibreKind
-from egs_warp.muscles.muscle_set import MuscleSet, attach_fibres, muscle_columns
-from egs_warp.muscles.tension import MuscleTension
+from egs_warp.muscles.muscle_set import MuscleSet, attach_fibres
+from egs_warp.muscles.tension import MuscleTension, muscle_columns
 from tests.support.meshes import box_mesh
 from tests.support.passive import passive_body
 
@@ -47,7 +47,7 @@ def energy_of(tension: MuscleTension, x: np.ndarray) -> float:
 
 def dense(tension: MuscleTension, x: np.ndarray) -> np.ndarray:
     """(3N, 3N) stiffness of all segments."""
-    across, rates = tension.stiffness(x).factors(least=0.0)
+    across, rates = tension.hessian(x).factors(least=0.0)
     return (across * rates) @ across.T
 
 
@@ -61,10 +61,10 @@ def test_force_and_stiffness_are_derivatives_of_the_energy() -> None:
     for _ in range(3):
         along = rng.standard_normal(x.shape)
         slope = (energy_of(tension, x + h * along) - energy_of(tension, x - h * along)) / (2 * h)
-        assert slope == pytest.approx(-float((tension.forces(x) * along).sum()), rel=1e-6)
-        change = -(tension.forces(x + h * along) - tension.forces(x - h * along)) / (2 * h)
+        assert slope == pytest.approx(float((tension.gradient(x) * along).sum()), rel=1e-6)
+        change = (tension.gradient(x + h * along) - tension.gradient(x - h * along)) / (2 * h)
         assert np.abs((K @ along.ravel()).reshape(x.shape) - change).max() < 1e-6 * np.abs(change).max()
-    across, rates = tension.stiffness(x).factors(least=1e-3)
+    across, rates = tension.hessian(x).factors(least=1e-3)
     assert across.shape[1] == len(rates) <= 2 * len(tension.tensions)
     np.testing.assert_allclose((across * rates) @ across.T, K, rtol=0, atol=1e-3 * np.abs(K).max())
 
@@ -75,7 +75,7 @@ def test_force_is_equation_7_and_makes_no_net_force_or_torque() -> None:
     muscles = tendon(5)
     activations = rng.uniform(-1.0, 1.0, 5) * muscles.bounds
     x = ROD.nodes + rng.normal(0.0, 0.004, ROD.nodes.shape)
-    forces = MuscleTension.of(muscles, activations).forces(x)
+    forces = -MuscleTension.of(muscles, activations).gradient(x)
     np.testing.assert_allclose(forces.ravel(), muscle_columns(muscles, x) @ activations, rtol=0, atol=1e-14)
     scale = np.abs(forces).sum()
     assert np.abs(forces.sum(axis=0)).max() < 1e-14 * scale
@@ -135,18 +135,18 @@ def press(rod: SoftBody, load: float, *, follows: bool) -> np.ndarray:
     x = ROD.nodes + 0.01 * ROD.nodes[:, 2:] ** 2 * [1.0, 0.0, 0.0]
 
     def elastic(positions: np.ndarray) -> np.ndarray:
-        upper = assembly.matrix(assembly.matrix_entries(positions))
+        upper = assembly.matrix(assembly.hessian_entries(positions))
         return (upper + sparse.triu(upper, 1).T).toarray()
 
     free = ROD.nodes[:, 2] > 0.01
     for _ in range(1 if follows else 6):
-        pull = tension.forces(x)
+        pull = -tension.gradient(x)
         if follows:
             x = equilibrium(
                 x,
                 free,
                 lambda p: assembly.energy(p) + energy_of(tension, p),
-                lambda p: assembly.gradient(p) - tension.forces(p),
+                lambda p: assembly.gradient(p) + tension.gradient(p),
                 lambda p: elastic(p) + dense(tension, p),
             )
         else:
@@ -186,7 +186,7 @@ def test_the_tangent_is_inverted_even_where_the_elastic_part_is_indefinite(
         assert result.converged
         pressed.state = BodyState(pressed.state.positions, still)
     problem = StepProblem(rod, pressed.state, dt)
-    entries = rod.assembly.matrix_entries(pressed.state.positions, problem.damping, factor=dt**2)
+    entries = rod.assembly.hessian_entries(pressed.state.positions, problem.damping, factor=dt**2)
     entries[rod.assembly.diagonal_entries] += np.repeat(rod.node_mass, 3)
     upper = rod.assembly.matrix(entries)
     elastic = (upper + sparse.triu(upper, 1).T).toarray()

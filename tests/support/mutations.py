@@ -65,8 +65,8 @@ EQUATIONS: dict[int, Mutation] = {
             "fem/test_step_problem.py::test_drag_slows_free_flight_exponentially",
         ),
         (
-            *(7, "the direction of a segment's pull", "kernels/muscles/columns.py"),
-            *("columns_out[3 * node + axis, segment] = row", "columns_out[3 * node + axis, segment] = -row"),
+            *(7, "the direction of a segment's pull", "muscles/tension.py"),
+            *("pulls = -muscles.stiffness", "pulls = muscles.stiffness"),
             "muscles/test_muscle_set.py::test_columns_are_equation_7",
         ),
         (
@@ -266,8 +266,8 @@ BESIDE_THE_PAPER: list[Mutation] = [
             "motions/test_twist.py::test_in_the_air_the_body_takes_the_width_with_which_its_spin_makes_the_turn",
         ),
         (
-            *("radial fibres: their pull", "kernels/muscles/columns.py"),
-            *("segment] = row_weights[entry] * force[axis]", "segment] = real(1.1) * row_weights[entry] * force[axis]"),
+            *("radial fibres: their pull", "muscles/tension.py"),
+            *("entries = rows.data[:, None] *", "entries = 1.1 * rows.data[:, None] *"),
             "muscles/test_muscle_set.py::test_radial_fibres_lengthen_by_poissons_ratio",
         ),
         (
