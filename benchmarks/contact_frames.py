@@ -127,7 +127,8 @@ def animation_frames(
     """
     body, muscles = bench.stepper.body, bench.stepper.muscles
     stepper = LocomotionStepper(body, muscles, bench.stepper.geometry, device=bench.device)
-    stepper.synergies = grouped_segments(muscles, body.mesh.nodes, activations, seed)
+    synergies = grouped_segments(muscles, body.mesh.nodes, activations, seed)
+    stepper.planner = replace(stepper.planner, synergies=synergies)
     # No point joins those that were chosen, however deep.
     stepper.solver = replace(stepper.solver, penetration_tolerance=np.inf)
     points = spread_points(bench, contacts)
@@ -136,12 +137,17 @@ def animation_frames(
     state, forces = bench.start, np.zeros((contacts, 3))
     made = []
     for previous, current in zip(known[:-1], known[1:], strict=True):
-        before, now = (muscles.bounds * (stepper.synergies.members @ a) for a in (previous, current))
+        before, now = (muscles.bounds * (synergies.members @ a) for a in (previous, current))
         problem = StepProblem(body, state, dt)
         contact_set = stepper.detector.contact_set(points, state.positions)
         memory = StepMemory(points, forces, before)
-        response, foreseen, pushes = stepper.foresee(problem, contact_set, memory, MuscleTension.of(muscles, before))
-        result = stepper.solver.solve(response, MuscleTension.of(muscles, now), velocities=foreseen, forces=pushes)
+        prospect = stepper.foresee(problem, contact_set, memory, before)
+        result = stepper.solver.solve(
+            prospect.response,
+            MuscleTension.of(muscles, now),
+            velocities=prospect.velocities,
+            forces=prospect.forces,
+        )
         if not result.converged:
             raise RuntimeError(f"the animation failed at frame {len(made)}; use less strength")
         after = BodyState(problem.end_positions(result.velocities), result.velocities, state.time + dt)
@@ -150,7 +156,7 @@ def animation_frames(
             SpinObjective(body.angular_momentum(after.positions, after.velocities), weights.spin),
             node_velocities(body, after.velocities, weights.pose),
         ]
-        program = stepper.program(response, foreseen, pushes, before, before, objectives)
+        program = stepper.planner.program(prospect, before, objectives)
         made.append(Frame(program.pieces, program.foreseen, current))
         state, forces = after, result.forces
     return made

@@ -20,8 +20,8 @@ import numpy as np
 from contact_frames import Frame, animation_frames, body_named
 from egs_warp.locomotion.complementarity import SEPARATE, states_of_pairs
 from egs_warp.locomotion.program import ContactProgram
+from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.solvers import QpSolution, QpSolver, quadratic_program
-from egs_warp.locomotion.stepper import LocomotionSettings
 from egs_warp.locomotion.strategies import Strategy, contact_under, search_program
 from harness import Row, Table, flags, report, timed
 

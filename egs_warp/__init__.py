@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from egs_warp.io.ply import write_ply
     from egs_warp.io.video import VideoWriter, contact_sheet, write_png
     from egs_warp.launching import use_device
-    from egs_warp.locomotion.stepper import LocomotionSettings
+    from egs_warp.locomotion.settings import LocomotionSettings
     from egs_warp.locomotion.strategies import Strategy
     from egs_warp.locomotion.trajectory import Trajectory
     from egs_warp.motions.script import Script, motion
@@ -63,7 +63,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "io.ply": ("write_ply",),
     "io.video": ("VideoWriter", "contact_sheet", "write_png"),
     "launching": ("use_device",),
-    "locomotion.stepper": ("LocomotionSettings",),
+    "locomotion.settings": ("LocomotionSettings",),
     "locomotion.strategies": ("Strategy",),
     "locomotion.trajectory": ("Trajectory",),
     "motions.script": ("Script", "motion"),

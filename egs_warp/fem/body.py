@@ -57,6 +57,16 @@ class SoftBody:
         """Newtons."""
         return self.mass * float(np.linalg.norm(self.gravity))
 
+    @property
+    def time_unit(self) -> float:
+        """sqrt(H / g), seconds."""
+        return float(np.sqrt(self.height / np.linalg.norm(self.gravity)))
+
+    @property
+    def speed_unit(self) -> float:
+        """sqrt(g H), m/s."""
+        return float(np.sqrt(np.linalg.norm(self.gravity) * self.height))
+
     def centre_of_mass(self, positions: np.ndarray) -> np.ndarray:
         """(3,) mean of ``positions`` (N, 3) weighted by mass; of velocities, the velocity of the centre of mass."""
         return self.node_mass @ positions / self.mass

@@ -1,4 +1,9 @@
-"""What a motion asks of the end velocity: weighted squares of linear functions of v (docs/concepts/motions.md)."""
+"""What a motion asks of a step's end: weighted squares of linear functions of it (docs/concepts/motions.md).
+
+Each kind says what it measures in the end of a step: ``slopes`` (j, k) for each of k unknowns that change the end
+velocity by columns (3N, k) and the angular momentum by ``torques`` (3, k), and its ``gap`` (j,) at one end; both in
+units of ``speed`` m/s, sqrt(g H).
+"""
 
 from __future__ import annotations
 
@@ -10,6 +15,7 @@ from scipy.spatial import ConvexHull
 
 from egs_warp.contact.detection import ContactSet
 from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.frames import square_to
 
 
@@ -23,6 +29,18 @@ class Objective:
     target: np.ndarray
     """(k,) m/s."""
     weight: float
+
+    def slopes(
+        self, problem: StepProblem, contacts: ContactSet, columns: np.ndarray, torques: np.ndarray, speed: float
+    ) -> np.ndarray:
+        """See the module."""
+        return (self.rows @ columns) / speed
+
+    def gap(
+        self, problem: StepProblem, contacts: ContactSet, velocities: np.ndarray, gained: np.ndarray, speed: float
+    ) -> np.ndarray:
+        """At the end of ``velocities`` (3N,), the angular momentum ``gained`` (3,)."""
+        return (self.rows @ velocities - self.target) / speed
 
 
 def centre_of_mass_velocity(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
@@ -43,6 +61,25 @@ class SpinObjective:
     """(3,) kg m^2/s."""
     weight: float
 
+    def slopes(
+        self, problem: StepProblem, contacts: ContactSet, columns: np.ndarray, torques: np.ndarray, speed: float
+    ) -> np.ndarray:
+        """See the module."""
+        return torques / self._unit(problem, speed)
+
+    def gap(
+        self, problem: StepProblem, contacts: ContactSet, velocities: np.ndarray, gained: np.ndarray, speed: float
+    ) -> np.ndarray:
+        """At the end of a step in which contact forces have ``gained`` (3,) kg m^2/s."""
+        state = problem.state
+        momentum = problem.body.angular_momentum(state.positions, state.velocities) + gained
+        return (momentum - self.target) / self._unit(problem, speed)
+
+    @staticmethod
+    def _unit(problem: StepProblem, speed: float) -> float:
+        gyration = np.sqrt(0.5 * np.trace(problem.inertia) / problem.body.mass)
+        return problem.body.mass * gyration * speed
+
 
 @dataclass(frozen=True)
 class LoadObjective:
@@ -55,9 +92,25 @@ class LoadObjective:
     """(k,)."""
     weight: float
 
-    def loads(self, contacts: ContactSet) -> np.ndarray:
-        """(3n,) 1 for the normal force of each contact nearest to one of the nodes."""
-        return np.outer(np.isin(contacts.nearest, self.nodes), [1.0, 0.0, 0.0]).ravel()
+    def slopes(
+        self, problem: StepProblem, contacts: ContactSet, columns: np.ndarray, torques: np.ndarray, speed: float
+    ) -> np.ndarray:
+        """One row for each contact nearest to one of the nodes; the contact forces, in body weights, are the last
+        unknowns.
+        """
+        loaded = self._loaded(contacts)
+        rows = np.zeros((len(loaded), columns.shape[1]))
+        rows[np.arange(len(loaded)), columns.shape[1] - 3 * contacts.count + 3 * loaded] = 1.0
+        return rows
+
+    def gap(
+        self, problem: StepProblem, contacts: ContactSet, velocities: np.ndarray, gained: np.ndarray, speed: float
+    ) -> np.ndarray:
+        """None: a load is judged in the program alone."""
+        return np.zeros(len(self._loaded(contacts)))
+
+    def _loaded(self, contacts: ContactSet) -> np.ndarray:
+        return np.flatnonzero(np.isin(contacts.nearest, self.nodes))
 
 
 AnyObjective = Objective | SpinObjective | LoadObjective

@@ -13,8 +13,9 @@ from egs_warp.contact.detection import ContactGeometry
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.locomotion.objectives import AnyObjective
+from egs_warp.locomotion.planner import STEPS_A_UNIT
 from egs_warp.locomotion.recorder import Recorder
-from egs_warp.locomotion.stepper import STEPS_A_UNIT, LocomotionStepper, StepReport
+from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 
 FRAME_RATE = 60
@@ -45,7 +46,7 @@ def solver_steps(body: SoftBody, step: float | None = None) -> tuple[float, int]
     """Seconds of a solver step, and how many make a frame: steps of at most ``step`` seconds and of sqrt(H / g) / 19,
     within which a body can be steered (docs/concepts/conventions.md). A frame is as long as a ``step`` that is longer.
     """
-    longest = float(np.sqrt(body.height / np.linalg.norm(body.gravity))) / STEPS_A_UNIT
+    longest = body.time_unit / STEPS_A_UNIT
     frame = max(1.0 / FRAME_RATE, step or 0.0)
     count = int(np.ceil(frame / min(longest, step or longest) - 1e-3))
     return frame / count, count
@@ -59,7 +60,7 @@ def settle(stepper: LocomotionStepper) -> BodyState:
     """
     body = stepper.body
     state = BodyState(body.mesh.nodes.copy(), np.zeros_like(body.mesh.nodes))
-    dt = 0.25 * np.sqrt(body.height / np.linalg.norm(body.gravity))
+    dt = 0.25 * body.time_unit
     memory = stepper.initial_memory()
     for _ in range(12):
         result = stepper.passive_step(state, memory, dt)

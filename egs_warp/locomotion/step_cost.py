@@ -14,7 +14,7 @@ import scipy.sparse as sparse
 from egs_warp.contact.detection import ContactSet
 from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.locomotion.objectives import AnyObjective, LoadObjective, SpinObjective
+from egs_warp.locomotion.objectives import AnyObjective
 
 EFFORT = 1.0
 """Cost of m g H of elastic and damping energy."""
@@ -57,22 +57,11 @@ def objectives_cost(
     speed: float,
 ) -> QuadraticCost:
     """The weighted squares that a motion asks for, in units of ``speed`` m/s, sqrt(g H)."""
-    body, state = problem.body, problem.state
     count = linear.columns.shape[1]
     P, q, constant = np.zeros((count, count)), np.zeros(count), 0.0
     for objective in objectives:
-        if isinstance(objective, LoadObjective):
-            loads = np.flatnonzero(objective.loads(contacts)) + count - 3 * contacts.count
-            P[loads, loads] += 2.0 * objective.weight
-            continue
-        if isinstance(objective, SpinObjective):
-            gyration = np.sqrt(0.5 * np.trace(problem.inertia) / body.mass)
-            unit = body.mass * gyration * speed
-            rows = linear.torques / unit
-            gap = (body.angular_momentum(state.positions, state.velocities) - objective.target) / unit
-        else:
-            rows = (objective.rows @ linear.columns) / speed
-            gap = (objective.rows @ linear.base - objective.target) / speed
+        rows = objective.slopes(problem, contacts, linear.columns, linear.torques, speed)
+        gap = objective.gap(problem, contacts, linear.base, np.zeros(3), speed)
         P += 2.0 * objective.weight * rows.T @ rows
         q += 2.0 * objective.weight * rows.T @ gap
         constant += objective.weight * float(gap @ gap)
@@ -81,25 +70,17 @@ def objectives_cost(
 
 def objectives_missed(
     problem: StepProblem,
+    contacts: ContactSet,
     objectives: Sequence[AnyObjective],
     velocities: np.ndarray,
-    torque: np.ndarray,
+    forces: np.ndarray,
     speed: float,
 ) -> float:
-    """The same weighted squares of a step that ends at ``velocities`` (N, 3) under contact forces of ``torque`` (3,)
-    about the centre of mass, N m; loads are left out."""
-    body, state, total = problem.body, problem.state, 0.0
-    for objective in objectives:
-        if isinstance(objective, LoadObjective):
-            continue
-        if isinstance(objective, SpinObjective):
-            gyration = np.sqrt(0.5 * np.trace(problem.inertia) / body.mass)
-            momentum = body.angular_momentum(state.positions, state.velocities) + problem.dt * torque
-            gap = (momentum - objective.target) / (body.mass * gyration * speed)
-        else:
-            gap = (objective.rows @ velocities.ravel() - objective.target) / speed
-        total += objective.weight * float(gap @ gap)
-    return total
+    """The same weighted squares of a step that ends at ``velocities`` (N, 3) under contact ``forces`` (n, 3); loads
+    are left out."""
+    gained = problem.dt * (problem.turns.T @ (contacts.frame.T @ forces.ravel()))
+    gaps = [objective.gap(problem, contacts, velocities.ravel(), gained, speed) for objective in objectives]
+    return sum(objective.weight * float(gap @ gap) for objective, gap in zip(objectives, gaps, strict=True))
 
 
 def effort_cost(
@@ -120,7 +101,7 @@ def effort_cost(
     to be strained the other way.
     """
     body = problem.body
-    time = max(horizon * float(np.sqrt(body.height / np.linalg.norm(body.gravity))), problem.dt)
+    time = max(horizon * body.time_unit, problem.dt)
     end = problem.end_positions(foreseen.reshape(-1, 3))
     assembly, damping = body.assembly, body.assembly.damping(problem.state.positions, time)
     entries = assembly.hessian_entries(end, damping, projected=True)

@@ -18,7 +18,7 @@ from egs_warp.io.atomic import atomic_write
 from egs_warp.io.run_folder import RunFolder, run_folder
 from egs_warp.io.video import ffmpeg_program
 from egs_warp.locomotion.ledger import ledger
-from egs_warp.locomotion.stepper import LocomotionSettings
+from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.motions.request import LARGEST_TARGET, LARGEST_TURN
 from egs_warp.motions.script import motion as script
 from egs_warp.pipelines import drawn

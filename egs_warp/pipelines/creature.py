@@ -17,7 +17,8 @@ from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.rollout import settle, solver_steps
-from egs_warp.locomotion.stepper import LocomotionSettings, LocomotionStepper
+from egs_warp.locomotion.settings import LocomotionSettings
+from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame
 from egs_warp.meshing.cage import Cage, cage_of_body
 from egs_warp.motions.sequence import Place

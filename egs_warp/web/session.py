@@ -204,7 +204,7 @@ class Session:
         self.report = reports[-1]
         body, velocities = self.creature.body, self.state.velocities
         speed = np.sqrt(body.node_mass @ (velocities**2).sum(axis=1) / body.mass)
-        if speed > _STILL * self.creature.stepper.speed_scale:
+        if speed > _STILL * body.speed_unit:
             self._still_since = None
         elif self._still_since is None:
             self._still_since = self.state.time

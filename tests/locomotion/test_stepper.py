@@ -20,8 +20,9 @@ from egs_warp.locomotion.objectives import (
     centre_of_mass_velocity,
     node_velocities,
 )
+from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.solvers import QpSolver
-from egs_warp.locomotion.stepper import LocomotionSettings, LocomotionStepper, StepMemory, StepReport
+from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory, StepReport
 from egs_warp.locomotion.strategies import PATIENCE, Strategy
 from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.muscle_set import attach_fibres

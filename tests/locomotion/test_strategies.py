@@ -11,8 +11,8 @@ from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.errors import UserError
 from egs_warp.locomotion.complementarity import STATIC
 from egs_warp.locomotion.program import ContactProgram
+from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.solvers import QpSolver
-from egs_warp.locomotion.stepper import LocomotionSettings
 from egs_warp.locomotion.strategies import (
     PATIENCE,
     Foreseen,

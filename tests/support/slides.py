@@ -11,7 +11,8 @@ import numpy as np
 from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import SpinObjective, centre_of_mass_velocity, node_velocities
 from egs_warp.locomotion.recorder import Recorder
-from egs_warp.locomotion.stepper import LocomotionSettings, LocomotionStepper, StepReport
+from egs_warp.locomotion.settings import LocomotionSettings
+from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from tests.support.creatures import coarse_creature
 from tests.support.meshes import block_mesh

@@ -1,0 +1,174 @@
+"""The activations of a step: what is asked of it, as a program about a foreseen end, and the search (Eq. 13)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from egs_warp.contact.coupled_step import ContactResponse
+from egs_warp.fem.body import SoftBody
+from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.locomotion.contact_pieces import ContactPieces
+from egs_warp.locomotion.objectives import AnyObjective
+from egs_warp.locomotion.settings import LocomotionSettings
+from egs_warp.locomotion.step_cost import LinearStep, QuadraticCost, effort_cost, objectives_cost
+from egs_warp.locomotion.strategies import Foreseen, search_program
+from egs_warp.locomotion.synergies import Synergies
+from egs_warp.muscles.muscle_set import MuscleSet
+from egs_warp.muscles.tension import muscle_columns
+
+STEPS_A_UNIT = 19.0
+"""Least number of steps in sqrt(H / g) within which a body can be steered."""
+_ORDINARY_STRENGTH = 4.0
+_FASTEST = 7.0
+"""Bounds of activations, in their bounds a sqrt(H / g): how fast a muscle is switched on and off."""
+_REGULAR = 1e-7
+
+
+@dataclass(frozen=True)
+class Prospect:
+    """Where a step would end under some activations, and the tangent there."""
+
+    response: ContactResponse
+    shift: np.ndarray
+    """(n,) m/s, the constants of the contacts' normal measures."""
+    activations: np.ndarray
+    """(M,) metres."""
+    velocities: np.ndarray
+    """(N, 3) m/s."""
+    forces: np.ndarray
+    """(n, 3) newtons."""
+
+
+@dataclass(frozen=True)
+class StepProgram:
+    """What is asked of a step, and what it is asked of."""
+
+    pieces: ContactPieces
+    foreseen: Foreseen
+    linear: LinearStep
+    """Of the activations of the synergies in their bounds, and of contact forces in body weights."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Activations, and the end that the program expects of them."""
+
+    activations: np.ndarray
+    """(M,) metres."""
+    velocities: np.ndarray
+    """(N, 3) m/s."""
+    forces: np.ndarray
+    """(n, 3) newtons."""
+    qp_count: int = 0
+    qp_infeasible: int = 0
+
+    def counting(self, *plans: Plan) -> Plan:
+        """This plan, with the programs counted that all ``plans`` of the step took."""
+        return replace(
+            self,
+            qp_count=sum(plan.qp_count for plan in plans),
+            qp_infeasible=sum(plan.qp_infeasible for plan in plans),
+        )
+
+
+@dataclass
+class StepPlanner:
+    """Programs of one body's steps."""
+
+    body: SoftBody
+    muscles: MuscleSet
+    synergies: Synergies
+    friction: float
+    settings: LocomotionSettings
+    factors: SparseFactors
+    """Of the effort's horizon."""
+
+    def plan(self, prospect: Prospect, last: np.ndarray, objectives: Sequence[AnyObjective], clock: StageClock) -> Plan:
+        """Activations for what the ``objectives`` ask, after ``last`` (M,) metres of the step before."""
+        problem, settings, m = prospect.response.tangent.problem, self.settings, self.synergies.count
+        program = self.program(prospect, last, objectives)
+        clock.lap("program")
+        found = search_program(
+            program.pieces,
+            settings.strategy,
+            program.foreseen,
+            directions=settings.directions,
+            qp_limit=settings.qp_limit,
+            solver=settings.qp_solver,
+        )
+        clock.lap("qp")
+        if found.x is None:
+            return Plan(last, prospect.velocities, prospect.forces, found.qp_count, found.infeasible)
+        activations = (self.synergies.members @ found.x[:m]) * self.muscles.bounds
+        moved = program.linear.base + program.linear.columns[:, :m] @ found.x[:m]
+        asked = self.body.weight * found.x[m:].reshape(-1, 3)
+        forces = prospect.response.forces(moved, prospect.shift, self.friction, asked)
+        velocities = (moved + prospect.response.columns @ forces.ravel()).reshape(prospect.velocities.shape)
+        clock.lap("contact")
+        if not problem.feasible(velocities):
+            velocities = prospect.velocities
+        return Plan(activations, velocities, forces, found.qp_count, found.infeasible)
+
+    def program(self, prospect: Prospect, last: np.ndarray, objectives: Sequence[AnyObjective]) -> StepProgram:
+        """What is asked of the step, linear about the ``prospect``; ``last`` (M,) are the step before's activations."""
+        response, foreseen, body = prospect.response, prospect.velocities, self.body
+        problem, contacts, members = response.tangent.problem, response.contacts, self.synergies.members
+        weight, m, speed = body.weight, self.synergies.count, body.speed_unit
+        each = muscle_columns(self.muscles, problem.end_positions(foreseen)).toarray() * self.muscles.bounds
+        # Without muscles and contact, in their stiffness at last step's tension.
+        free = problem.residual(foreseen, None).ravel()
+        solved = response.tangent.solve(np.column_stack([problem.dt * (members.T @ each.T).T, free]))
+        torques = problem.dt * weight * (contacts.frame @ problem.turns).T
+        linear = LinearStep(
+            foreseen.ravel() - solved[:, -1],
+            np.hstack([solved[:, :-1], weight * response.columns]),
+            np.hstack([np.zeros((3, m)), torques]),
+        )
+        previous = self.synergies.mean(last / self.muscles.bounds)
+        cost = (
+            objectives_cost(problem, linear, contacts, objectives, speed)
+            + effort_cost(problem, linear, foreseen.ravel(), self.factors)
+            + self._activation_cost(problem.dt, previous, linear.columns.shape[1])
+        )
+        rows = np.hstack([contacts.frame @ solved[:, :-1], weight * response.delassus]) / speed
+        offset = contacts.frame @ linear.base / speed
+        offset[::3] += prospect.shift / speed
+        reach = _FASTEST * problem.dt / body.time_unit
+        pieces = ContactPieces(
+            *(cost.P, cost.q, cost.constant, rows, offset, self.friction),
+            *(np.maximum(previous - reach, -1.0), np.minimum(previous + reach, 1.0)),
+        )
+        slip = (contacts.frame @ foreseen.ravel()).reshape(-1, 3) / speed
+        start = self.synergies.mean(prospect.activations / self.muscles.bounds)
+        return StepProgram(pieces, Foreseen(start, prospect.forces / weight, slip), linear)
+
+    def _activation_cost(self, dt: float, previous: np.ndarray, count: int) -> QuadraticCost:
+        """Of ``count`` unknowns that begin with the activations, how large they are and how they change from
+        ``previous`` (m,)."""
+        settings, members = self.settings, self.synergies.members
+        share = dt * STEPS_A_UNIT / self.body.time_unit
+        strength = self.muscles.max_forces / (_ORDINARY_STRENGTH * self.body.weight)
+        size = settings.activation_weight * share**2 * (members.T @ strength)
+        change = settings.activation_change_weight * share * (members.T @ strength**2)
+        diagonal, q = np.zeros(count), np.zeros(count)
+        diagonal[: len(previous)] = 2.0 * (size + change) + _REGULAR
+        q[: len(previous)] = -2.0 * change * previous
+        return QuadraticCost(np.diag(diagonal), q, float(change @ previous**2))
+
+
+@dataclass
+class StageClock:
+    """Milliseconds of each stage of a step."""
+
+    milliseconds: dict[str, float] = field(default_factory=dict)
+    _last: float = field(default_factory=time.perf_counter)
+
+    def lap(self, name: str) -> None:
+        """Since the lap before was ``name``."""
+        now = time.perf_counter()
+        self.milliseconds[name] = self.milliseconds.get(name, 0.0) + 1e3 * (now - self._last)
+        self._last = now
