@@ -13,6 +13,7 @@ from egs_warp.version import __version__
 if TYPE_CHECKING:
     from egs_warp.assets.scene import BUILT_IN_SCENES, Scene, scene
     from egs_warp.commands.endings import one_line_errors
+    from egs_warp.contact.terrain import Solid
     from egs_warp.deformation.deformer import Deformer
     from egs_warp.deformation.embedding import embed_gaussians
     from egs_warp.errors import ArgumentError, UserError
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from egs_warp.geometry.tetmesh import TetMesh
     from egs_warp.inpainting.holes import footprint
     from egs_warp.inpainting.inpaint import InpaintOptions, inpaint
+    from egs_warp.inpainting.inpainters import Inpainter, inpainter_by_name
     from egs_warp.io.atomic import writable_folder
     from egs_warp.io.cameras import read_cameras
     from egs_warp.io.capture import read_capture
@@ -41,13 +43,23 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.train_capture import TrainResult, train
     from egs_warp.render.autograd import render_torch
     from egs_warp.render.rasteriser import render_gaussians
+    from egs_warp.segmentation.clearance import Clearing, ClearingOptions, Reach
     from egs_warp.segmentation.object_mask import Box, ObjectSpec
-    from egs_warp.training.finetune import FinetuneOptions, Rates, finetune, views_of_capture
+    from egs_warp.segmentation.votes import MaskedView
+    from egs_warp.training.finetune import (
+        Densification,
+        FinetuneOptions,
+        Rates,
+        TrainingView,
+        finetune,
+        views_of_capture,
+    )
     from egs_warp.training.likeness import psnr
 
 _HOMES: dict[str, tuple[str, ...]] = {
     "assets.scene": ("BUILT_IN_SCENES", "Scene", "scene"),
     "commands.endings": ("one_line_errors",),
+    "contact.terrain": ("Solid",),
     "deformation.deformer": ("Deformer",),
     "deformation.embedding": ("embed_gaussians",),
     "errors": ("ArgumentError", "UserError"),
@@ -57,6 +69,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "geometry.tetmesh": ("TetMesh",),
     "inpainting.holes": ("footprint",),
     "inpainting.inpaint": ("InpaintOptions", "inpaint"),
+    "inpainting.inpainters": ("Inpainter", "inpainter_by_name"),
     "io.atomic": ("writable_folder",),
     "io.cameras": ("read_cameras",),
     "io.capture": ("read_capture",),
@@ -76,8 +89,10 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "pipelines.train_capture": ("TrainResult", "train"),
     "render.autograd": ("render_torch",),
     "render.rasteriser": ("render_gaussians",),
+    "segmentation.clearance": ("Clearing", "ClearingOptions", "Reach"),
     "segmentation.object_mask": ("Box", "ObjectSpec"),
-    "training.finetune": ("FinetuneOptions", "Rates", "finetune", "views_of_capture"),
+    "segmentation.votes": ("MaskedView",),
+    "training.finetune": ("Densification", "FinetuneOptions", "Rates", "TrainingView", "finetune", "views_of_capture"),
     "training.likeness": ("psnr",),
 }
 """Where each public name lives; the imports above say the same to type checkers."""
@@ -89,25 +104,33 @@ __all__ = [
     "ArgumentError",
     "Box",
     "Camera",
+    "Clearing",
+    "ClearingOptions",
     "Creature",
     "Deformer",
+    "Densification",
     "FinetuneOptions",
     "GaussianCloud",
     "InpaintOptions",
+    "Inpainter",
     "LocomotionSettings",
+    "MaskedView",
     "ObjectSpec",
     "Performance",
     "Plane",
     "PreparedScene",
     "Rates",
+    "Reach",
     "Report",
     "Scene",
     "SceneOptions",
     "Script",
     "Shot",
+    "Solid",
     "Strategy",
     "TetMesh",
     "TrainResult",
+    "TrainingView",
     "Trajectory",
     "UserError",
     "VideoWriter",
@@ -118,6 +141,7 @@ __all__ = [
     "finetune",
     "footprint",
     "inpaint",
+    "inpainter_by_name",
     "joined",
     "make_creature",
     "motion",

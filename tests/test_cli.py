@@ -23,7 +23,7 @@ from egs_warp.inpainting.inpainters import OpenCvMethod
 from egs_warp.io import write_ply
 from egs_warp.io.writing import WRITERS
 from egs_warp.pipelines.render_run import Show
-from egs_warp.pipelines.shot import CAMERAS
+from egs_warp.pipelines.shot import CameraMove
 from egs_warp.segmentation.clearance import Clearing
 
 
@@ -142,7 +142,7 @@ def test_choices_of_flags_are_those_of_the_library() -> None:
     assert choices("convert", "--to") == set(WRITERS) == choices("export", "--to") - {"usd", "bundle"}
     assert choices("render", "--show") == {show.value for show in Show}
     assert choices("segment", "--straddling") == {method.value for method in Clearing}
-    assert {"patch", TRANSPARENT, *CAMERAS, *(method.value for method in OpenCvMethod)} == set(_WORDS)
+    assert {"patch", TRANSPARENT, *CameraMove, *(method.value for method in OpenCvMethod)} == set(_WORDS)
 
 
 def test_axes_and_planes_are_read() -> None:

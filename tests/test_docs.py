@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import runpy
 from pathlib import Path
@@ -66,3 +67,13 @@ def test_pages_start_from_captures_and_keys_that_can_be_read(tmp_path: Path) -> 
         assert read_capture(tmp_path / f"{name}.ply").cloud.count == made.object.count
         assert read_capture(tmp_path / f"{name}_in_room.ply").cloud.count == made.whole()[0].count
     assert {key.part for key in read_keyframes(ROOT / "examples" / "bow.csv")} == {"head"}
+
+
+def test_every_room_says_what_comes_in_what_goes_out_and_which_part_of_the_paper_it_is() -> None:
+    rooms = sorted((ROOT / "egs_warp").glob("*/__init__.py"))
+    assert len(rooms) > 15
+    for room in rooms:
+        told = ast.get_docstring(ast.parse(room.read_text())) or ""
+        assert "In: " in told and "Out: " in told, room.parent.name
+        assert re.search(r"sections? \d|Eq\. \d|paper", told), room.parent.name
+        assert len(told.splitlines()) <= 4, room.parent.name

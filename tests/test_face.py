@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
+import inspect
 import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +18,12 @@ import egs_warp as egs
 
 ROOT = Path(__file__).parents[1]
 FACE = ROOT / "egs_warp" / "__init__.py"
+PACKAGE_CLASSES = {
+    node.name
+    for path in (ROOT / "egs_warp").rglob("*.py")
+    for node in ast.parse(path.read_text()).body
+    if isinstance(node, ast.ClassDef)
+}
 
 
 def readme_lines() -> str:
@@ -31,6 +40,31 @@ def test_the_face_is_what_the_docs_teach() -> None:
         assert getattr(egs, name).__doc__, name
     with pytest.raises(AttributeError, match="module 'egs_warp' has no attribute 'fly'"):
         egs.fly  # noqa: B018
+
+
+def classes_of(annotation: object) -> list[set[str]]:
+    """Of each alternative of an annotation that is not None, the package's classes in it."""
+    alternatives = re.split(r"\|(?![^\[]*\])", str(annotation))
+    return [set(re.findall(r"\w+", text)) & PACKAGE_CLASSES for text in alternatives if text.strip() != "None"]
+
+
+def test_whatever_a_public_function_takes_can_be_given_by_the_face() -> None:
+    """Each parameter has an alternative that is made of public classes, or of records that a public function gives; so
+    do the constructors of classes that no function gives."""
+    public: dict[str, Any] = {name: getattr(egs, name) for name in egs.__all__}
+    functions: dict[str, Any] = {name: given for name, given in public.items() if inspect.isfunction(given)}
+    returned = [inspect.signature(one).return_annotation for one in functions.values()]
+    given = {name for annotation in returned for names in classes_of(annotation) for name in names}
+    makers: dict[str, Any] = {
+        name: one for name, one in public.items() if dataclasses.is_dataclass(one) and name not in given
+    }
+    checked = 0
+    for name, made in (functions | makers).items():
+        for parameter in inspect.signature(made).parameters.values():
+            alternatives = classes_of(parameter.annotation)
+            checked += any(alternatives)
+            assert any(needed <= given | set(public) for needed in alternatives), f"{name}({parameter})"
+    assert checked > 40
 
 
 def test_type_checkers_see_the_same_names_in_the_same_places() -> None:

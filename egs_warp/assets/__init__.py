@@ -1,4 +1,4 @@
-"""Objects and rooms made by the package: nothing to download.
+"""Objects and rooms made by the package, to try the whole paper on: nothing to download.
 
 In: a name, a seed. Out: a cloud, its plane and cameras.
 """

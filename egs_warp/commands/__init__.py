@@ -1,6 +1,6 @@
 """The sub-commands of ``egs-warp``: each module adds its parser with ``add_parser``; heavy imports wait for its run.
 
-In: flags. Out: files and an exit status. Nothing else in the package speaks of flags.
+In: flags. Out: files and an exit status. Beside the paper; nothing else in the package speaks of flags.
 """
 
 GROUPS = {

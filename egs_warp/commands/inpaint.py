@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from egs_warp.commands.flags import Commands, add_inpainter_flags, chosen_inpainter, named_path, parse_plane
 from egs_warp.commands.scene_flags import start
 from egs_warp.errors import UserError
+
+if TYPE_CHECKING:
+    from egs_warp.geometry.gaussians import GaussianCloud
+    from egs_warp.geometry.plane import Plane
+    from egs_warp.inpainting.holes import Hole
 
 EXAMPLES = (
     "background.ply --plane plane.json --out filled.ply",
@@ -65,6 +70,7 @@ def _inpaint(chosen: argparse.Namespace) -> int:
     inpainter = chosen_inpainter(chosen, seed=chosen.seed)
     background = read_capture(chosen.background, device=chosen.device)
     hole = _hole(chosen, plane, recorded, background.cloud)
+    assert hole is not None, "one of them was given"
     result = inpaint(background.cloud, hole, inpainter=inpainter, options=options)
     write_ply(chosen.out, result.cloud)
     write_png(picture, before_and_after(result))
@@ -74,7 +80,7 @@ def _inpaint(chosen: argparse.Namespace) -> int:
     return 0
 
 
-def _plane(text: str) -> tuple[Any, Any]:
+def _plane(text: str) -> tuple[Plane, Hole | None]:
     """The plane, and the hole that ``segment`` found in it, if it did."""
     if not text.lower().endswith(".json"):
         return parse_plane(text), None
@@ -85,7 +91,7 @@ def _plane(text: str) -> tuple[Any, Any]:
     return known.plane, Hole.of_outline(known.plane, known.hole) if known.hole is not None else None
 
 
-def _hole(chosen: argparse.Namespace, plane: Any, recorded: Any, background: Any) -> Any:
+def _hole(chosen: argparse.Namespace, plane: Plane, recorded: Hole | None, background: GaussianCloud) -> Hole | None:
     import numpy as np
 
     from egs_warp.commands.object_flag import read_object

@@ -1,4 +1,4 @@
-"""Files of others, in and out: captures, camera poses, planes, texts, pictures and videos.
+"""Files of others, in and out, beside the paper: captures, camera poses, planes, texts, pictures and videos.
 
 In: paths. Out: the records of ``geometry``; each file is written whole or not at all.
 """

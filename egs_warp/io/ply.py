@@ -11,6 +11,7 @@ import warnings
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -151,8 +152,8 @@ def _read_text(data: bytes, header: PlyHeader, wanted: list[str], source: Path) 
             # numpy only warns of text that is not a number; newer ones raise ValueError.
             warnings.simplefilter("error", DeprecationWarning)
             try:
-                rows = bytes(memoryview(data)[header.size + start : header.size + end])
-                values = np.fromstring(rows, dtype=np.float64, sep=" ")  # pyright: ignore[reportCallIssue, reportArgumentType]
+                text: Any = bytes(memoryview(data)[header.size + start : header.size + end])
+                values = np.fromstring(text, dtype=np.float64, sep=" ")
             except (DeprecationWarning, ValueError):
                 values = np.empty(0)
         if len(values) != element.count * columns:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,6 @@ from egs_warp.io.text import parse_json, read_text
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
 
-CAMERAS = ("fixed", "follow", "orbit")
 SMALLEST_SIDE, LARGEST_SIDE = 16, 4096
 """Pixels of a film."""
 FASTEST = 1000.0
@@ -32,11 +32,19 @@ _TURNTABLE = 4.0
 """Seconds of a turn about a body that is held."""
 
 
+class CameraMove(StrEnum):
+    """How a camera moves by itself."""
+
+    FIXED = "fixed"
+    FOLLOW = "follow"
+    ORBIT = "orbit"
+
+
 @dataclass(frozen=True)
 class Shot:
     """What a user may ask of a film."""
 
-    camera: str = "fixed"
+    camera: str = CameraMove.FIXED
     """``fixed``, ``follow``, ``orbit`` (once around in the film), or the name of a JSON file with key cameras."""
     size: tuple[int, int] | None = None
     """Pixels across and down; None: as the film's."""
@@ -54,8 +62,8 @@ class Shot:
             raise ArgumentError("size", advice, value=text)
         if not 1.0 <= self.fps <= FASTEST:
             raise ArgumentError("fps", f"give a number of frames a second from 1 to {FASTEST:g}", value=self.fps)
-        if self.camera not in CAMERAS and not self.camera.endswith(".json"):
-            raise ArgumentError("camera", f"give {', '.join(CAMERAS)} or a path.json", value=self.camera)
+        if self.camera not in list(CameraMove) and not self.camera.endswith(".json"):
+            raise ArgumentError("camera", f"give {', '.join(CameraMove)} or a path.json", value=self.camera)
 
     def to_json(self) -> dict[str, Any]:
         """For the report."""
@@ -64,17 +72,17 @@ class Shot:
 
     def check(self) -> None:
         """Raise ``UserError`` for a file of key cameras that cannot be read: before any long work."""
-        if self.camera not in CAMERAS:
+        if self.camera not in list(CameraMove):
             _keys(Path(self.camera))
 
     def cameras(self, camera: Camera, trajectory: Trajectory, steps: np.ndarray) -> list[Camera]:
         """One for each of ``steps`` (n,); ``camera`` is the film's own. Raises ``UserError`` for a bad file of keys."""
         base = resized(camera, *self.size) if self.size is not None else camera
-        if self.camera == "fixed":
+        if self.camera == CameraMove.FIXED:
             return [base] * len(steps)
-        if self.camera == "follow":
+        if self.camera == CameraMove.FOLLOW:
             return _following(base, trajectory, steps)
-        if self.camera == "orbit":
+        if self.camera == CameraMove.ORBIT:
             return around(base, trajectory.positions[steps])
         return _through_keys(Path(self.camera), base, trajectory, steps)
 

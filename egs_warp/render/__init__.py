@@ -1,4 +1,4 @@
-"""Tile-based Gaussian splatting (Kerbl et al. 2023): projection, tiles, compositing, and its gradients.
+"""Tile-based Gaussian splatting (section 3.1; Kerbl et al. 2023): projection, tiles, compositing, and its gradients.
 
 In: a cloud and a camera. Out: colour, alpha and depth; with ``autograd``, gradients for PyTorch.
 """

@@ -1,0 +1,159 @@
+"""What the choices inside a step are worth, on every step of the pawn's jump.
+
+python benchmarks/step.py [--quick] [--device cpu] [--seed 0] [--json PATH] [--plot PATH]
+
+Three tables. Newton's iterations: as the jump took them, and done again from what the step's own activations foresee,
+with the true Hessian of the elements and with the projected one in its place. Contact speeds: by how much what the
+tangent expects of a step's activations misses what is then solved, with the tangent where the body goes on rigidly and
+where the step is foreseen to end (rms and largest over the loaded contacts of all steps, m/s; the pawn is 1 m tall).
+Factors: a step's matrix factored, and solved for a right-hand side per muscle and contact row, by rslab and by scipy's
+SuperLU. No aim is named for this benchmark.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+from unittest.mock import patch
+
+import numpy as np
+import scipy.sparse as sparse
+from scipy.sparse.linalg import splu
+
+from egs_warp.assets import pawn
+from egs_warp.contact.coupled_step import ContactResponse
+from egs_warp.fem.elasticity import ElasticAssembly
+from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.step_problem import StepProblem
+from egs_warp.locomotion.stepper import StepMemory, StepReport
+from egs_warp.motions.script import motion
+from egs_warp.muscles.tension import MuscleTension
+from egs_warp.pipelines.creature import Creature, make_creature
+from egs_warp.pipelines.performance import simulate
+from harness import Row, Table, flags, median_ms, report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PLACES = ("ground", "flight")
+
+
+def iterations(creature: Creature, before: StepReport, step: StepReport) -> Row:
+    """Newton's iterations of one step by Hessian."""
+
+    def again() -> int:
+        return creature.stepper.held_step(before.state, memory_of(before), step.activations, step.dt)[
+            2
+        ].newton_iterations
+
+    hessian_entries = ElasticAssembly.hessian_entries
+
+    def projected(assembly: ElasticAssembly, *arguments: Any, **options: Any) -> np.ndarray:
+        return hessian_entries(assembly, *arguments, **{**options, "projected": True})
+
+    figures = {"as it was": step.newton_iterations, "true": again()}
+    with patch.object(ElasticAssembly, "hessian_entries", projected):
+        return {**figures, "projected": again()}
+
+
+def memory_of(step: StepReport) -> StepMemory:
+    """What a step handed to the next."""
+    return StepMemory(step.contacts.points, step.forces, step.activations)
+
+
+def contact_errors(creature: Creature, before: StepReport, step: StepReport) -> dict[str, np.ndarray]:
+    """(3k,) m/s by which a tangent misses the speeds of the k loaded contacts, by where it is."""
+    stepper, contacts, muscles = creature.stepper, step.contacts, creature.muscles
+    problem = StepProblem(creature.body, before.state, step.dt)
+    foreseen = stepper.foresee(problem, contacts, memory_of(before), before.activations).velocities
+    factors = SparseFactors(creature.body.assembly.upper_pattern)
+    last, now = (MuscleTension.of(muscles, one.activations) for one in (before, step))
+    loaded = np.repeat(step.forces[:, 0] > 0.0, 3)
+    errors = {}
+    for place, velocities in (("rigid start", problem.start), ("foreseen end", foreseen)):
+        tangent = problem.tangent(factors, velocities, last)
+        response = ContactResponse.of(tangent, contacts)
+        free = velocities.ravel() - tangent.solve(problem.residual(velocities, now).ravel())
+        shift = stepper.solver.shift(contacts, step.dt)
+        forces = response.forces(free, shift, creature.geometry.friction, step.forces)
+        expected = free + response.columns @ forces.ravel()
+        errors[place] = (contacts.frame @ (expected - step.state.velocities.ravel()))[loaded]
+    return errors
+
+
+def factor_times(creature: Creature, repeats: int) -> list[Row]:
+    """Milliseconds of rslab and SuperLU."""
+    assembly, body = creature.body.assembly, creature.body
+    entries = assembly.hessian_entries(creature.start.positions, factor=(1.0 / 60.0) ** 2)
+    entries[assembly.diagonal_entries] += np.repeat(body.node_mass, 3)
+    upper = assembly.matrix(entries)
+    full = (upper + sparse.triu(upper, 1).T).tocsc()
+    right = np.random.default_rng(0).standard_normal((full.shape[0], creature.muscles.segment_count + 3 * 32))
+    ours, theirs = SparseFactors(assembly.upper_pattern), splu(full)
+    ours.update(entries)
+    milliseconds = median_ms(
+        {
+            "rslab factor": lambda: ours.update(entries),
+            "rslab solve": lambda: ours.solve(right),
+            "SuperLU factor": lambda: splu(full),
+            "SuperLU solve": lambda: theirs.solve(right),
+        },
+        repeats=repeats,
+    )
+    return [
+        {
+            "solver": solver,
+            "unknowns": full.shape[0],
+            "right_hand_sides": right.shape[1],
+            "factor": milliseconds[f"{solver} factor"],
+            "solve": milliseconds[f"{solver} solve"],
+        }
+        for solver in ("rslab", "SuperLU")
+    ]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the benchmark."""
+    options = flags(
+        __doc__, quick="every fourth step", device="cpu", seed="not used: nothing here is random"
+    ).parse_args(arguments)
+    scene = pawn(device=options.device)
+    creature = make_creature(scene.cloud, plane=scene.plane)
+    reports = simulate(creature, motion("jump")).simulation.reports
+    pairs = list(pairwise(reports))[:: 4 if options.quick else 1]
+    counts = [(step.contacts.count == 0, iterations(creature, before, step)) for before, step in pairs]
+    rows: list[Row] = []
+    table = Table(Hessian="<10", ground_mean=".1f", ground_worst="d", flight_mean=".1f", flight_worst="d")
+    for hessian in counts[0][1]:
+        found = {place: [one[hessian] for flies, one in counts if flies == (place == "flight")] for place in PLACES}
+        row: Row = {"hessian": hessian}
+        for place, numbers in found.items():
+            row |= {f"{place}_mean": float(np.mean(numbers)), f"{place}_worst": max(numbers)}
+        rows.append(row)
+        table.row(*row.values())
+    errors = [contact_errors(creature, before, step) for before, step in pairs if step.contacts.count > 0]
+    speeds: list[Row] = []
+    table = Table(tangent_at="<14", rms=".1e", largest=".1e")
+    for place in errors[0]:
+        missed = np.concatenate([one[place] for one in errors])
+        rms = float(np.sqrt(np.mean(missed**2)))
+        speeds.append({"tangent_at": place, "rms": rms, "largest": float(np.abs(missed).max())})
+        table.row(*speeds[-1].values())
+    factors = factor_times(creature, 5 if options.quick else 20)
+    table = Table(solver="<8", unknowns="d", right_hand_sides="d", factor_ms=".1f", solve_ms=".1f")
+    for row in factors:
+        table.row(*row.values())
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        for hessian in counts[0][1]:
+            axes.plot([one[hessian] for _, one in counts], label=hessian)
+        axes.set(xlabel="step", ylabel="Newton's iterations")
+        axes.legend()
+
+    report(options, rows, contact_speeds=speeds, factors=factors, aims={}, draw=draw)
+
+
+if __name__ == "__main__":
+    main()
