@@ -70,9 +70,9 @@ def _tetrahedralize() -> Callable[..., Any]:
     except ImportError:
         sys.modules["pyvista"] = types.ModuleType("pyvista")
         try:
-            import pytetwild
+            from pytetwild.pytetwild import tetrahedralize
         finally:
             del sys.modules["pyvista"]
     else:
-        import pytetwild
-    return pytetwild.tetrahedralize
+        from pytetwild.pytetwild import tetrahedralize
+    return tetrahedralize
