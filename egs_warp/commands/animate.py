@@ -90,7 +90,7 @@ def add_parser(commands: Commands) -> None:
         "--view-from", help="x,y,z or an axis: from the object to the camera of the video, capture's frame"
     )
     camera.add_argument("--no-shadow", action="store_true", help="no shadow on the ground under the object")
-    animate.set_defaults(run=_animate, parser=animate)
+    animate.set_defaults(run=_animate, parser=animate, resume=False)
 
 
 def _animate(chosen: argparse.Namespace) -> int:
@@ -99,6 +99,11 @@ def _animate(chosen: argparse.Namespace) -> int:
     check_run_folder(chosen.out, overwrite=chosen.overwrite)
     if chosen.config is not None and changed_capture(chosen.config, chosen.capture):
         say(f"{chosen.capture} is not the file that the run of {chosen.config} had; the result will be another")
+    return animated(chosen)
+
+
+def animated(chosen: argparse.Namespace) -> int:
+    """What ``egs-warp animate`` does once ``chosen.out`` is known to be free, or a run in it to go on; its status."""
     report, more = _animate_scene(chosen) if chosen.object is not None else _animate_capture(chosen)
     print(report.summary())
     print(f"wrote the video, sheet.png, plots.png, report.json, trajectory.npz{more} into {chosen.out}")
@@ -130,7 +135,7 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
         up, note = guessed_up(capture)
         notes = (*notes, note)
         say(note)
-    with run_folder(chosen.out, overwrite=chosen.overwrite) as run:
+    with run_folder(chosen.out, overwrite=chosen.overwrite, resume=chosen.resume) as run:
         run.begin_with(lambda: write_config(run.file(NAME), chosen, chosen.parser))
         report = animate(
             capture.cloud,
@@ -167,7 +172,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
     given = read_scene(chosen)
     options = SceneOptions(clearing=clearing_of(chosen), inpaint=not chosen.no_inpaint, inpainter=inpainter)
-    with run_folder(chosen.out, overwrite=chosen.overwrite) as run:
+    with run_folder(chosen.out, overwrite=chosen.overwrite, resume=chosen.resume) as run:
         run.begin_with(lambda: write_config(run.file(NAME), chosen, chosen.parser))
         scene = given.prepared(options, progress=lambda stage: say(f"{stage} ..."))
         # Whatever goes wrong later, the minutes that these took are not lost.

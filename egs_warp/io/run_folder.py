@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Any
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.atomic import atomic_write, lock, sweep, writable_folder
 from egs_warp.io.limits import LARGEST_TEXT, read_bytes
+from egs_warp.io.text import parse_json, read_text
 from egs_warp.version import __version__
 
 MANIFEST = "manifest.json"
@@ -27,15 +29,20 @@ _SCHEMA = 1
 class RunFolder:
     """What one run writes; made by ``run_folder``."""
 
-    def __init__(self, path: Path, overwrite: bool) -> None:
+    def __init__(self, path: Path, *, overwrite: bool = False, names: Sequence[str] = ()) -> None:
+        """``names``: files of a run that was cut off and goes on."""
         self.path = path
+        self.resumed = bool(names)
         self._overwrite = overwrite
-        self._names: list[str] = []
+        self._names = list(names)
         self._begin: Callable[[], object] | None = None
 
     def begin_with(self, begin: Callable[[], object]) -> None:
-        """Have ``begin`` write its files before the first other one: an interrupted run has them, too."""
-        self._begin = begin
+        """Have ``begin`` write its files before the first other one: an interrupted run has them, too. One that goes on
+        has them already.
+        """
+        if not self.resumed:
+            self._begin = begin
 
     def file(self, name: str) -> Path:
         """Where the run's file ``name`` goes. Before the first one, an earlier run is moved aside, if that was allowed.
@@ -57,9 +64,14 @@ class RunFolder:
         return self.path / name
 
     def finish(self) -> None:
-        """Describe all files; the manifest says from now on that the run has finished."""
+        """Describe all files; the manifest says from now on that the run has finished. Folders, which a run needs only
+        to go on, are gone then.
+        """
         facts = {name: _facts(self.path / name) for name in self._names if (self.path / name).is_file()}
         self._write_manifest(facts, finished=True)
+        for name in self._names:
+            if name not in facts:
+                shutil.rmtree(self.path / name, ignore_errors=True)
 
     def _write_manifest(self, files: dict[str, Any], *, finished: bool) -> None:
         content = {"schema": _SCHEMA, "version": __version__, "finished": finished, "files": files}
@@ -84,25 +96,53 @@ class RunFolder:
 
 
 @contextmanager
-def run_folder(out: Path | str | RunFolder, *, overwrite: bool = False) -> Iterator[RunFolder]:
+def run_folder(out: Path | str | RunFolder, *, overwrite: bool = False, resume: bool = False) -> Iterator[RunFolder]:
     """The folder ``out``, made where it is missing and locked, for one run; a ``RunFolder`` is handed on as it is.
 
     Raises ``UserError`` where another run is writing, or where an earlier run lies and may not be moved aside
-    (``overwrite``).
+    (``overwrite``); of a run that goes on (``resume``), where there is none, or none that was cut off.
     """
     if isinstance(out, RunFolder):
         with nullcontext():
             yield out
         return
-    check_run_folder(out, overwrite=overwrite)
+    _check(out, overwrite=overwrite, resume=resume)
     folder = writable_folder(out)
     with lock(folder / _LOCK) as free:
         if not free:
             raise UserError(f"{out}: another run is writing into this folder; wait for it, or choose another folder")
         # What came between the check and the lock.
-        check_run_folder(out, overwrite=overwrite)
+        _check(out, overwrite=overwrite, resume=resume)
         sweep(folder)
-        yield RunFolder(folder, overwrite)
+        yield RunFolder(folder, overwrite=overwrite, names=_known(folder)[:-1] if resume else ())
+
+
+def _check(out: Path | str, *, overwrite: bool, resume: bool) -> None:
+    if not resume:
+        check_run_folder(out, overwrite=overwrite)
+    elif has_finished(out):
+        raise UserError(f"{out}: this run has finished; there is nothing to go on with")
+
+
+def has_finished(out: Path | str) -> bool:
+    """Whether the run in the folder ``out`` has written all of its files. Raises ``UserError`` where there is none that
+    could go on, or one of another version.
+    """
+    check_out(out)
+    path = Path(out) / MANIFEST
+    if not path.is_file():
+        raise UserError(f"{out}: no run has begun to write here; begin it")
+    manifest = parse_json(read_text(path), path)
+    if not isinstance(manifest, dict) or not _names_in(manifest):
+        raise UserError(f"{path}: is no manifest of a run; begin the run again")
+    if manifest.get("finished") is True:
+        return True
+    if manifest.get("version") != __version__:
+        raise UserError(
+            f"{path}: the run was begun by egs-warp {manifest.get('version')}, this is {__version__}, whose steps are"
+            " others; begin the run again"
+        )
+    return False
 
 
 def check_run_folder(out: Path | str, *, overwrite: bool = False) -> None:
@@ -147,11 +187,17 @@ def _known(folder: Path) -> list[str]:
     if not path.is_file():
         return []
     try:
-        files = json.loads(read_bytes(path, at_most=LARGEST_TEXT))["files"]
-        names = [name for name in files if isinstance(name, str) and Path(name).name == name]
-    except (ValueError, KeyError, TypeError, RecursionError):
+        names = _names_in(json.loads(read_bytes(path, at_most=LARGEST_TEXT)))
+    except (ValueError, RecursionError):
         names = []
-    return [*(name for name in names if name != MANIFEST), MANIFEST]
+    return [*names, MANIFEST]
+
+
+def _names_in(manifest: Any) -> list[str]:
+    """Files that a manifest tells of; not of other folders."""
+    files = manifest.get("files") if isinstance(manifest, dict) else None
+    names = files if isinstance(files, dict) else {}
+    return [name for name in names if Path(name).name == name and name != MANIFEST]
 
 
 def _facts(path: Path) -> dict[str, Any]:

@@ -1,4 +1,7 @@
-"""Writes a simulation down as it goes, so that a run that is killed loses no more than its last steps."""
+"""Writes a simulation down as it goes, so that a run that is killed loses no more than its last steps.
+
+Beside what a trajectory keeps, parts hold all that a ``StepReport`` says: ``Replay`` reads it.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,9 @@ from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import FIRST_PART, Trajectory, part_name, write_arrays
 from egs_warp.muscles.muscle_set import MuscleSet
 
-_STEPS_A_PART = 30
+_STEPS_A_PART = 10
+REPORTED = ("qp_count", "qp_infeasible", "newton_iterations", "converged", "added_spin")
+"""Fields of ``StepReport`` that are arrays of a part, a row a step."""
 
 
 class Recorder:
@@ -34,21 +39,28 @@ class Recorder:
         folder: Callable[[], Path] | None = None,
     ) -> None:
         """``start_gap``: smallest gap at ``start``, metres; ``frame``: where the body lies in its capture; ``folder``:
-        tells, once the first part is full, where the parts go; it is made where it is missing.
+        tells, once the first step is done, where the parts go; it is made where it is missing.
         """
         self._planes = np.array([[*plane.normal, plane.offset] for plane in geometry.planes])
         self._folder, self._path = folder, None
-        self._steps = self._written = 0
+        self._steps = self._written = self._asked_steps = 0
         self._last = start.positions
         self._reports: list[StepReport] = []
-        self._parts = [self._first(body, muscles, geometry, start, start_gap, drag, frame)]
+        self._asked: list[tuple[int, int]] = []
+        self.start = self._first(body, muscles, geometry, start, start_gap, drag, frame)
+        """The first part."""
+        self._parts = [self.start]
 
-    def add(self, reports: Sequence[StepReport]) -> None:
-        """Write down the next steps."""
+    def add(self, reports: Sequence[StepReport], *, asked: int = 0) -> None:
+        """Write down the next steps, into which one that was asked for was divided; ``asked`` is the ``digest`` of its
+        objectives.
+        """
         self._reports += reports
+        self._asked += [(self._asked_steps, asked)] * len(reports)
+        self._asked_steps += 1
         if len(self._reports) >= _STEPS_A_PART:
             self._parts.append(self._part())
-            self._write()
+        self._write()
 
     def trajectory(self) -> Trajectory:
         """All steps so far."""
@@ -125,6 +137,7 @@ class Recorder:
     def _part(self) -> dict[str, np.ndarray]:
         """The steps since the last part."""
         reports, self._reports = self._reports, []
+        asked, self._asked = self._asked, []
         starts = [self._last, *(report.state.positions for report in reports)]
         counts = [report.contacts.count for report in reports]
         planes = [self._plane(report.contacts, start) for report, start in zip(reports, starts, strict=False)]
@@ -142,6 +155,12 @@ class Recorder:
             "contact_normal": np.concatenate([report.contacts.axes[:, 0] for report in reports]),
             "contact_force": np.concatenate([np.einsum("na,nai->ni", r.forces, r.contacts.axes) for r in reports]),
             "contact_gap": np.concatenate([report.end_gaps for report in reports]),
+            "contact_point": np.concatenate([report.contacts.points for report in reports]),
+            "contact_load": np.concatenate([report.forces for report in reports]),
+            "asked_step": np.array([step for step, _ in asked]),
+            "asked_digest": np.array([number for _, number in asked], np.uint64),
+            **{name: np.array([getattr(report, name) for report in reports]) for name in REPORTED},
+            **_laps(reports),
         }
         self._last, self._steps = starts[-1], self._steps + len(reports)
         return part
@@ -152,3 +171,10 @@ class Recorder:
         gaps = points @ self._planes[:, :3].T + self._planes[:, 3]
         turned = np.abs(contacts.axes[:, None, 0] - self._planes[None, :, :3]).max(axis=2)
         return np.argmin(np.abs(gaps - contacts.gaps[:, None]) + np.where(turned < 1e-9, 0.0, np.inf), axis=1)
+
+
+def _laps(reports: Sequence[StepReport]) -> dict[str, np.ndarray]:
+    """The ``stages`` (S,) of the steps by name and their ``milliseconds`` (n, S), NaN where a step did without one."""
+    stages = list(dict.fromkeys(stage for report in reports for stage in report.milliseconds))
+    laps = [[report.milliseconds.get(stage, np.nan) for stage in stages] for report in reports]
+    return {"stages": np.array(stages, str), "milliseconds": np.array(laps)}

@@ -15,7 +15,8 @@ from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.planner import STEPS_A_UNIT
 from egs_warp.locomotion.recorder import Recorder
-from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
+from egs_warp.locomotion.replay import Replay, digest
+from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory, StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 
 FRAME_RATE = 60
@@ -84,14 +85,15 @@ def roll_out(
     step: float | None = None,
     place: BodyFrame | None = None,
     parts: Callable[[], Path] | None = None,
+    resume: Path | None = None,
     finished: Callable[[], bool] = lambda: False,
     progress: Callable[[int], object] = lambda frame: None,
 ) -> Simulation:
     """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``.
 
     ``step``: seconds that a solver step takes at most, see ``solver_steps``. ``place`` is where the body lies in its
-    capture; steps are written into the folder that ``parts`` tells as they are done (``Recorder``). ``progress`` is
-    told each frame done.
+    capture; steps are written into the folder that ``parts`` tells as they are done (``Recorder``); those in the folder
+    ``resume`` are not solved again (``Replay``). ``progress`` is told each frame done.
     """
     dt, per_frame = solver_steps(stepper.body, step)
     state, memory = start, stepper.initial_memory()
@@ -109,12 +111,18 @@ def roll_out(
         frame=place,
         folder=parts,
     )
+    replay = Replay(resume, recorder.start, stepper.detector) if resume is not None else None
     for frame in range(frames):
         for _ in range(per_frame):
             objectives = motion.objectives(state, reports[-1] if reports else None, dt)
-            state, memory, done = stepper.advance(state, memory, objectives, dt)
+            asked = digest(objectives)
+            done = replay.step(asked) if replay is not None else []
+            if done:
+                state, memory = done[-1].state, StepMemory.after(done[-1])
+            else:
+                state, memory, done = stepper.advance(state, memory, objectives, dt)
             reports.extend(done)
-            recorder.add(done)
+            recorder.add(done, asked=asked)
         shown.append(len(reports))
         progress(frame)
         resting = resting + 1 if finished() else 0

@@ -39,6 +39,11 @@ class StepMemory:
     activations: np.ndarray
     """(M,) metres."""
 
+    @classmethod
+    def after(cls, report: StepReport) -> StepMemory:
+        """What the step of ``report`` hands on."""
+        return cls(report.contacts.points, report.forces, report.activations)
+
 
 @dataclass(frozen=True)
 class StepReport:
@@ -261,4 +266,4 @@ class LocomotionStepper:
             added_spin=float(np.linalg.norm(problem.spin(internal))),
             milliseconds=clock.milliseconds,
         )
-        return after, StepMemory(result.contacts.points, result.forces, plan.activations), report
+        return after, StepMemory.after(report), report

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import lzma
+import struct
+import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +36,11 @@ CONTACTS = (
 """Arrays of C rows."""
 FIRST_PART = "start.npz"
 """Of a recording that goes on: what never changes, and the state it began at."""
+DAMAGES = (
+    *(OSError, EOFError, RuntimeError, KeyError, IndexError, ValueError, TypeError),
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error),
+)
+"""What reading a damaged file of arrays, or using what it holds, ends in."""
 
 
 @dataclass(frozen=True)
@@ -131,10 +141,7 @@ class Trajectory:
         """
         if not path.is_dir():
             return cls._of(read_arrays(path))
-        parts = [read_arrays(path / FIRST_PART)]
-        for number in range(len(list(path.glob("steps-*.npz")))):
-            parts.append(read_arrays(path / part_name(number)))
-        return cls.joined(parts)
+        return cls.joined([read_arrays(part) for part in (path / FIRST_PART, *part_paths(path))])
 
     @classmethod
     def joined(cls, parts: Sequence[dict[str, np.ndarray]]) -> Trajectory:
@@ -157,6 +164,13 @@ def part_name(number: int) -> str:
     return f"steps-{number:06d}.npz"
 
 
+def part_paths(folder: Path) -> list[Path]:
+    """Files of the steps in the ``folder`` of a recording, in their order; one that is missing among them is named,
+    too.
+    """
+    return [folder / part_name(number) for number in range(len(list(folder.glob("steps-*.npz"))))]
+
+
 def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Write ``arrays`` by name, whole or not at all."""
     with atomic_write(path) as temporary, temporary.open("wb") as stream:
@@ -164,12 +178,15 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """What ``write_arrays`` wrote. Raises ``ValueError`` for a file of another schema."""
-    with np.load(path, allow_pickle=False) as data:
-        schema = int(data["schema"]) if "schema" in data else 1
-        if schema != SCHEMA:
-            raise ValueError(f"it is of schema {schema}, this version reads schema {SCHEMA}")
-        return {name: data[name] for name in data.files if name != "schema"}
+    """What ``write_arrays`` wrote. Raises ``ValueError`` for a file of another schema, and ``DAMAGES``."""
+    with zipfile.ZipFile(path) as archive:
+        # Each member is read whole, which compares its checksum, before anything of it is believed.
+        members = {name.removesuffix(".npy"): BytesIO(archive.read(name)) for name in archive.namelist()}
+    arrays = {name: np.lib.format.read_array(member, allow_pickle=False) for name, member in members.items()}
+    schema = int(arrays.pop("schema", 1))
+    if schema != SCHEMA:
+        raise ValueError(f"it is of schema {schema}, this version reads schema {SCHEMA}")
+    return arrays
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -125,6 +124,7 @@ def animate(
     source: str = "capture",
     notes: tuple[str, ...] = (),
     overwrite: bool = False,
+    resume: bool = False,
     quiet: bool = False,
 ) -> Report:
     """Bring ``cloud`` (scene units) to life and write video, contact sheet, plots, report and trajectory into ``out``.
@@ -134,15 +134,15 @@ def animate(
     the object to the camera; ``shot``: how it is filmed. ``muscles_file``, ``solids``, ``gravity_up``, ``settings``:
     see ``make_creature``; ``forward`` (3,): see ``first_place``. Returns what it wrote as ``report.json``
     (docs/guide/report.md). A folder belongs to one run (``egs_warp.io.run_folder``): one with an earlier run is
-    refused, or that run moved aside (``overwrite``). Raises ``UserError`` for bad input, before any file of an earlier
-    run is touched.
+    refused, or that run moved aside (``overwrite``), or gone on with if it was cut off (``resume``): with the same
+    arguments to the same bits. Raises ``UserError`` for bad input, before any file of an earlier run is touched.
     """
     options, shot = options or AnimateOptions(), shot or Shot()
     shot.check()
     asked = script(motion, **options.targets())
     cut_off = asked.frames()
     ffmpeg_program()
-    with run_folder(out, overwrite=overwrite) as run:
+    with run_folder(out, overwrite=overwrite, resume=resume) as run:
         with tqdm(desc="prepare", bar_format="{desc}, {elapsed}", disable=quiet) as bar:
             creature = make_creature(
                 cloud,
@@ -165,11 +165,11 @@ def animate(
                 frames=options.frames,
                 forward=forward,
                 parts=lambda: run.file(PARTS),
+                resume=_recorded(run),
                 progress=lambda _: bar.update(),
             )
         # Whatever becomes of the film, the simulation is not lost.
         performance.trajectory.save(run.file("trajectory.npz"))
-        shutil.rmtree(run.path / PARTS, ignore_errors=True)
         books = ledger(performance.trajectory)
         draw_plots(run.file("plots.png"), performance.trajectory, books)
         with atomic_write(run.file("cage.vtu")) as temporary:
@@ -213,6 +213,12 @@ def animate(
         if not isinstance(out, RunFolder):
             run.finish()
     return report
+
+
+def _recorded(run: RunFolder) -> Path | None:
+    """Where the steps are that a run which goes on has done already."""
+    folder = run.path / PARTS
+    return folder if run.resumed and any(folder.glob("*.npz")) else None
 
 
 def _numbers(vector: np.ndarray | None) -> tuple[float, ...]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,13 +19,13 @@ from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io.capture import read_capture
 from egs_warp.io.text import parse_json, read_text
 from egs_warp.locomotion.rollout import FRAME_RATE
-from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.locomotion.trajectory import DAMAGES, Trajectory
 from egs_warp.pipelines import drawn
 from egs_warp.pipelines.drawn import DrawnCreature
 from egs_warp.pipelines.shot import nearest_steps
 
 PARTS = "trajectory.parts"
-"""Folder that takes the steps of a run as they are done; it goes when ``trajectory.npz`` is there."""
+"""Folder that takes the steps of a run as they are done; it goes when the run has finished."""
 
 
 def read_trajectory(path: Path) -> Trajectory:
@@ -38,9 +37,12 @@ def read_trajectory(path: Path) -> Trajectory:
         return Trajectory.load(path)
     except FileNotFoundError as error:
         if not path.is_dir() and (path.parent / PARTS).is_dir():
-            raise UserError(f"{path}: is missing, the run was cut off; what it did is in {PARTS}") from error
+            raise UserError(
+                f"{path}: is missing, the run was cut off; egs-warp resume {path.parent} goes on"
+                f" (what it did is in {PARTS})"
+            ) from error
         raise UserError(f"{path}: is missing; give the folder that egs-warp animate wrote") from error
-    except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except DAMAGES as error:
         raise UserError(f"{path}: is no trajectory ({error}); run egs-warp animate again, which writes it") from error
 
 

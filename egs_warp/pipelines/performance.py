@@ -79,13 +79,15 @@ def simulate(
     forward: np.ndarray | None = None,
     step: float | None = None,
     parts: Callable[[], Path] | None = None,
+    resume: Path | None = None,
     progress: Callable[[int], object] = lambda frame: None,
 ) -> Performance:
     """Run ``motion`` for ``frames`` at 60 Hz, or else until the body has come to rest or the motion is cut off.
 
     ``forward`` (3,) is the way of the motion, the long axis of the footprint if not given; ``step`` the seconds of a
-    solver step, if not the usual; ``parts`` tells the folder that takes the steps as they are done. ``progress`` is
-    told each frame done. Raises ``UserError`` for a motion that the body cannot do.
+    solver step, if not the usual; ``parts`` tells the folder that takes the steps as they are done, ``resume`` is
+    that of a run that was cut off and goes on. ``progress`` is told each frame done. Raises ``UserError`` for a motion
+    that the body cannot do, and a folder that another run has left.
     """
     place = first_place(creature, forward, step=step)
     motion.check(place)
@@ -101,6 +103,7 @@ def simulate(
         step=step,
         place=creature.frame,
         parts=parts,
+        resume=resume,
         finished=lambda: frames is None and sequence.finished,
         progress=progress,
     )

@@ -1,0 +1,140 @@
+"""``egs-warp resume``: a run that is killed at any moment goes on to the bits of one that was not."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from egs_warp import cli
+from egs_warp.assets import pawn, scene, stool
+from egs_warp.io import write_ply
+from egs_warp.io.run_folder import MANIFEST
+
+PATIENCE = 300.0
+"""Seconds that a run may take on a busy machine."""
+SMALL = ("--up", "z", "--size", "32")
+COMMANDS = {
+    "jump": ("pawn.ply", "--frames", "45"),
+    "hops": ("pawn.ply", "--motion", "hop 0.3 0.2 x2, jump", "--frames", "110"),
+    "walk": ("stool.ply", "--motion", "walk 2", "--frames", "60"),
+    "keys": ("pawn.ply", "--motion", "trajectory keys.json", "--camera", "follow", "--background", "transparent"),
+    "scene": ("room.ply", "--object", "0,0,0.5", "--frames", "20"),
+}
+KEYS = [{"time": 0.4, "part": "head", "quantity": "position", "value": [0, 0, -0.05]}]
+
+
+def command(*arguments: str | Path) -> list[str]:
+    return [sys.executable, "-m", "tests.support.coarse", *map(str, arguments)]
+
+
+def made(folder: Path) -> Path:
+    """What the commands take."""
+    write_ply(folder / "pawn.ply", pawn(gaussian_count=2000, device="cpu").cloud)
+    (folder / "keys.json").write_text(json.dumps(KEYS))
+    return folder
+
+
+def animate(name: str, folder: Path, out: Path) -> list[str]:
+    capture, *flags = COMMANDS[name]
+    given = [str(folder / flag) if flag.endswith(".ply") else flag for flag in flags]
+    given = [flag.replace("keys.json", str(folder / "keys.json")) for flag in given]
+    return command("animate", folder / capture, *SMALL, *given, "--out", out)
+
+
+def bits(folder: Path) -> dict[str, bytes | str]:
+    """Of all files, but for the milliseconds of the report and so the checksum of it."""
+    found: dict[str, bytes | str] = {path.name: path.read_bytes() for path in folder.iterdir()}
+    report = json.loads(found["report.json"])
+    found["report.json"] = json.dumps(report | {"timing": None})
+    manifest = json.loads(found[MANIFEST])
+    found[MANIFEST] = json.dumps(manifest | {"files": manifest["files"] | {"report.json": None}})
+    return found
+
+
+def finishes(arguments: Sequence[str]) -> None:
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=PATIENCE)
+    assert done.returncode == 0, done.stderr
+
+
+def ended_by(arguments: Sequence[str], number: int, ready: Path, after: float) -> tuple[int, str]:
+    """Status and message of a run that gets a signal ``after`` seconds from when the file ``ready`` is there."""
+    run = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    give_up = time.monotonic() + PATIENCE
+    while not ready.exists() and run.poll() is None and time.monotonic() < give_up:
+        time.sleep(0.01)
+    time.sleep(after)
+    run.send_signal(number)
+    _, said = run.communicate(timeout=PATIENCE)
+    return run.returncode, said
+
+
+def test_a_run_that_is_killed_again_and_again(tmp_path: Path) -> None:
+    """Before it has a part, between parts, in the film; by SIGKILL and by Ctrl-C."""
+    folder, whole, out = made(tmp_path), tmp_path / "whole", tmp_path / "out"
+    finishes(animate("jump", folder, whole))
+    parts = out / "trajectory.parts"
+    moments = random.Random(18)
+    first, again = animate("jump", folder, out), command("resume", out)
+    assert ended_by(first, signal.SIGKILL, parts / "start.npz", 0.2 * moments.random())[0] == -signal.SIGKILL
+    for ready in (parts / "steps-000000.npz", parts / "steps-000002.npz"):
+        status, said = ended_by(again, signal.SIGINT, ready, 0.2 * moments.random())
+        assert status == 130
+        assert said.splitlines()[-1] == "egs-warp: stopped; finished files are whole, unfinished ones are gone"
+        assert not [name for name in os.listdir(out) if name.startswith(".egs-")]
+    assert ended_by(again, signal.SIGKILL, out / "plots.png", 0.0)[0] == -signal.SIGKILL
+    assert not json.loads((out / MANIFEST).read_text())["finished"]
+    finishes(again)
+    assert bits(out) == bits(whole)
+    done = subprocess.run(again, capture_output=True, text=True, timeout=PATIENCE)
+    assert (done.returncode, done.stdout) == (0, f"{out}: this run has finished\n")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMANDS)
+def test_twenty_random_moments(name: str, tmp_path: Path) -> None:
+    """SIGKILL at any time, preparation and film included; a run that had not begun to write is begun again."""
+    folder, whole = made(tmp_path), tmp_path / "whole"
+    write_ply(folder / "stool.ply", stool(device="cpu").cloud)
+    write_ply(folder / "room.ply", scene("pawn", device="cpu").whole()[0])
+    began = time.monotonic()
+    finishes(animate(name, folder, whole))
+    length = time.monotonic() - began
+    moments = random.Random(name)
+    for number in range(20):
+        out = tmp_path / str(number)
+        ended_by(animate(name, folder, out), signal.SIGKILL, folder, length * moments.random())
+        if (out / MANIFEST).exists():
+            finishes(command("resume", out))
+        else:
+            finishes(animate(name, folder, out))
+        assert bits(out) == bits(whole), number
+
+
+def test_what_cannot_go_on_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def told(folder: Path) -> str:
+        assert cli.main(["resume", str(folder)]) == 2
+        return capsys.readouterr().err
+
+    out, manifest = tmp_path / "out", tmp_path / "out" / MANIFEST
+    assert told(out) == f"egs-warp: {out}: no run has begun to write here; begin it\n"
+    out.mkdir()
+    content = {"schema": 1, "version": "0.0.1", "finished": False, "files": {"run.yaml": None}}
+    manifest.write_text(json.dumps(content))
+    assert "the run was begun by egs-warp 0.0.1, this is 0.1.0, whose steps are others; begin the run" in told(out)
+    for broken in ("[]", "{}", json.dumps({"files": {"../a": None}})):
+        manifest.write_text(broken)
+        assert told(out) == f"egs-warp: {manifest}: is no manifest of a run; begin the run again\n"
+    manifest.write_text(json.dumps(content | {"version": "0.1.0"}))
+    assert "run.yaml: is missing, the run was cut off before its first step; begin it again" in told(out)
+    write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=50, device="cpu").cloud)
+    (out / "run.yaml").write_text("capture: ../pawn.ply\nup: z\ncapture_sha256: 0\n")
+    assert "pawn.ply: is not the file that the run had; bring that back, or begin the run again" in told(out)

@@ -1,0 +1,174 @@
+"""A run that was cut off goes on to the bits of one that never was; what does not fit it is refused in one line."""
+
+from __future__ import annotations
+
+import errno
+import os
+from dataclasses import asdict
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from egs_warp.errors import UserError
+from egs_warp.locomotion.objectives import LoadObjective, SpinObjective, held_contacts, node_velocities
+from egs_warp.locomotion.replay import Replay, digest
+from egs_warp.locomotion.rollout import Simulation, roll_out
+from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
+from egs_warp.motions.script import motion
+from egs_warp.motions.sequence import MotionSequence
+from tests.support.creatures import CoarseCreature, coarse_creature
+from tests.support.meshes import box_mesh
+from tests.support.places import FORWARD
+from tests.support.slides import slide
+
+FRAMES, CUT = 36, 28
+"""The block is in its thrust where the run is cut off."""
+
+
+class KilledError(Exception):
+    """The run ends here."""
+
+
+def block() -> CoarseCreature:
+    """45 nodes, made anew: nothing of an earlier run is left in it."""
+    return coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD)
+
+
+def run(made: CoarseCreature, script: str = "jump", *, killed_at: int | None = None, **given: Any) -> Simulation:
+    def progress(frame: int) -> None:
+        if frame == killed_at:
+            raise KilledError
+
+    sequence = MotionSequence(made.place, motion(script).parts(made.place.body.height))
+    geometry = made.stepper.geometry
+    return roll_out(made.stepper, geometry, made.start, sequence, frames=FRAMES, progress=progress, **given)
+
+
+@cache
+def uninterrupted() -> Simulation:
+    return run(block())
+
+
+def cut_off(parts: Path) -> None:
+    with pytest.raises(KilledError):
+        run(block(), killed_at=CUT, parts=lambda: parts)
+
+
+def same_steps(one: tuple[StepReport, ...], other: tuple[StepReport, ...]) -> bool:
+    """All but the milliseconds."""
+
+    def bits(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {name: bits(v) for name, v in value.items() if name != "milliseconds"}
+        return value.toarray().tobytes() if hasattr(value, "toarray") else np.asarray(value).tobytes()
+
+    return len(one) == len(other) and all(bits(asdict(a)) == bits(asdict(b)) for a, b in zip(one, other, strict=True))
+
+
+def test_a_run_goes_on_to_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only what had not been written down is solved, by a body that is made anew."""
+    cut_off(tmp_path)
+    whole = uninterrupted()
+    there = sorted(os.listdir(tmp_path))
+    assert there == ["start.npz", "steps-000000.npz", "steps-000001.npz"]
+    solved: list[float] = []
+    advance = LocomotionStepper.advance
+
+    def counted(stepper: LocomotionStepper, state: Any, *rest: Any) -> Any:
+        solved.append(state.time)
+        return advance(stepper, state, *rest)
+
+    monkeypatch.setattr(LocomotionStepper, "advance", counted)
+    resumed = run(block(), parts=lambda: tmp_path, resume=tmp_path)
+    assert len(solved) == len(whole.reports) - 20
+    assert same_steps(resumed.reports, whole.reports)
+    assert (resumed.frames == whole.frames).all()
+    for name in whole.trajectory.__dataclass_fields__:
+        assert np.array_equal(getattr(resumed.trajectory, name), getattr(whole.trajectory, name)), name
+    # One that was cut off after its last step, too.
+    solved.clear()
+    assert same_steps(run(block(), parts=lambda: tmp_path, resume=tmp_path).reports, whole.reports) and solved == []
+
+
+def test_parts_of_divided_steps_are_put_together_again(tmp_path: Path) -> None:
+    """Steps that did not converge at once: what was asked is asked once for all of their parts."""
+    slid = slide()
+    recorder = slid.recorder(folder=lambda: tmp_path)
+    reports = slid.reports
+    for asked, (first, last) in enumerate([(0, 1), (1, 5), (5, 6), (6, 14), (14, 24)]):
+        recorder.add(reports[first:last], asked=asked)
+    recorder.trajectory()
+    replay = Replay(tmp_path, recorder.start, slid.stepper.detector)
+    found = [replay.step(asked) for asked in range(5)]
+    assert [len(done) for done in found] == [1, 4, 1, 8, 10] and replay.step(5) == []
+    assert same_steps(tuple(report for done in found for report in done), reports)
+    assert found[1][0].milliseconds == reports[1].milliseconds
+
+
+def test_another_run_is_refused(tmp_path: Path) -> None:
+    cut_off(tmp_path)
+    other = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.01)), forward=FORWARD)
+    for made, script in ((other, "jump"), (block(), "jump 0.6")):
+        with pytest.raises(UserError, match="does not fit the run that is to go on: capture, flags, program or"):
+            run(made, script, parts=lambda: tmp_path, resume=tmp_path)
+
+
+def test_a_damaged_part_is_told_and_can_be_left_out(tmp_path: Path) -> None:
+    cut_off(tmp_path)
+    second = tmp_path / "steps-000001.npz"
+    good = second.read_bytes()
+    for bad in (good[:-40], good[: len(good) // 2] + b"\x55" + good[len(good) // 2 + 1 :], b"", b"text"):
+        second.write_bytes(bad)
+        with pytest.raises(UserError, match=r"steps-000001\.npz: is damaged \(.*\); remove it and the parts after it"):
+            run(block(), parts=lambda: tmp_path, resume=tmp_path)
+    second.unlink()
+    assert same_steps(run(block(), parts=lambda: tmp_path, resume=tmp_path).reports, uninterrupted().reports)
+    (tmp_path / "steps-000000.npz").unlink()
+    with pytest.raises(UserError, match=r"steps-000000\.npz: is missing; remove the parts after it to go on"):
+        run(block(), parts=lambda: tmp_path, resume=tmp_path)
+    (tmp_path / "start.npz").unlink()
+    with pytest.raises(UserError, match=r"start\.npz: is missing; begin the run again"):
+        run(block(), parts=lambda: tmp_path, resume=tmp_path)
+
+
+def test_a_disk_that_is_full_at_a_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One line; what was written before stays, and the run goes on from it."""
+    replace = os.replace
+    for number in (0, 2):
+        parts, calls = tmp_path / str(number), iter(range(100))
+
+        def failing(source: Path, target: Path, *, number: int = number, calls: Any = calls) -> None:
+            if next(calls) == number:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            replace(source, target)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "replace", failing)
+            with pytest.raises(UserError, match=r"npz: cannot be written \(No space left on device\)"):
+                run(block(), parts=lambda parts=parts: parts)
+        assert len(os.listdir(parts)) == number
+        resume = parts if number else None
+        again = run(block(), parts=lambda parts=parts: parts, resume=resume)
+        assert same_steps(again.reports, uninterrupted().reports)
+
+
+def test_a_digest_tells_objectives_apart() -> None:
+    slid = slide()
+    body, contacts = slid.stepper.body, slid.reports[-1].contacts
+    still = np.zeros((len(body.node_mass), 3))
+    many = [
+        [],
+        [SpinObjective(np.zeros(3), 1.0)],
+        [SpinObjective(np.array([0.0, 0.0, 1e-300]), 1.0)],
+        [SpinObjective(np.zeros(3), 1.0 + 1e-15)],
+        [node_velocities(body, still, 1.0)],
+        [LoadObjective(np.array([1, 2]), 1.0)],
+        [LoadObjective(np.array([1, 3]), 1.0)],
+        [held_contacts(contacts, np.ones(contacts.count), 1.0)],
+        [held_contacts(contacts, np.arange(contacts.count), 1.0)],
+    ]
+    assert len({digest(objectives) for objectives in many}) == len(many)
+    assert digest(many[4]) == digest([node_velocities(body, still.copy(), 1.0)])
