@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from egs_warp.pipelines.report import Report
 
 
+FALLEN = 3
+"""Exit status of a run that has written its files, but whose body has fallen or could not be simulated on."""
 EXAMPLES = (
     "pawn.ply --up z --out out/jump",
     'scan.spz --motion "hop x3, twist 180" --camera follow --size 1280x720 --out out/hop',
@@ -107,7 +109,7 @@ def animated(chosen: argparse.Namespace) -> int:
     report, more = _animate_scene(chosen) if chosen.object is not None else _animate_capture(chosen)
     print(report.summary())
     print(f"wrote the video, sheet.png, plots.png, report.json, trajectory.npz{more} into {chosen.out}")
-    return 0
+    return FALLEN if report.state.bad else 0
 
 
 def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:

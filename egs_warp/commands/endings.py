@@ -1,6 +1,7 @@
 """How a program ends: whatever stops it, it says one line, leaves no half-written file and has a status of its own.
 
-0 done, 1 the machine refused (memory, disk), 2 bad input, 130 stopped by Ctrl-C, 143 asked to end (SIGTERM).
+0 done, 1 the machine refused (memory, disk), 2 bad input, 3 written, but fallen or stopped (``animate``), 130 ended by
+Ctrl-C, 143 asked to end (SIGTERM).
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from egs_warp.commands.animate import animated
+from egs_warp.commands.animate import FALLEN, animated
 from egs_warp.commands.config import NAME, changed_capture, with_config
 from egs_warp.commands.flags import Commands, named_path
 from egs_warp.errors import UserError
@@ -27,11 +27,18 @@ def add_parser(commands: Commands) -> None:
 
 def _resume(chosen: argparse.Namespace) -> int:
     from egs_warp.io.run_folder import has_finished
+    from egs_warp.io.text import parse_json, read_text
+    from egs_warp.pipelines.ending import State
 
     folder: Path = chosen.folder
     if has_finished(folder):
+        report = parse_json(read_text(folder / "report.json"), folder / "report.json")
         print(f"{folder}: this run has finished")
-        return 0
+        return (
+            FALLEN
+            if isinstance(report, dict) and report.get("state") in [state.value for state in State if state.bad]
+            else 0
+        )
     flags = folder / NAME
     if not flags.is_file():
         raise UserError(f"{flags}: is missing, the run was cut off before its first step; begin it again")

@@ -172,4 +172,6 @@ def _first_frequency(assembly: ElasticAssembly, node_mass: np.ndarray, free: np.
     mass = sparse.diags(np.repeat(node_mass, 3)[kept]).tocsc()
     start = np.ones(len(kept))
     value = sparse_linalg.eigsh(stiffness, k=1, M=mass, sigma=0.0, v0=start, return_eigenvectors=False)[0]
+    if not value > 0.0:
+        raise ArgumentError("nodes", "the cage has parts that hang on a corner or an edge alone; give it more")
     return float(np.sqrt(value))

@@ -17,6 +17,10 @@ _NEGLIGIBLE = 1e-3
 """Of the largest T / L of the muscles: those below it do not count in a tangent."""
 
 
+class UnsolvableStepError(ArithmeticError):
+    """A step's equations cannot be solved."""
+
+
 @dataclass(frozen=True)
 class StepProblem:
     """M (v - v0) + dt alpha M v = dt (P^T f(x + dt v) + M g + f_contact), f of elasticity, damping and muscles.
@@ -107,7 +111,7 @@ class StepProblem:
 
     def tangent(self, factors: SparseFactors, velocities: np.ndarray, tension: MuscleTension | None) -> Tangent:
         """The derivative of the residual at ``velocities`` (N, 3), or a definite one near it, factored by
-        ``factors``.
+        ``factors``. Raises ``UnsolvableStepError`` where it has no factors.
         """
         definite = factors.update(self._entries(velocities, projected=False))
         across, rates = np.zeros((len(self.turns), 0)), np.zeros(0)
@@ -125,6 +129,8 @@ class StepProblem:
                 return Tangent(self, factors, across, through, np.linalg.inv(small))
         if not definite:
             factors.update(self._entries(velocities, projected=True))
+        if not factors.ready:
+            raise UnsolvableStepError("the tangent is singular or not finite")
         nothing = np.zeros((len(self.turns), 0))
         return Tangent(self, factors, nothing, nothing, np.zeros((0, 0)))
 

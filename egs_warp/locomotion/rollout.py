@@ -11,6 +11,7 @@ import numpy as np
 
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.fem.step_problem import UnsolvableStepError
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.planner import STEPS_A_UNIT
@@ -41,6 +42,8 @@ class Simulation:
     reports: tuple[StepReport, ...]
     frames: np.ndarray
     """(n,) index into the trajectory's times for each frame of the video."""
+    stopped: bool = False
+    """Whether it ended at a step that could not be solved."""
 
 
 def solver_steps(body: SoftBody, step: float | None = None) -> tuple[float, int]:
@@ -89,7 +92,8 @@ def roll_out(
     finished: Callable[[], bool] = lambda: False,
     progress: Callable[[int], object] = lambda frame: None,
 ) -> Simulation:
-    """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``.
+    """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``, or a step
+    cannot be solved.
 
     ``step``: seconds that a solver step takes at most, see ``solver_steps``. ``place`` is where the body lies in its
     capture; steps are written into the folder that ``parts`` tells as they are done (``Recorder``); those in the folder
@@ -100,6 +104,7 @@ def roll_out(
     reports: list[StepReport] = []
     shown = [0]
     resting = 0
+    stopped = False
     gaps, _ = stepper.detector.gaps(start.positions)
     recorder = Recorder(
         stepper.body,
@@ -117,15 +122,28 @@ def roll_out(
             objectives = motion.objectives(state, reports[-1] if reports else None, dt)
             asked = digest(objectives)
             done = replay.step(asked) if replay is not None else []
-            if done:
-                state, memory = done[-1].state, StepMemory.after(done[-1])
-            else:
-                state, memory, done = stepper.advance(state, memory, objectives, dt)
+            done = done or _advanced(stepper, state, memory, objectives, dt)
+            stopped = not done
+            if stopped:
+                break
+            state, memory = done[-1].state, StepMemory.after(done[-1])
             reports.extend(done)
             recorder.add(done, asked=asked)
-        shown.append(len(reports))
+        if shown[-1] < len(reports):
+            shown.append(len(reports))
         progress(frame)
         resting = resting + 1 if finished() else 0
-        if resting == REST_FRAMES:
+        if stopped or resting == REST_FRAMES:
             break
-    return Simulation(recorder.trajectory(), tuple(reports), np.array(shown))
+    return Simulation(recorder.trajectory(), tuple(reports), np.array(shown), stopped)
+
+
+def _advanced(
+    stepper: LocomotionStepper, state: BodyState, memory: StepMemory, objectives: Sequence[AnyObjective], dt: float
+) -> list[StepReport]:
+    """A step in the parts it was divided into; none if it cannot be solved, nor any part of it."""
+    try:
+        _, _, done = stepper.advance(state, memory, objectives, dt)
+    except (UnsolvableStepError, np.linalg.LinAlgError):
+        return []
+    return done if any(report.converged for report in done) else []

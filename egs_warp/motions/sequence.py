@@ -137,13 +137,16 @@ class MotionSequence:
 
     def cut_short(self) -> list[str]:
         """What the last frame kept from its end, for the user."""
-        notes = []
-        if self.done and not self._resting:
-            notes.append(f"{self.done[-1].name} was cut off before it came to rest; give more frames")
-        if self._parts:
-            names = ", ".join(part.name for part in self._parts)
-            notes.append(f"{len(self._parts)} of {self._count} motions did not begin: {names}")
-        return notes
+        if not self.done or self._resting:
+            return self.not_begun()
+        return [f"{self.done[-1].name} was cut off before it came to rest; give more frames", *self.not_begun()]
+
+    def not_begun(self) -> list[str]:
+        """What did not begin, for the user."""
+        if not self._parts:
+            return []
+        names = ", ".join(part.name for part in self._parts)
+        return [f"{len(self._parts)} of {self._count} motions did not begin: {names}"]
 
     def spans(self, time: np.ndarray) -> list[tuple[int, int]]:
         """First and last index into ``time`` (F+1,) of each motion that was begun."""

@@ -197,7 +197,7 @@ def animate(
             muscles=None if muscles_file is None else Path(muscles_file).name,
             solids=len(solids),
         )
-        notes = (*notes, *performance.sequence.cut_short())
+        notes = (*notes, *performance.cut_short())
         simulation = performance.simulation
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),
@@ -208,6 +208,7 @@ def animate(
             notes=notes,
             seed=options.seed,
             asked=asked_for.to_json(),
+            ending=performance.ending,
         )
         report.write(run.file("report.json"))
         if not isinstance(out, RunFolder):

@@ -12,9 +12,11 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.frames import box_corners
 from egs_warp.locomotion.rollout import FRAME_RATE, Simulation, roll_out
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.fall import FallWatch
 from egs_warp.motions.script import Script
 from egs_warp.motions.sequence import MotionSequence, Place
 from egs_warp.pipelines.creature import FILMED_FROM, Creature, first_place
+from egs_warp.pipelines.ending import Ending
 from egs_warp.pipelines.planned import planned_com
 
 
@@ -28,6 +30,18 @@ class Performance:
     sequence: MotionSequence
     """The motions that it went through."""
     simulation: Simulation
+    fallen: str | None = None
+    """How it was told that the creature has fallen, if it has."""
+
+    @property
+    def ending(self) -> Ending:
+        """How the last motion ended."""
+        return Ending(self.fallen, self.simulation.stopped)
+
+    def cut_short(self) -> list[str]:
+        """What the end kept from being done, for the user."""
+        ended = self.fallen is not None or self.simulation.stopped
+        return self.sequence.not_begun() if ended else self.sequence.cut_short()
 
     @property
     def trajectory(self) -> Trajectory:
@@ -82,7 +96,8 @@ def simulate(
     resume: Path | None = None,
     progress: Callable[[int], object] = lambda frame: None,
 ) -> Performance:
-    """Run ``motion`` for ``frames`` at 60 Hz, or else until the body has come to rest or the motion is cut off.
+    """Run ``motion`` for ``frames`` at 60 Hz, or else until the body has come to rest or fallen, or the motion is cut
+    off.
 
     ``forward`` (3,) is the way of the motion, the long axis of the footprint if not given; ``step`` the seconds of a
     solver step, if not the usual; ``parts`` tells the folder that takes the steps as they are done, ``resume`` is
@@ -92,21 +107,22 @@ def simulate(
     place = first_place(creature, forward, step=step)
     motion.check(place)
     sequence = MotionSequence(place, motion.parts(creature.body.height))
+    watch = FallWatch(sequence, place)
     # A frame is as long as a step that is longer than it.
     share = 1.0 if step is None else min(1.0, 1.0 / (FRAME_RATE * step))
     simulation = roll_out(
         creature.stepper,
         creature.geometry,
         creature.start,
-        sequence,
+        watch,
         frames=frames or round(share * motion.frames()),
         step=step,
         place=creature.frame,
         parts=parts,
         resume=resume,
-        finished=lambda: frames is None and sequence.finished,
+        finished=lambda: frames is None and watch.finished,
         progress=progress,
     )
     trajectory = simulation.trajectory
     trajectory = trajectory.with_plan(planned_com(sequence, creature.body, trajectory))
-    return Performance(creature, place, sequence, replace(simulation, trajectory=trajectory))
+    return Performance(creature, place, sequence, replace(simulation, trajectory=trajectory), watch.fallen)

@@ -19,6 +19,7 @@ from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Reached, Trajectory, measure
 from egs_warp.motions.sequence import Done, spans_of
 from egs_warp.pipelines.creature import Creature
+from egs_warp.pipelines.ending import Ending, State
 from egs_warp.version import __version__
 
 if TYPE_CHECKING:
@@ -48,6 +49,7 @@ class MotionReport:
     planned: DataclassInstance
     """The record of its state machine."""
     reached: Reached
+    state: State
     also_reached: DataclassInstance | None
     """The record of what only such a motion is measured by."""
     notes: tuple[str, ...]
@@ -60,6 +62,7 @@ class MotionReport:
             "asked": dict(self.asked),
             "planned": asdict(self.planned),
             "reached": {**asdict(self.reached), **also},
+            "state": self.state.value,
             "notes": list(self.notes),
         }
 
@@ -186,11 +189,17 @@ class Report:
     """Everything else that was asked."""
     versions: Mapping[str, str] = field(default_factory=versions)
 
+    @property
+    def state(self) -> State:
+        """How the run ended."""
+        return State.worst(tuple(motion.state for motion in self.motion))
+
     def to_json(self) -> dict[str, Any]:
         """The whole report, ready for JSON."""
         return {
             "schema": SCHEMA_VERSION,
             "source": self.source,
+            "state": self.state.value,
             "asked": dict(self.asked),
             "motion": [motion.to_json() for motion in self.motion],
             "audit": asdict(self.audit),
@@ -258,25 +267,17 @@ def report_of_run(
     notes: Sequence[str],
     seed: int,
     asked: Mapping[str, Any],
+    ending: Ending | None = None,
 ) -> Report:
     """Of the motions ``done`` on a ``trajectory`` with its ``books``; ``frames`` (n,) are indices into its times.
+    ``ending`` says what ended the last motion before its time.
 
     ``drawn`` splats are in its pictures, ``drawing`` are the milliseconds of each by stage.
     """
     mesh = creature.cage.mesh
     return Report(
         source=source,
-        motion=tuple(
-            MotionReport(
-                entry.name,
-                entry.asked,
-                entry.motion.planned(),
-                measure(trajectory, first=first, last=last),
-                entry.motion.reached(trajectory, first, last),
-                tuple(entry.motion.notes()),
-            )
-            for entry, (first, last) in zip(done, spans_of(done, trajectory.time), strict=True)
-        ),
+        motion=_motion_reports(trajectory, done, ending or Ending()),
         audit=audit(trajectory, energy=books, newton_unconverged=sum(not step.converged for step in steps)),
         energy=EnergySums.of(books),
         qp=QpCounts.of(steps, frames),
@@ -291,6 +292,17 @@ def report_of_run(
         seed=seed,
         asked=asked,
     )
+
+
+def _motion_reports(trajectory: Trajectory, done: Sequence[Done], ending: Ending) -> tuple[MotionReport, ...]:
+    reports = []
+    for entry, (first, last) in zip(done, spans_of(done, trajectory.time), strict=True):
+        reached = measure(trajectory, first=first, last=last)
+        state, why = ending.of(entry, reached, last=entry is done[-1])
+        also = entry.motion.reached(trajectory, first, last)
+        notes = (*entry.motion.notes(), *why)
+        reports.append(MotionReport(entry.name, entry.asked, entry.motion.planned(), reached, state, also, notes))
+    return tuple(reports)
 
 
 def write_report(path: Path, report: Mapping[str, Any]) -> None:

@@ -21,11 +21,13 @@ from egs_warp.io.run_folder import MANIFEST
 
 PATIENCE = 300.0
 """Seconds that a run may take on a busy machine."""
+MOMENTS = 20
+"""At which each command is killed once."""
 SMALL = ("--up", "z", "--size", "32")
 COMMANDS = {
     "jump": ("pawn.ply", "--frames", "45"),
     "hops": ("pawn.ply", "--motion", "hop 0.3 0.2 x2, jump", "--frames", "110"),
-    "walk": ("stool.ply", "--motion", "walk 2", "--frames", "60"),
+    "walk": ("stool.ply", "--motion", "walk 2", "--frames", "20"),
     "keys": ("pawn.ply", "--motion", "trajectory keys.json", "--camera", "follow", "--background", "transparent"),
     "scene": ("room.ply", "--object", "0,0,0.5", "--frames", "20"),
 }
@@ -60,9 +62,11 @@ def bits(folder: Path) -> dict[str, bytes | str]:
     return found
 
 
-def finishes(arguments: Sequence[str]) -> None:
+def finishes(arguments: Sequence[str]) -> int:
+    """Its status: a coarse body may fall."""
     done = subprocess.run(arguments, capture_output=True, text=True, timeout=PATIENCE)
-    assert done.returncode == 0, done.stderr
+    assert done.returncode in (0, 3), done.stderr
+    return done.returncode
 
 
 def ended_by(arguments: Sequence[str], number: int, ready: Path, after: float) -> tuple[int, str]:
@@ -80,7 +84,7 @@ def ended_by(arguments: Sequence[str], number: int, ready: Path, after: float) -
 def test_a_run_that_is_killed_again_and_again(tmp_path: Path) -> None:
     """Before it has a part, between parts, in the film; by SIGKILL and by Ctrl-C."""
     folder, whole, out = made(tmp_path), tmp_path / "whole", tmp_path / "out"
-    finishes(animate("jump", folder, whole))
+    assert finishes(animate("jump", folder, whole)) == 0
     parts = out / "trajectory.parts"
     moments = random.Random(18)
     first, again = animate("jump", folder, out), command("resume", out)
@@ -92,7 +96,7 @@ def test_a_run_that_is_killed_again_and_again(tmp_path: Path) -> None:
         assert not [name for name in os.listdir(out) if name.startswith(".egs-")]
     assert ended_by(again, signal.SIGKILL, out / "plots.png", 0.0)[0] == -signal.SIGKILL
     assert not json.loads((out / MANIFEST).read_text())["finished"]
-    finishes(again)
+    assert finishes(again) == 0
     assert bits(out) == bits(whole)
     done = subprocess.run(again, capture_output=True, text=True, timeout=PATIENCE)
     assert (done.returncode, done.stdout) == (0, f"{out}: this run has finished\n")
@@ -100,22 +104,23 @@ def test_a_run_that_is_killed_again_and_again(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMMANDS)
-def test_twenty_random_moments(name: str, tmp_path: Path) -> None:
+def test_random_moments(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """SIGKILL at any time, preparation and film included; a run that had not begun to write is begun again."""
     folder, whole = made(tmp_path), tmp_path / "whole"
+    if name == "walk":
+        # A coarser stool has no four feet.
+        monkeypatch.setenv("EGS_WARP_TEST_NODES", "500")
     write_ply(folder / "stool.ply", stool(device="cpu").cloud)
     write_ply(folder / "room.ply", scene("pawn", device="cpu").whole()[0])
     began = time.monotonic()
-    finishes(animate(name, folder, whole))
+    status = finishes(animate(name, folder, whole))
     length = time.monotonic() - began
     moments = random.Random(name)
-    for number in range(20):
+    for number in range(MOMENTS):
         out = tmp_path / str(number)
         ended_by(animate(name, folder, out), signal.SIGKILL, folder, length * moments.random())
-        if (out / MANIFEST).exists():
-            finishes(command("resume", out))
-        else:
-            finishes(animate(name, folder, out))
+        begun = (out / MANIFEST).exists()
+        assert finishes(command("resume", out) if begun else animate(name, folder, out)) == status
         assert bits(out) == bits(whole), number
 
 

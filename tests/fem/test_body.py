@@ -14,7 +14,7 @@ from egs_warp.errors import UserError
 from egs_warp.fem.body import GRAVITY, SoftBody, make_body
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
-from tests.support.meshes import block_mesh
+from tests.support.meshes import block_mesh, box_mesh
 
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 
@@ -85,3 +85,15 @@ def test_a_height_that_no_body_has_is_refused(scale: float) -> None:
         UserError, match=r"metres_per_unit: the body is .* m high; choose it so that this is from 0.001"
     ):
         make_body(TetMesh(mesh.nodes * scale, mesh.tets), FLOOR, device="cpu")
+
+
+def test_a_body_that_hangs_on_an_edge_is_refused() -> None:
+    """Two boxes that share an edge are hinged: the upper one swings free, which no damping of a first mode can hold."""
+    box = box_mesh((1, 1, 1), (1.0, 1.0, 1.0))
+    low = box.nodes.min(axis=0)
+    both = np.concatenate([box.nodes - low, box.nodes - low + [1.0, 0.0, 1.0]])
+    nodes, merged = np.unique(both.round(9), axis=0, return_inverse=True)
+    assert len(nodes) == 2 * len(box.nodes) - 2
+    tets = merged.ravel()[np.concatenate([box.tets, box.tets + len(box.nodes)])].astype(np.int32)
+    with pytest.raises(UserError, match="nodes: the cage has parts that hang on a corner or an edge alone; give it"):
+        make_body(TetMesh(nodes, tets), FLOOR, device="cpu")

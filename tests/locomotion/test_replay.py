@@ -20,7 +20,7 @@ from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
 from tests.support.creatures import CoarseCreature, coarse_creature
-from tests.support.meshes import box_mesh
+from tests.support.meshes import box_mesh, coarse_stool
 from tests.support.places import FORWARD
 from tests.support.slides import slide
 
@@ -37,6 +37,11 @@ def block() -> CoarseCreature:
     return coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD)
 
 
+def walker() -> CoarseCreature:
+    """A stool, made anew."""
+    return coarse_creature(coarse_stool(), forward=np.array([1.0, 0.0, 0.0]))
+
+
 def run(made: CoarseCreature, script: str = "jump", *, killed_at: int | None = None, **given: Any) -> Simulation:
     def progress(frame: int) -> None:
         if frame == killed_at:
@@ -50,6 +55,9 @@ def run(made: CoarseCreature, script: str = "jump", *, killed_at: int | None = N
 @cache
 def uninterrupted() -> Simulation:
     return run(block())
+
+
+BODIES = {"jump": block, "walk 1": walker}
 
 
 def cut_off(parts: Path) -> None:
@@ -68,12 +76,15 @@ def same_steps(one: tuple[StepReport, ...], other: tuple[StepReport, ...]) -> bo
     return len(one) == len(other) and all(bits(asdict(a)) == bits(asdict(b)) for a, b in zip(one, other, strict=True))
 
 
-def test_a_run_goes_on_to_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("script", ["jump", pytest.param("walk 1", marks=pytest.mark.slow)])
+def test_a_run_goes_on_to_the_same_bits(script: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Only what had not been written down is solved, by a body that is made anew."""
-    cut_off(tmp_path)
-    whole = uninterrupted()
-    there = sorted(os.listdir(tmp_path))
-    assert there == ["start.npz", "steps-000000.npz", "steps-000001.npz"]
+    body = BODIES[script]
+    whole = uninterrupted() if script == "jump" else run(body(), script)
+    with pytest.raises(KilledError):
+        run(body(), script, killed_at=CUT, parts=lambda: tmp_path)
+    parts = sorted(os.listdir(tmp_path))
+    assert parts[:3] == ["start.npz", "steps-000000.npz", "steps-000001.npz"]
     solved: list[float] = []
     advance = LocomotionStepper.advance
 
@@ -82,15 +93,16 @@ def test_a_run_goes_on_to_the_same_bits(tmp_path: Path, monkeypatch: pytest.Monk
         return advance(stepper, state, *rest)
 
     monkeypatch.setattr(LocomotionStepper, "advance", counted)
-    resumed = run(block(), parts=lambda: tmp_path, resume=tmp_path)
-    assert len(solved) == len(whole.reports) - 20
+    resumed = run(body(), script, parts=lambda: tmp_path, resume=tmp_path)
+    assert len(solved) == len(whole.reports) - 10 * (len(parts) - 1)
     assert same_steps(resumed.reports, whole.reports)
     assert (resumed.frames == whole.frames).all()
     for name in whole.trajectory.__dataclass_fields__:
         assert np.array_equal(getattr(resumed.trajectory, name), getattr(whole.trajectory, name)), name
     # One that was cut off after its last step, too.
     solved.clear()
-    assert same_steps(run(block(), parts=lambda: tmp_path, resume=tmp_path).reports, whole.reports) and solved == []
+    again = run(body(), script, parts=lambda: tmp_path, resume=tmp_path)
+    assert same_steps(again.reports, whole.reports) and solved == []
 
 
 def test_parts_of_divided_steps_are_put_together_again(tmp_path: Path) -> None:

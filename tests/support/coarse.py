@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from functools import partial
 from unittest.mock import patch
@@ -10,7 +11,9 @@ from egs_warp.cli import main
 from egs_warp.pipelines.creature import make_creature
 
 NODES = 60
+"""Where ``EGS_WARP_TEST_NODES`` does not say otherwise."""
 
 if __name__ == "__main__":
-    with patch("egs_warp.pipelines.animate.make_creature", partial(make_creature, nodes=NODES)):
+    nodes = int(os.environ.get("EGS_WARP_TEST_NODES", NODES))
+    with patch("egs_warp.pipelines.animate.make_creature", partial(make_creature, nodes=nodes)):
         sys.exit(main())

@@ -37,6 +37,7 @@ from egs_warp.io.onnx import read_onnx
 from egs_warp.io.photos import read_photo
 from egs_warp.io.planes import read_planes
 from egs_warp.io.ply import read_point_ply
+from egs_warp.locomotion.replay import Replay
 from egs_warp.motions.keyframes import read_keyframes
 from egs_warp.motions.script import motion
 from egs_warp.muscles.files import read_muscles
@@ -44,6 +45,7 @@ from egs_warp.pipelines.shot import Shot
 from tests.support import onnx
 from tests.support.captures import ARRAYS, good_bytes, small_cloud, spz_of_streams
 from tests.support.meshes import block_mesh
+from tests.support.slides import slide
 
 LONGEST = 2.0
 """Seconds that reading a small file may take."""
@@ -307,6 +309,25 @@ def _spz_of_streams() -> bytes:
     return spz_of_streams(gzip.decompress(good_bytes("a.spz")), 7, 9)
 
 
+@cache
+def _record() -> dict[str, bytes]:
+    """What a recorder leaves of eight steps."""
+    slid = slide()
+    with tempfile.TemporaryDirectory() as folder:
+        recorder = slid.recorder(folder=lambda: Path(folder))
+        for report in slid.reports[:8]:
+            recorder.add([report])
+        recorder.trajectory()
+        return {path.name: path.read_bytes() for path in Path(folder).iterdir()}
+
+
+def _replayed(path: Path) -> None:
+    slid = slide()
+    replay = Replay(path.parent, slid.recorder().start, slid.stepper.detector)
+    reports = [report for _ in slid.reports for report in replay.step(0)]
+    assert len(reports) == 8 and all(np.isfinite(report.state.positions).all() for report in reports)
+
+
 READERS: tuple[Reader, ...] = (
     Reader("ply", "a.ply", lambda: good_bytes("a.ply"), _capture),
     Reader("text ply", "a.ply", _text_ply, _capture),
@@ -341,6 +362,8 @@ READERS: tuple[Reader, ...] = (
     Reader("key frames csv", "keys.csv", lambda: _CSV, _keys),
     Reader("camera path", "path.json", lambda: _json(_PATH), _camera_path, json=True),
     Reader("run.yaml", "run.yaml", lambda: _CONFIG, _config),
+    Reader("recorded start", "start.npz", lambda: _record()["start.npz"], _replayed, beside=_record),
+    Reader("recorded steps", "steps-000000.npz", lambda: _record()["steps-000000.npz"], _replayed, beside=_record),
     Reader("mask", "mask.png", lambda: _picture("PNG", "L"), read_mask),
     Reader("photo png", "a.png", lambda: _picture("PNG", "RGB"), _photo),
     Reader("photo jpeg", "a.jpg", lambda: _picture("JPEG", "RGB"), _photo),

@@ -1,0 +1,64 @@
+"""A step that cannot be solved ends a simulation with what there is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from egs_warp.fem.body import BodyState
+from egs_warp.fem.step_problem import UnsolvableStepError
+from egs_warp.locomotion.rollout import Simulation, roll_out
+from egs_warp.locomotion.stepper import LocomotionStepper
+from egs_warp.motions.script import motion
+from egs_warp.motions.sequence import MotionSequence
+from tests.support.creatures import CoarseCreature, coarse_creature
+from tests.support.meshes import box_mesh
+from tests.support.places import FORWARD
+
+
+def run(made: CoarseCreature, start: BodyState) -> Simulation:
+    sequence = MotionSequence(made.place, motion("jump").parts(made.place.body.height))
+    return roll_out(made.stepper, made.stepper.geometry, start, sequence, frames=8)
+
+
+@pytest.fixture(scope="module")
+def made() -> CoarseCreature:
+    return coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD)
+
+
+@pytest.mark.parametrize("failure", [UnsolvableStepError("singular"), np.linalg.LinAlgError("singular"), None])
+def test_what_was_solved_before_is_kept(
+    made: CoarseCreature, failure: Exception | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The fourth step fails with an error, or does not converge in any of its parts."""
+    advance, whole = LocomotionStepper.advance, run(made, made.start)
+
+    def failing(stepper: LocomotionStepper, state: BodyState, *rest: Any) -> Any:
+        end, memory, done = advance(stepper, state, *rest)
+        if state.time < 0.049:
+            return end, memory, done
+        if failure is not None:
+            raise failure
+        return end, memory, [replace(report, converged=False) for report in done]
+
+    monkeypatch.setattr(LocomotionStepper, "advance", failing)
+    cut = run(made, made.start)
+    assert cut.stopped and not whole.stopped
+    assert len(cut.reports) == 3 and cut.frames.tolist() == [0, 1, 2, 3]
+    assert np.array_equal(cut.trajectory.positions, whole.trajectory.positions[:4])
+
+
+def test_steps_that_have_no_solution(made: CoarseCreature) -> None:
+    """Found in the first step, before anything is done: no number, too fast and too far for double precision."""
+    still, positions = np.zeros_like(made.start.velocities), made.start.positions
+    for start in (
+        BodyState(positions, still * np.nan),
+        BodyState(positions, still - [0.0, 0.0, 1e20]),
+        BodyState(positions + [1e9, 0.0, 0.0], still),
+    ):
+        done = run(made, start)
+        assert done.stopped and len(done.reports) == 0 and done.frames.tolist() == [0]
+        assert done.trajectory.activations.shape == (0, made.stepper.muscles.segment_count)
