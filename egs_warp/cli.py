@@ -61,7 +61,7 @@ _STATUSES = """exit status:
   0    done
   1    memory or disk gave out; of doctor: something is missing without which nothing works
   2    bad input, told in one line
-  3    of animate and resume: files are written, but the body has fallen or a step could not be solved
+  3    of animate, resume: written, but the body has fallen or a step could not be solved
   130  Ctrl-C; 143 SIGTERM: one line, no half-written file"""
 
 

@@ -106,7 +106,13 @@ def _animate(chosen: argparse.Namespace) -> int:
 
 def animated(chosen: argparse.Namespace) -> int:
     """What ``egs-warp animate`` does once ``chosen.out`` is known to be free, or a run in it to go on; its status."""
-    report, more = _animate_scene(chosen) if chosen.object is not None else _animate_capture(chosen)
+    try:
+        report, more = _animate_scene(chosen) if chosen.object is not None else _animate_capture(chosen)
+    except BaseException as error:
+        # What lies there may still be the earlier run, which is not this one.
+        if not chosen.overwrite and (chosen.out / NAME).is_file():
+            error.add_note(f"egs-warp resume {chosen.out} goes on")
+        raise
     print(report.summary())
     print(f"wrote the video, sheet.png, plots.png, report.json, trajectory.npz{more} into {chosen.out}")
     return FALLEN if report.state.bad else 0

@@ -53,10 +53,10 @@ def one_line_errors(program: str) -> Iterator[None]:
             yield
         except UserError as error:
             end(2, error.told(flag_of))
-        except KeyboardInterrupt:
-            end(130, "stopped; finished files are whole, unfinished ones are gone")
-        except _TerminatedError:
-            end(143, "asked to end; finished files are whole, unfinished ones are gone")
+        except KeyboardInterrupt as error:
+            end(130, _noted("stopped; finished files are whole, unfinished ones are gone", error))
+        except _TerminatedError as error:
+            end(143, _noted("asked to end; finished files are whole, unfinished ones are gone", error))
         except MemoryError:
             end(1, "not enough memory; give a smaller capture, picture or number of Gaussians")
         except OSError as error:
@@ -64,6 +64,11 @@ def one_line_errors(program: str) -> Iterator[None]:
                 raise
             place = f"{error.filename}: " if error.filename else ""
             end(1, f"{place}{error.strerror}; free some space, or choose another place")
+
+
+def _noted(line: str, error: BaseException) -> str:
+    """The ``line`` with what was noted on the ``error`` on its way."""
+    return "; ".join([line, *getattr(error, "__notes__", [])])
 
 
 @contextmanager

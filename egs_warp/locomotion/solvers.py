@@ -110,6 +110,9 @@ class OsqpProgram:
             self._solver.update(l=lower, u=upper)
         result = self._solver.solve(raise_error=False)
         codes: Any = osqp.SolverStatus
+        if result.info.status_val == codes.OSQP_SIGINT:
+            # OSQP takes Ctrl-C for itself while it runs; the program would go on with what it had found by then.
+            raise KeyboardInterrupt
         status = {
             codes.OSQP_SOLVED: QpStatus.SOLVED,
             codes.OSQP_SOLVED_INACCURATE: QpStatus.INEXACT,

@@ -25,7 +25,7 @@ MOMENTS = 20
 """At which each command is killed once."""
 SMALL = ("--up", "z", "--size", "32")
 COMMANDS = {
-    "jump": ("pawn.ply", "--frames", "45"),
+    "jump": ("pawn.ply", "--frames", "28"),
     "hops": ("pawn.ply", "--motion", "hop 0.3 0.2 x2, jump", "--frames", "110"),
     "walk": ("stool.ply", "--motion", "walk 2", "--frames", "20"),
     "keys": ("pawn.ply", "--motion", "trajectory keys.json", "--camera", "follow", "--background", "transparent"),
@@ -89,11 +89,10 @@ def test_a_run_that_is_killed_again_and_again(tmp_path: Path) -> None:
     moments = random.Random(18)
     first, again = animate("jump", folder, out), command("resume", out)
     assert ended_by(first, signal.SIGKILL, parts / "start.npz", 0.2 * moments.random())[0] == -signal.SIGKILL
-    for ready in (parts / "steps-000000.npz", parts / "steps-000002.npz"):
-        status, said = ended_by(again, signal.SIGINT, ready, 0.2 * moments.random())
-        assert status == 130
-        assert said.splitlines()[-1] == "egs-warp: stopped; finished files are whole, unfinished ones are gone"
-        assert not [name for name in os.listdir(out) if name.startswith(".egs-")]
+    status, said = ended_by(again, signal.SIGINT, parts / "steps-000001.npz", 0.2 * moments.random())
+    told = "egs-warp: stopped; finished files are whole, unfinished ones are gone"
+    assert status == 130 and said.splitlines()[-1] == f"{told}; egs-warp resume {out} goes on"
+    assert not [name for name in os.listdir(out) if name.startswith(".egs-")]
     assert ended_by(again, signal.SIGKILL, out / "plots.png", 0.0)[0] == -signal.SIGKILL
     assert not json.loads((out / MANIFEST).read_text())["finished"]
     assert finishes(again) == 0
@@ -105,7 +104,9 @@ def test_a_run_that_is_killed_again_and_again(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", COMMANDS)
 def test_random_moments(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """SIGKILL at any time, preparation and film included; a run that had not begun to write is begun again."""
+    """SIGKILL at any time, preparation and film included, and Ctrl-C; a run that had not begun to write is begun
+    again.
+    """
     folder, whole = made(tmp_path), tmp_path / "whole"
     if name == "walk":
         # A coarser stool has no four feet.
@@ -116,9 +117,9 @@ def test_random_moments(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     status = finishes(animate(name, folder, whole))
     length = time.monotonic() - began
     moments = random.Random(name)
-    for number in range(MOMENTS):
+    for number, ending in enumerate([signal.SIGKILL] * MOMENTS + [signal.SIGINT] * (MOMENTS // 4)):
         out = tmp_path / str(number)
-        ended_by(animate(name, folder, out), signal.SIGKILL, folder, length * moments.random())
+        ended_by(animate(name, folder, out), ending, folder, length * moments.random())
         begun = (out / MANIFEST).exists()
         assert finishes(command("resume", out) if begun else animate(name, folder, out)) == status
         assert bits(out) == bits(whole), number

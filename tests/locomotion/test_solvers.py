@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import builtins
+import os
+import signal
+import threading
+import time
 from types import ModuleType
 from typing import Any
 
@@ -132,3 +136,16 @@ def test_daqp_is_optional(monkeypatch: pytest.MonkeyPatch) -> None:
         UserError, match=r"^QP solver daqp: the package is not installed; pip install daqp, or use osqp$"
     ):
         quadratic_program(P, q, A, solver=QpSolver.DAQP)
+
+
+def test_ctrl_c_while_osqp_runs_is_not_lost() -> None:
+    """It keeps the signal to itself and says that it was interrupted."""
+    random = np.random.default_rng(3)
+    A = random.normal(size=(400, 200))
+    program = quadratic_program(np.eye(200), 10.0 * random.normal(size=200), A, solver="osqp", accuracy=1e-15)
+    timer = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
+    began = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        timer.start()
+        while time.monotonic() - began < 30.0:
+            program.solve(np.full(400, -1e-3), np.full(400, 1e-3))
