@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,9 @@ SMALLEST_HEIGHT, LARGEST_HEIGHT = 0.001, 1000.0
 """Metres; smaller and larger bodies are refused as a slip of the pen."""
 LARGEST_SINK = 0.02
 """Body heights by which the centre of mass may sink from the unloaded to the standing body."""
+
+_HINGED = 1e4
+"""Body heights by which, linearly, only what swings on hinges sinks."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +146,11 @@ def make_body(
     node_mass = mesh.lumped_masses(density)
     free = heights > heights.min() + 0.05 * height
     column = ElasticAssembly(mesh, Material(young, poisson_ratio, density, 0.0), device=device)
-    young *= max(1.0, _sink(column, node_mass, free, -GRAVITY * plane.normal) / (LARGEST_SINK * height))
+    sink = _sink(column, node_mass, free, -GRAVITY * plane.normal)
+    # It is no number, or below zero, where the stiffness is singular.
+    if not 0.0 <= sink < _HINGED * height:
+        raise ArgumentError("nodes", "the cage has parts that hang on a corner or an edge alone; give it more")
+    young *= max(1.0, sink / (LARGEST_SINK * height))
     undamped = ElasticAssembly(mesh, Material(young, poisson_ratio, density, 0.0), device=device)
     frequency = _first_frequency(undamped, node_mass, free)
     damped = Material(young, poisson_ratio, density, 2.0 * damping_ratio / frequency)
@@ -162,7 +170,10 @@ def _sink(assembly: ElasticAssembly, node_mass: np.ndarray, free: np.ndarray, gr
     stiffness, kept = _held_stiffness(assembly, free)
     force = (node_mass[:, None] * gravity).ravel()
     moved = np.zeros_like(force)
-    moved[kept] = sparse_linalg.spsolve(stiffness, force[kept])
+    with warnings.catch_warnings():
+        # What is singular sinks by no number.
+        warnings.simplefilter("ignore", sparse_linalg.MatrixRankWarning)
+        moved[kept] = sparse_linalg.spsolve(stiffness, force[kept])
     return float(node_mass @ moved.reshape(-1, 3) @ gravity / (node_mass.sum() * np.linalg.norm(gravity)))
 
 
@@ -172,6 +183,4 @@ def _first_frequency(assembly: ElasticAssembly, node_mass: np.ndarray, free: np.
     mass = sparse.diags(np.repeat(node_mass, 3)[kept]).tocsc()
     start = np.ones(len(kept))
     value = sparse_linalg.eigsh(stiffness, k=1, M=mass, sigma=0.0, v0=start, return_eigenvectors=False)[0]
-    if not value > 0.0:
-        raise ArgumentError("nodes", "the cage has parts that hang on a corner or an edge alone; give it more")
     return float(np.sqrt(value))
