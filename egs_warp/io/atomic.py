@@ -19,7 +19,7 @@ except ImportError:
     fcntl = None
 
 _TEMPORARY = re.compile(r"\.egs-[0-9a-f]{16}(\..*)?")
-_YOUNGEST = 5.0
+_YOUNGEST = 2.0
 """Seconds: a file that is younger may not have been locked yet."""
 
 

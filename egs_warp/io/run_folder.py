@@ -72,6 +72,8 @@ class RunFolder:
         for name in self._names:
             if name not in facts:
                 shutil.rmtree(self.path / name, ignore_errors=True)
+        # What the run that was cut off has left was too young when this one began, perhaps.
+        sweep(self.path)
 
     def _write_manifest(self, files: dict[str, Any], *, finished: bool) -> None:
         content = {"schema": _SCHEMA, "version": __version__, "finished": finished, "files": files}

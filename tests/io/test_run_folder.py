@@ -156,3 +156,37 @@ def test_places_are_checked_before_the_work_and_not_made(tmp_path: Path) -> None
             check_run_folder(out)
     check_run_folder(tmp_path / "new" / "deeper")
     assert os.listdir(tmp_path) == ["file"]
+
+
+def test_what_a_killed_run_left_is_gone_when_the_next_has_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Too young to be swept when that one began."""
+    left = tmp_path / f".egs-{'0' * 16}.png"
+    with run_folder(tmp_path) as run:
+        left.write_text("half")
+        run.file("a.txt").write_text("one")
+    with run_folder(tmp_path, resume=True) as run:
+        assert run.resumed and left.exists()
+        monkeypatch.setattr("egs_warp.io.atomic._YOUNGEST", 0.0)
+        run.file("a.txt").write_text("two")
+        run.finish()
+    assert sorted(os.listdir(tmp_path)) == ["a.txt", MANIFEST]
+
+
+def test_a_run_that_goes_on(tmp_path: Path) -> None:
+    """Its files are its own, what it began with is not written again, and folders are gone when it has finished."""
+    with pytest.raises(UserError, match="no run has begun to write here"), run_folder(tmp_path, resume=True):
+        raise AssertionError("must not come here")
+    with run_folder(tmp_path) as run:
+        run.file("a.txt").write_text("one")
+        run.file("parts").mkdir()
+    with run_folder(tmp_path, resume=True) as run:
+        run.begin_with(lambda: pytest.fail("it has begun"))
+        assert run.file("a.txt").read_text() == "one" and run.file("parts").is_dir()
+        run.file("b.txt").write_text("two")
+        run.finish()
+    assert sorted(os.listdir(tmp_path)) == ["a.txt", "b.txt", MANIFEST]
+    assert set(manifest(tmp_path)["files"]) == {"a.txt", "b.txt"}
+    with pytest.raises(UserError, match="this run has finished"), run_folder(tmp_path, resume=True):
+        raise AssertionError("must not come here")
