@@ -26,8 +26,6 @@ _NEAR_GROUND = 0.07
 """Body heights: a limb that ends higher hangs."""
 _APART = 0.08
 """Body heights over which a limb is apart from all others; what is shorter is a toe."""
-_TOE = 0.04
-"""Body heights: what is apart below this only is rough ground."""
 _JOINED = 0.1
 """Body heights, or a mean edge of the mesh if that is more: limbs joined on the ground by more are one base."""
 
@@ -143,13 +141,13 @@ class Limbs:
 def find_limbs(sections: Sections, nodes: np.ndarray) -> Limbs:
     """The limbs that reach the ground, of a body whose cage has ``nodes`` (N, 3), metres."""
     graph = _Graph(sections)
-    limbs = max(
-        map(graph.limbs_through, graph.crossings()), key=lambda found: sum(one.apart for one in found), default=[]
-    )
-    base_from_limb = graph.bases(limbs)
-    count = int(base_from_limb.max(initial=0)) + 1
-    if count == 1:
+    candidates = [graph.limbs_through(crossing) for crossing in graph.crossings()]
+    bases = [graph.bases(limbs) for limbs in candidates]
+    scores = [_score(limbs, base) for limbs, base in zip(candidates, bases, strict=True)]
+    if max(scores, default=0) == 0:
         return Limbs(np.zeros(len(nodes), int), (graph.height,))
+    best = int(np.argmax(scores))
+    limbs, base_from_limb = candidates[best], bases[best]
     base_from_section = np.full(len(sections.levels), -1)
     for limb, base in zip(limbs, base_from_limb, strict=True):
         base_from_section[list(limb.own)] = base
@@ -160,9 +158,16 @@ def find_limbs(sections: Sections, nodes: np.ndarray) -> Limbs:
     limb_from_node[shared] = base_from_limb[np.asarray(KDTree(ends).query(nodes[shared, :2])[1], int)]
     tops = [
         sections.thickness * max(limb.top for limb, base in zip(limbs, base_from_limb, strict=True) if base == number)
-        for number in range(count)
+        for number in range(int(base_from_limb.max()) + 1)
     ]
     return Limbs(limb_from_node, tuple(tops))
+
+
+def _score(limbs: Sequence[_Limb], base_from_limb: np.ndarray) -> int:
+    """Levels over which two feet or more are apart, together; 0 for fewer."""
+    apart = np.zeros(int(base_from_limb.max(initial=-1)) + 1, int)
+    np.maximum.at(apart, base_from_limb, [limb.apart for limb in limbs])
+    return int(apart.sum()) if len(apart) > 1 else 0
 
 
 @dataclass(frozen=True)
@@ -204,7 +209,6 @@ class _Graph:
         """Metres."""
         self._near = int(np.ceil(_NEAR_GROUND * size))
         self._shortest = max(2, round(_APART * size))
-        self._toe = round(_TOE * size)
         self._melt = int(np.ceil(sections.melt / sections.thickness))
 
     def crossings(self) -> list[list[int]]:
@@ -273,24 +277,20 @@ class _Graph:
         return gone, own, last, met
 
     def bases(self, limbs: Sequence[_Limb]) -> np.ndarray:
-        """The number of each limb's foot: those that are joined by much, down to the ground, have one."""
-        under = [self._under(limb) for limb in limbs]
+        """(limbs,) the number of each limb's foot: those that are joined by much have one."""
+        under = [self._ground_under(limb) for limb in limbs]
         pairs = [
             (a, b)
             for a in range(len(limbs))
             for b in range(a)
-            if len(under[a] & under[b]) == len(under[a] | under[b]) == 1
-            and min(limbs[a].bottom, limbs[b].bottom) > self._melt
+            if under[a] & under[b] and min(limbs[a].bottom, limbs[b].bottom) > self._melt
         ]
         return _components(len(limbs), np.array(pairs, int).reshape(-1, 2))[1] if limbs else np.zeros(0, int)
 
-    def _under(self, limb: _Limb) -> set[int]:
-        """Sections just over the ground that what is under the limb leads down to, or the last above."""
+    def _ground_under(self, limb: _Limb) -> set[int]:
+        """The last sections that what is under the limb leads down to."""
         below = set(limb.lowest)
-        while any(self.levels[section] > self._toe for section in below):
-            further = set().union(*(self.down[section] for section in below))
-            if not further:
-                break
+        while further := set().union(*(self.down[section] for section in below)):
             below = further
         return below
 

@@ -110,7 +110,7 @@ def make_creature(
     if gravity_up is not None:
         _check_slope(normal / np.linalg.norm(normal), gravity_up)
     if front is not None:
-        _check_front(normal if gravity_up is None else gravity_up, front)
+        check_front(normal if gravity_up is None else gravity_up, front)
     progress("cage")
     standing = stand(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit, nodes=nodes)
     progress("contact")
@@ -202,7 +202,8 @@ def face(standing: Standing, front: np.ndarray | None = None, *, seen_from: np.n
     return Front(np.array([x, y, 0.0]) / np.hypot(x, y), None)
 
 
-def _check_front(up: np.ndarray, front: np.ndarray) -> None:
+def check_front(up: np.ndarray, front: np.ndarray) -> None:
+    """Raises ``ArgumentError`` where ``front`` (3,) points along ``up`` (3,)."""
     if np.linalg.norm(np.cross(front, up)) < 1e-3 * np.linalg.norm(front) * np.linalg.norm(up):
         given = ",".join(f"{x:g}" for x in front)
         raise ArgumentError("front", "points up or down; give a way along the ground", value=given)
