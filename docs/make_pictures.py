@@ -24,6 +24,7 @@ TWIST = "python examples/twist.py --out out/twist"
 JUMP = "python examples/jump.py --out out/jump"
 WALK = 'egs-warp animate out/captures/stool_in_room.ply --up z --object 0,0,0.97 --motion "walk 6" --out out/stool'
 SCENE = "egs-warp animate out/captures/figurine_in_room.ply --up z --object 0,0,0.5 --motion jump --out out/figurine"
+INFO = "egs-warp info out/captures/stool.ply --up z --plot out/info.png"
 MUSCLES = "egs-warp muscles out/captures/pawn.ply --up z --plot out/muscles.png"
 
 
@@ -62,6 +63,7 @@ PICTURES = (
     Picture("scene.webp", SCENE, "figurine/jump.mp4", 400, at=0.45),
     Picture("segment.webp", SCENE, "figurine/segment.png", 1200),
     Picture("filled.webp", SCENE, "figurine/filled.png", 1200),
+    Picture("info.webp", INFO, "info.png", 1400),
     Picture("muscles.webp", MUSCLES, "muscles.png", 1200),
 )
 

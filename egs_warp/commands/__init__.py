@@ -7,7 +7,7 @@ GROUPS = {
     "begin": ("doctor", "samples"),
     "captures": ("pose", "train", "convert"),
     "scenes": ("plane", "segment", "inpaint"),
-    "motion": ("muscles", "animate", "resume", "live"),
+    "motion": ("info", "muscles", "animate", "resume", "live"),
     "finished runs": ("render", "view", "export"),
 }
 """Names of the commands, as ``egs-warp --help`` lists them."""

@@ -63,10 +63,10 @@ def add_parser(commands: Commands) -> None:
         help="rise of the centre of mass, body heights: of a jump (0.2), hop (0.3) or twist (0.3)",
     )
     motion.add_argument("--heading-degrees", type=float, help="of a twist, counter-clockwise from above (180)")
-    motion.add_argument("--forward", help="x,y,z or an axis: the way of motions; else along the feet")
     motion.add_argument("--frames", type=int, help="length of the video at 60 Hz (until the body rests)")
     body = animate.add_argument_group("body and ground")
     body.add_argument("--up", help="axis that points up: x, y, z or with a minus, as --up=-y; else it is guessed")
+    body.add_argument("--front", help="x,y,z or an axis: the way it faces and moves, as --front=-x; else it is guessed")
     body.add_argument(
         "--plane", help="nx,ny,nz,d of the ground n.x + d = 0 in the capture's units, or a plane.json; else it is found"
     )
@@ -165,6 +165,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
     from egs_warp.io.run_folder import run_folder
     from egs_warp.io.video import ffmpeg_program
     from egs_warp.pipelines.animate import animate
+    from egs_warp.pipelines.front import mean_view
     from egs_warp.pipelines.prepare_scene import SceneOptions, viewing_direction
 
     shot, behind = shot_of(chosen)
@@ -196,6 +197,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
             plane=scene.plane,
             background=scene.background,
             view_from=view_from if view_from is not None else viewing_direction(scene, given.cameras),
+            seen_from=mean_view(given.cameras, scene.located.centre),
             notes=(*given.notes, *scene.notes),
             **asked,
         )
@@ -240,7 +242,7 @@ def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
         parse_json(read_text(chosen.muscles), chosen.muscles)
     return {
         "motion": chosen.motion,
-        "forward": parse_direction("forward", chosen.forward) if chosen.forward is not None else None,
+        "front": parse_direction("front", chosen.front) if chosen.front is not None else None,
         "gravity_up": parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up is not None else None,
         "muscles_file": chosen.muscles,
         "solids": read_terrain(chosen.terrain) if chosen.terrain else (),

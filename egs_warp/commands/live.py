@@ -38,7 +38,7 @@ def add_parser(commands: Commands) -> None:
     body.add_argument("--friction", type=float, default=0.8, help="Coulomb coefficient to begin with (0.8)")
     body.add_argument("--metres-per-unit", type=float, help="true scale; else the body is 1 m tall")
     body.add_argument("--muscles", type=named_path, help="JSON with fibres (docs/motions/muscles.md)")
-    body.add_argument("--forward", help="x,y,z or an axis: the way of motions; else along the feet")
+    body.add_argument("--front", help="x,y,z or an axis: the way it faces and moves, as --front=-x; else it is guessed")
     page = live.add_argument_group("page")
     page.add_argument("--background", type=Path, help="capture behind the creature, as background.ply of a run")
     page.add_argument("--port", type=int, default=0, help="of this machine's own address (any that is free)")
@@ -89,7 +89,7 @@ def _session(chosen: argparse.Namespace) -> Session:
     options = AnimateOptions(friction=chosen.friction, metres_per_unit=chosen.metres_per_unit)
     up = parse_up(chosen.up) if chosen.up is not None else None
     plane = plane_of(chosen.plane) if chosen.plane is not None else None
-    forward = parse_direction("forward", chosen.forward) if chosen.forward is not None else None
+    front = parse_direction("front", chosen.front) if chosen.front is not None else None
     capture = read_capture(chosen.capture, device=chosen.device)
     if plane is None and up is None:
         up, note = guessed_up(capture)
@@ -101,14 +101,15 @@ def _session(chosen: argparse.Namespace) -> Session:
             plane=plane,
             metres_per_unit=options.metres_per_unit,
             friction=options.friction,
+            front=front,
             muscles_file=chosen.muscles,
             nodes=chosen.nodes,
             progress=lambda stage: bar.set_description_str(f"prepare: {stage}"),
         )
         bar.set_description_str("prepare: split")
-        drawn_as = drawn_creature(creature, split_for_life(creature), forward)
+        drawn_as = drawn_creature(creature, split_for_life(creature))
         bar.set_description_str("prepare: done")
-    made = SessionOptions(
-        source=Path(chosen.capture).name, takes=chosen.out, muscles_file=chosen.muscles, forward=forward
-    )
+    if front is None:
+        say(creature.front.told(creature.frame))
+    made = SessionOptions(source=Path(chosen.capture).name, takes=chosen.out, muscles_file=chosen.muscles)
     return Session(creature, drawn_as, made)

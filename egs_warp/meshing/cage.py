@@ -103,10 +103,12 @@ def cage_of_body(
     target_nodes: int = 500,
     dilation: float = 0.005,
     method: CageMethod = CageMethod.VOXEL,
+    solid: LatticeSolid | None = None,
 ) -> Cage:
     """Cage of about ``target_nodes`` nodes around the opaque part of ``cloud`` above z = 0, which it never crosses.
 
-    ``cloud`` is in its body's frame (``body_gaussians``), whose axes and origin are those of the lattice.
+    ``cloud`` is in its body's frame (``body_gaussians``), whose axes and origin are those of the lattice; ``solid`` is
+    what it shows (``solid_from_gaussians``), if that is known.
     ``dilation`` is in units of the object's longest side; it is raised, and the mesh refined (up to 1.75 times the
     nodes), until all but 0.07 % of the object's opacity mass is inside.
     The same input gives the same bits (``CageMethod.VOXEL``). See docs/concepts/cage.md.
@@ -115,7 +117,7 @@ def cage_of_body(
     """
     if not 50 <= target_nodes <= 20000:
         raise UserError(f"cage: {target_nodes} nodes asked; give a number from 50 to 20000")
-    solid = solid_from_gaussians(cloud)
+    solid = solid or solid_from_gaussians(cloud)
     _refuse_flat(solid)
     weights = np.where(solid.belongs, cloud.opacities(), 0.0)
     distance = _Distance(solid)

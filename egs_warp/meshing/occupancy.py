@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -42,6 +42,10 @@ class LatticeSolid:
     def points(self, lattice_points: np.ndarray) -> np.ndarray:
         """Points (m, 3) of the body's frame, from lattice indices (m, 3)."""
         return self.spacing * (np.asarray(lattice_points, float) + self.corner)
+
+    def scaled(self, factor: float) -> LatticeSolid:
+        """The same solid after all lengths are multiplied by ``factor``."""
+        return replace(self, spacing=self.spacing * factor, longest_side=self.longest_side * factor)
 
 
 def solid_from_gaussians(cloud: GaussianCloud, *, resolution: int = 64) -> LatticeSolid:

@@ -1,12 +1,13 @@
-"""Feet and legs of a body: separate patches on the ground, and the limbs that carry the body on them.
+"""Feet and legs of a body: the limbs that carry it, and where these stand on the ground.
 
-See docs/concepts/motions.md.
+See docs/motions/index.md.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -16,13 +17,33 @@ from egs_warp.contact.detection import ContactSet
 from egs_warp.errors import UserError
 from egs_warp.geometry.tetmesh import TetMesh, edge_graph
 from egs_warp.locomotion.stepper import StepReport
+from egs_warp.motions.limbs import Limbs, Sections, find_limbs
 
 _GROUND = 0.02
-"""Body heights: nodes at most this high stand on the ground."""
+"""Body heights: nodes at most this high above the lowest of a foot are its sole."""
 _FOOT = 0.1
-"""Body heights: ground patches that meet below this are one foot."""
+"""Body heights: below this a foot and its leg are one."""
 _FLAT = 0.15
 """Part of a leg, from the ground up, that moves with the foot as one."""
+_LONG = 3.0
+"""Body heights and own widths: a base this long has no feet."""
+_ROUND_SOLE, _ROUND = 0.6, 0.15
+"""A ball stands on less than this part of its width, and its surface is as far from its middle everywhere but for a
+standard deviation of this part."""
+AHEAD = np.radians(15.0)
+"""A foot this little to the right of straight ahead is still the first."""
+
+
+class Base(Enum):
+    """What a body stands on."""
+
+    FEET = "feet"
+    """Two or more."""
+    ONE = "one base"
+    ROUND = "a round base"
+    """It can roll."""
+    LONG = "its length"
+    """It lies, and has no foot."""
 
 
 @dataclass(frozen=True)
@@ -35,33 +56,80 @@ class Foot:
     """(N,) 1 at the foot, falling smoothly to 0 where the leg joins the body, 0 elsewhere."""
     length: float
     """Metres from the ground to where the leg joins the body."""
+    height: float = 0.0
+    """Metres of its lowest node over that of the body: the leg is so much short."""
+    joined: bool = False
+    """The cage joins it to another foot by an edge below where the legs meet."""
 
 
-def find_feet(mesh: TetMesh, heights: np.ndarray, body_height: float) -> tuple[Foot, ...]:
-    """The separate feet of a standing body; ``heights`` (N,) of its nodes over the ground, ``body_height`` H, metres.
+def find_feet(mesh: TetMesh, heights: np.ndarray, body_height: float, limbs: Limbs | None = None) -> tuple[Foot, ...]:
+    """The feet of a standing body, none if it lies along the ground; ``heights`` (N,) of its nodes over the ground,
+    ``body_height`` H, metres.
 
-    A leg reaches up to where it first meets another foot's leg.
+    ``limbs`` are those of the capture, whose gaps may be finer than the cage's; without them, those of the cage. A leg
+    reaches up to where it first meets another foot's leg.
     """
+    limbs = limbs or find_limbs(Sections.of_mesh(mesh, heights), mesh.nodes)
+    above = heights - heights.min()
+    if limbs.count == 1:
+        if base_of(mesh, heights, 1) is Base.LONG:
+            return ()
+        sole = np.flatnonzero(above < _GROUND * body_height)
+        everything = np.arange(len(above))
+        return (Foot(sole, _leg_weights(above, everything, float(above.max())), float(above.max())),)
     graph = edge_graph(mesh)
-    on_ground = heights < heights.min() + _GROUND * body_height
-    labels = _patches(graph, heights < heights.min() + _FOOT * body_height)
-    patches = [np.flatnonzero(labels == label) for label in np.unique(labels[on_ground])]
-    levels = np.unique(heights[heights >= heights.min() + _FOOT * body_height])
-    limbs = list(patches)
-    tops = np.full(len(patches), _FOOT * body_height)
-    apart = np.ones(len(patches), bool)
-    for level in levels:
+    found = [(np.flatnonzero(limbs.limb_from_node == limb), top) for limb, top in enumerate(limbs.tops)]
+    found = [(nodes, top) for nodes, top in found if len(nodes)]
+    found.sort(key=lambda one: int(one[0][above[one[0]] < above[one[0]].min() + _FOOT * body_height].min()))
+    roots = [nodes for nodes, _ in found]
+    legs, tops = list(roots), [top for _, top in found]
+    lowest = [int(nodes[np.argmin(above[nodes])]) for nodes in roots]
+    apart = np.ones(len(roots), bool)
+    for level in np.unique(heights[above >= _FOOT * body_height]):
         labels = _patches(graph, heights <= level)
-        met = np.array([labels[patch[0]] for patch in patches])
-        for i in np.flatnonzero(apart):
+        met = labels[lowest]
+        for i in np.flatnonzero(apart & (met >= 0)):
             if (met == met[i]).sum() > 1:
                 apart[i] = False
             else:
-                limbs[i], tops[i] = np.flatnonzero(labels == met[i]), level - heights.min()
+                legs[i], tops[i] = np.flatnonzero(labels == met[i]), float(level - heights.min())
+        if not apart.any():
+            break
     return tuple(
-        Foot(patch[on_ground[patch]], _leg_weights(heights - heights.min(), limb, top), float(top))
-        for patch, limb, top in zip(patches, limbs, tops, strict=True)
+        Foot(
+            nodes[above[nodes] < above[nodes].min() + _GROUND * body_height],
+            _leg_weights(above, leg, top),
+            top,
+            float(above[nodes].min()),
+            one,
+        )
+        for nodes, leg, top, one in zip(roots, legs, tops, _joined(graph, roots, above), strict=True)
     )
+
+
+def base_of(mesh: TetMesh, heights: np.ndarray, foot_count: int) -> Base:
+    """What a body stands on that has so many feet, or limbs that reach the ground; ``heights`` (N,): see
+    ``find_feet``."""
+    if foot_count > 1:
+        return Base.FEET
+    nodes = mesh.nodes[np.unique(mesh.boundary_faces())]
+    size = float(np.ptp(heights))
+    up = _up(mesh, heights)
+    flat = mesh.nodes - np.outer(mesh.nodes @ up, up)
+    long, wide = _sides(flat[heights < heights.min() + _FOOT * size])
+    if long > _LONG * max(wide, size):
+        return Base.LONG
+    sole, _ = _sides(flat[heights < heights.min() + _GROUND * size])
+    away = np.linalg.norm(nodes - np.average(mesh.nodes, axis=0, weights=mesh.lumped_masses(1.0)), axis=1)
+    is_ball = float(away.std()) < _ROUND * float(away.mean()) and sole < _ROUND_SOLE * _sides(flat)[0]
+    return Base.ROUND if is_ball else Base.ONE
+
+
+def around(places: np.ndarray) -> np.ndarray:
+    """(feet,) indices of the feet at ``places`` (feet, 2), forward and left, as they are numbered: anticlockwise as
+    seen from above, from straight ahead on."""
+    ahead, left = (places - places.mean(axis=0)).T
+    return np.argsort((np.arctan2(left, ahead) + AHEAD) % (2.0 * np.pi))
 
 
 def feet_around(feet: Sequence[Foot], positions: np.ndarray, up: np.ndarray) -> tuple[int, int, int, int]:
@@ -70,6 +138,9 @@ def feet_around(feet: Sequence[Foot], positions: np.ndarray, up: np.ndarray) -> 
     """
     if len(feet) != 4:
         raise UserError(f"walk: a walk needs four separate feet, the body has {len(feet)}")
+    if any(foot.joined for foot in feet):
+        joined = sum(foot.joined for foot in feet)
+        raise UserError(f"walk: a walk needs four separate feet, of the body's four {joined} are joined to another")
     centres = np.array([positions[foot.sole].mean(axis=0) for foot in feet])
     arms = centres - centres.mean(axis=0)
     side = arms[0] - (arms[0] @ up) * up
@@ -93,6 +164,33 @@ def foot_loads(feet: Sequence[Foot], report: StepReport | None, weight: float) -
     if report is not None:
         np.add.at(loads, foot_of_contact(feet, report.contacts), report.forces[:, 0] / weight)
     return loads
+
+
+def _joined(graph: csr_matrix, limbs: Sequence[np.ndarray], above: np.ndarray) -> list[bool]:
+    """Whether the lower half of each limb, a list of nodes, has an edge to another's; nodes are ``above`` (N,) the
+    ground."""
+    lower = np.full(len(above), -1)
+    for limb, nodes in enumerate(limbs):
+        lower[nodes[above[nodes] <= 0.5 * above[nodes].max()]] = limb
+    edges = graph.tocoo()
+    first, second = lower[edges.row], lower[edges.col]
+    met = np.unique(first[(first != second) & (first >= 0) & (second >= 0)])
+    return [limb in met for limb in range(len(limbs))]
+
+
+def _up(mesh: TetMesh, heights: np.ndarray) -> np.ndarray:
+    """(3,) unit, along which the ``heights`` (N,) of the nodes grow."""
+    arms = mesh.nodes - mesh.nodes.mean(axis=0)
+    up = np.linalg.lstsq(arms, heights - heights.mean(), rcond=None)[0]
+    return up / np.linalg.norm(up)
+
+
+def _sides(flat: np.ndarray) -> tuple[float, float]:
+    """Length and width of points (n, 3) that lie in a plane: of the narrowest strip that holds them."""
+    middle = flat.mean(axis=0)
+    across = np.linalg.svd(flat - middle, full_matrices=False)[2][:2]
+    spans = np.ptp((flat - middle) @ across.T, axis=0)
+    return float(spans.max()), float(spans.min())
 
 
 def _patches(graph: csr_matrix, kept: np.ndarray) -> np.ndarray:

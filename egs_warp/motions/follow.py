@@ -25,15 +25,13 @@ from egs_warp.locomotion.objectives import (
 )
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.feet import find_feet
+from egs_warp.motions.feet import around
 from egs_warp.motions.keyframes import Channel, Key, Quantity, channels
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.stance import Calm, PoseFamily, Weights
 
 MISSED = 0.1
 """Of the largest value of its channel: a key missed by more is noted."""
-AHEAD = np.radians(15.0)
-"""A foot that is less than this to the right of straight ahead counts as straight ahead."""
 LONGEST_HOLD = 9.0
 """Of sqrt(H / g): at most for how long, after the last key, the body is waited for to be calm."""
 
@@ -231,18 +229,14 @@ def parts_of_body(place: Place) -> list[BodyPart]:
     heights = (standing - ground.origin) @ ground.surface_normal
     base = BodyPart.base(body, heights)
     found = [BodyPart.whole(body), base, BodyPart.head(body, ground.local(standing)[:, 2])]
-    feet = find_feet(body.mesh, heights, body.height)
-    if len(feet) == 1:
+    feet = place.feet()
+    if len(feet) < 2:
         return [*found, BodyPart("foot", base.nodes, base.masses)]
-    soles = np.array([ground.local(standing[foot.sole])[:, :2].mean(axis=0) for foot in feet])
-    ahead, left = (soles - soles.mean(axis=0)).T
-    # A foot straight ahead is the first, even if a little to the right.
-    order = np.argsort((np.arctan2(left, ahead) + AHEAD) % (2.0 * np.pi))
-    legs = [feet[index].leg for index in order]
-    return found + [
-        BodyPart.of(body, f"foot {number}", base.nodes[leg[base.nodes] > 0.0])
-        for number, leg in enumerate(legs, start=1)
-    ]
+    soles = [base.nodes[foot.leg[base.nodes] > 0.0] for foot in feet]
+    # A leg that is too short to reach the base stands on its own lowest nodes.
+    soles = [nodes if len(nodes) else foot.sole for nodes, foot in zip(soles, feet, strict=True)]
+    order = around(np.array([ground.local(standing[foot.sole])[:, :2].mean(axis=0) for foot in feet]))
+    return found + [BodyPart.of(body, f"foot {number}", soles[index]) for number, index in enumerate(order, start=1)]
 
 
 def turn_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -13,6 +13,8 @@ from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.feet import Foot, find_feet
+from egs_warp.motions.limbs import Limbs
 from egs_warp.motions.stance import Ground, heading_between, sole_shares
 
 if TYPE_CHECKING:
@@ -36,6 +38,13 @@ class Place:
     """What there is to stand on, the ground among it."""
     friction: float = 0.8
     """Coulomb coefficient."""
+    limbs: Limbs | None = None
+    """Of the capture, where there is one; else they are those of the cage."""
+
+    def feet(self) -> tuple[Foot, ...]:
+        """What the body stands on (``find_feet``)."""
+        heights = (self.standing - self.ground.origin) @ self.ground.surface_normal
+        return find_feet(self.body.mesh, heights, self.body.height, self.limbs)
 
     def now(self, positions: np.ndarray) -> Place:
         """The same stance turned about up and moved to where the feet of ``positions`` (N, 3) are."""

@@ -27,7 +27,7 @@ from egs_warp.locomotion.objectives import (
 )
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.feet import feet_around, find_feet, foot_loads, foot_of_contact, foot_of_node
+from egs_warp.motions.feet import feet_around, foot_loads, foot_of_contact, foot_of_node
 from egs_warp.motions.footfalls import Footfalls, footfalls
 from egs_warp.motions.gait import Gait, Passage, nearest_in_hull
 from egs_warp.motions.sequence import Place
@@ -97,8 +97,7 @@ class Walk:
         It walks along the side of its feet that is nearest to the forward of ``place``.
         """
         body = place.body
-        heights = (place.standing - place.ground.origin) @ place.ground.surface_normal
-        feet = find_feet(body.mesh, heights, body.height)
+        feet = place.feet()
         order = feet_around(feet, place.standing, place.ground.axes[2])
         corners = np.array([place.standing[feet[index].sole].mean(axis=0) for index in order])
         sides = [corners[0] + corners[1] - corners[2] - corners[3], corners[1] + corners[2] - corners[3] - corners[0]]

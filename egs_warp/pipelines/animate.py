@@ -94,7 +94,7 @@ class Asked:
     """nx, ny, nz, d."""
     view_from: tuple[float, ...]
     gravity_up: tuple[float, ...]
-    forward: tuple[float, ...]
+    front: tuple[float, ...]
     muscles: str | None
     """Name of the file."""
     solids: int
@@ -117,7 +117,8 @@ def animate(
     muscles_file: Path | None = None,
     solids: tuple[Solid, ...] = (),
     gravity_up: np.ndarray | None = None,
-    forward: np.ndarray | None = None,
+    front: np.ndarray | None = None,
+    seen_from: np.ndarray | None = None,
     settings: LocomotionSettings | None = None,
     options: AnimateOptions | None = None,
     shot: Shot | None = None,
@@ -131,8 +132,8 @@ def animate(
 
     ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.motions.script``).
     ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
-    the object to the camera; ``shot``: how it is filmed. ``muscles_file``, ``solids``, ``gravity_up``, ``settings``:
-    see ``make_creature``; ``forward`` (3,): see ``first_place``. Returns what it wrote as ``report.json``
+    the object to the camera; ``shot``: how it is filmed. ``muscles_file``, ``solids``, ``gravity_up``, ``front``,
+    ``seen_from``, ``settings``: see ``make_creature``. Returns what it wrote as ``report.json``
     (docs/guide/report.md). A folder belongs to one run (``egs_warp.io.run_folder``): one with an earlier run is
     refused, or that run moved aside (``overwrite``), or gone on with if it was cut off (``resume``): with the same
     arguments to the same bits. Raises ``UserError`` for bad input, before any file of an earlier run is touched.
@@ -153,17 +154,20 @@ def animate(
                 muscles_file=muscles_file,
                 solids=solids,
                 gravity_up=gravity_up,
+                front=front,
+                seen_from=seen_from,
                 settings=settings,
                 progress=lambda stage: bar.set_description_str(f"prepare: {stage}"),
             )
             bar.set_description_str("prepare: done")
+        if front is None:
+            notes = (*notes, creature.front.told(creature.frame))
         notes = (*notes, *oddities(creature.cloud, creature.cage.mesh, creature.body.height))
         with tqdm(total=options.frames or cut_off, desc="simulate", unit="frame", disable=quiet) as bar:
             performance = simulate(
                 creature,
                 asked,
                 frames=options.frames,
-                forward=forward,
                 parts=lambda: run.file(PARTS),
                 resume=_recorded(run),
                 progress=lambda _: bar.update(),
@@ -193,7 +197,7 @@ def animate(
             plane=None if plane is None else (*_numbers(plane.normal), plane.offset),
             view_from=_numbers(view_from),
             gravity_up=_numbers(gravity_up),
-            forward=_numbers(forward),
+            front=_numbers(front),
             muscles=None if muscles_file is None else Path(muscles_file).name,
             solids=len(solids),
         )

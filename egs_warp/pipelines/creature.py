@@ -21,20 +21,19 @@ from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame
 from egs_warp.meshing.cage import Cage, cage_of_body
+from egs_warp.meshing.occupancy import solid_from_gaussians
+from egs_warp.motions.limbs import Limbs, Sections, find_limbs
 from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import SOLE, Ground
+from egs_warp.motions.stance import Ground
 from egs_warp.muscles.files import read_muscles
 from egs_warp.muscles.muscle_set import MuscleSet, automatic_muscles
+from egs_warp.pipelines.front import Front, find_front
 from egs_warp.segmentation.base_plane import find_base_plane
 
 SMALLEST_SAG = 0.004
 """A body is not made stiffer than this column's sag, whatever it bends."""
 STEEPEST_SLOPE = 45.0
 """Degrees: nothing stands on a steeper one."""
-FILMED_FROM = (0.35, -1.0, 0.22)
-"""From the body to the camera of a film: ahead, left and up."""
-_DETAIL_CELL = 0.06
-"""Body heights: eyes and noses differ from what is this near, fur and flat paint do not."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +44,10 @@ class Creature:
     """Of the body, in the capture."""
     cloud: GaussianCloud
     """The capture, in the order of its own."""
-    front: np.ndarray
-    """(3,) unit, along the ground: where it shows most detail."""
+    front: Front
+    """Which way it faces, and moves."""
+    limbs: Limbs
+    """On which it stands."""
     cage: Cage
     stepper: LocomotionStepper
     """Body, muscles and contact."""
@@ -86,6 +87,8 @@ def make_creature(
     muscles_file: Path | None = None,
     solids: tuple[Solid, ...] = (),
     gravity_up: np.ndarray | None = None,
+    front: np.ndarray | None = None,
+    seen_from: np.ndarray | None = None,
     settings: LocomotionSettings | None = None,
     nodes: int = 500,
     progress: Callable[[str], object] = lambda stage: None,
@@ -94,7 +97,9 @@ def make_creature(
 
     All that is given is in the capture's frame and units; what is made is in the body's, so nothing hangs on how the
     file lies. ``muscles_file``: see ``body_muscles``. ``solids`` are steps and walls beside the ground; ``gravity_up``
-    (3,) is against gravity if the ground is a slope. ``settings`` of its stepper choose the strategy for the contact
+    (3,) is against gravity if the ground is a slope. ``front`` (3,) is the way it faces and moves; else it is found
+    (``find_front``), with ``seen_from`` (3,), the mean of the unit vectors to the cameras of its photos, if these are
+    known. ``settings`` of its stepper choose the strategy for the contact
     states and the QP solver. The body is as stiff as makes it sag by ``sag`` of its height; one that its weight would
     bend out of shape is made stiffer. ``nodes``: of its cage, about. ``progress`` is told the name of each stage.
     """
@@ -104,6 +109,8 @@ def make_creature(
         raise ArgumentError("plane", advice, check=("plane", "up"))
     if gravity_up is not None:
         _check_slope(normal / np.linalg.norm(normal), gravity_up)
+    if front is not None:
+        check_front(normal if gravity_up is None else gravity_up, front)
     progress("cage")
     standing = stand(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit, nodes=nodes)
     progress("contact")
@@ -113,6 +120,8 @@ def make_creature(
         standing.gaussians, cage.mesh, (GROUND,), solids=solids, friction=friction, device=device
     )
     against_gravity = None if gravity_up is None else frame.axes @ gravity_up
+    progress("front")
+    faces = face(standing, front, seen_from=seen_from)
     while True:
         progress("body and muscles")
         body = make_body(cage.mesh, GROUND, up=against_gravity, sag=sag, device=device)
@@ -122,8 +131,8 @@ def make_creature(
         start = settle(stepper)
         if sag < SMALLEST_SAG or _stands(stepper, start):
             everything = (Solid((GROUND,)), *solids)
-            front = _front(standing.gaussians, body.height)
-            return Creature(frame, in_body_frame(cloud, frame), front, cage, stepper, start, everything)
+            placed = in_body_frame(cloud, frame)
+            return Creature(frame, placed, faces, standing.limbs, cage, stepper, start, everything)
         sag *= 0.5
 
 
@@ -150,6 +159,8 @@ class Standing:
     gaussians: GaussianCloud
     """What the mechanics sees of the capture (``body_gaussians``)."""
     cage: Cage
+    limbs: Limbs
+    """On which it stands, found where the capture shows them."""
 
 
 def stand(
@@ -172,9 +183,30 @@ def stand(
         plane = plane.moved(-anchor)
     frame = find_body_frame(near, plane)
     gaussians = body_gaussians(near, frame)
-    cage = cage_of_body(gaussians, target_nodes=nodes)
+    solid = solid_from_gaussians(gaussians)
+    cage = cage_of_body(gaussians, target_nodes=nodes, solid=solid)
     metres = 1.0 / cage.height(GROUND) if metres_per_unit is None else metres_per_unit / frame.scale
-    return Standing(frame.moved(anchor).scaled(metres), gaussians.scaled(metres), cage.scaled(metres))
+    cage = cage.scaled(metres)
+    limbs = find_limbs(Sections.of_solid(solid.scaled(metres), cage.mesh), cage.mesh.nodes)
+    return Standing(frame.moved(anchor).scaled(metres), gaussians.scaled(metres), cage, limbs)
+
+
+def face(standing: Standing, front: np.ndarray | None = None, *, seen_from: np.ndarray | None = None) -> Front:
+    """Which way it faces: ``front`` (3,) if that is given, else as ``find_front`` finds; ``front`` and ``seen_from`` as
+    in ``make_creature``."""
+    axes = standing.frame.axes
+    if front is None:
+        seen = None if seen_from is None else axes @ seen_from
+        return find_front(standing.gaussians, standing.cage.mesh, seen_from=seen)
+    x, y, _ = axes @ front
+    return Front(np.array([x, y, 0.0]) / np.hypot(x, y), None)
+
+
+def check_front(up: np.ndarray, front: np.ndarray) -> None:
+    """Raises ``ArgumentError`` where ``front`` (3,) points along ``up`` (3,)."""
+    if np.linalg.norm(np.cross(front, up)) < 1e-3 * np.linalg.norm(front) * np.linalg.norm(up):
+        given = ",".join(f"{x:g}" for x in front)
+        raise ArgumentError("front", "points up or down; give a way along the ground", value=given)
 
 
 def _check_slope(normal: np.ndarray, up: np.ndarray) -> None:
@@ -213,58 +245,20 @@ def _stands(stepper: LocomotionStepper, start: BodyState) -> bool:
     return bool(np.linalg.norm(moved) < 0.04 * body.height and upright and gaps.min() > -0.01 * body.height)
 
 
-def first_place(creature: Creature, forward: np.ndarray | None = None, *, step: float | None = None) -> Place:
-    """Where the creature stands at the start; ``forward`` (3,) is the way of its motions in the capture, else the long
-    axis of its footprint.
+def first_place(creature: Creature, *, step: float | None = None) -> Place:
+    """Where the creature stands at the start, its front ahead.
 
     ``step``: seconds that a solver step takes at most, see ``solver_steps``.
     """
     body, start = creature.body, creature.start
     up = -body.gravity / np.linalg.norm(body.gravity)
-    ahead = _forward(creature) if forward is None else creature.frame.axes @ forward
-    if forward is not None and np.linalg.norm(np.cross(ahead, up)) < 1e-3 * np.linalg.norm(ahead):
-        given = ",".join(f"{x:g}" for x in forward)
-        raise ArgumentError("forward", "points up or down; give a way along the ground", value=given)
     return Place(
         body,
-        Ground.on(GROUND, ahead, body.centre_of_mass(start.positions), up=up),
+        Ground.on(GROUND, creature.front.direction, body.centre_of_mass(start.positions), up=up),
         start.positions,
         creature.stepper.detector.points_within(start.positions, 0.01 * body.height),
         solver_steps(body, step)[0],
         creature.solids,
         creature.geometry.friction,
+        creature.limbs,
     )
-
-
-def _forward(creature: Creature) -> np.ndarray:
-    """(3,) the long axis of the footprint: the direction in which the body is least likely to tip, with the body's
-    front to the camera; of a round one, its front.
-    """
-    nodes = creature.cage.mesh.nodes
-    sole = nodes[nodes[:, 2] < SOLE * creature.body.height, :2]
-    flat = sole - sole.mean(axis=0)
-    values, vectors = np.linalg.eigh(flat.T @ flat)
-    if values[1] <= 1.2 * values[0]:
-        return creature.front
-    (x, y), (ahead, left, _) = vectors[:, 1], FILMED_FROM
-    seen = ahead * np.array([x, y]) + left * np.array([-y, x])
-    return np.array([x, y, 0.0]) * (1.0 if seen @ creature.front[:2] >= 0.0 else -1.0)
-
-
-def _front(gaussians: GaussianCloud, height: float) -> np.ndarray:
-    """(3,) unit, along the ground: where a body of ``height`` shows most detail, as faces do.
-
-    Detail is the distance of a Gaussian's colour from the mean of those about it, in cells of ``_DETAIL_CELL`` heights.
-    """
-    means, colours = gaussians.means.numpy().astype(np.float64), gaussians.sh.numpy()[:, 0].astype(np.float64)
-    masses = np.where(means[:, 2] > 0.0, gaussians.opacities(), 0.0)
-    _, cell = np.unique(np.floor(means / (_DETAIL_CELL * height)), axis=0, return_inverse=True)
-    cell = cell.ravel()
-    mass = np.maximum(np.bincount(cell, masses), 1e-300)
-    around = np.stack([np.bincount(cell, masses * colours[:, k]) / mass for k in range(3)], axis=1)
-    detail = masses * np.linalg.norm(colours - around[cell], axis=1)
-    detail -= masses * detail.sum() / max(float(masses.sum()), 1e-300)
-    radius = np.linalg.norm(means[:, :2], axis=1)
-    x, y = (detail / np.maximum(radius, 1e-12)) @ means[:, :2]
-    length = float(np.hypot(x, y))
-    return np.array([x / length, y / length, 0.0]) if length > 0.0 else np.array([1.0, 0.0, 0.0])

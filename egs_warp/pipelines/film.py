@@ -85,7 +85,8 @@ def draw_film(
     creature, simulation = performance.creature, performance.simulation
     trajectory, shot = simulation.trajectory, shot or Shot()
     steps = simulation.frames if shot.fps == FRAME_RATE else nearest_steps(trajectory.time, shot.fps)
-    camera = resized(performance.camera(size, view_from), *(shot.size or (size, size)))
+    scene = creature.placed(background) if background is not None else None
+    camera = resized(performance.camera(size, view_from, scene=scene), *(shot.size or (size, size)))
     cameras = shot.cameras(camera, trajectory, steps)
     # The whole motion is known, so what it will bend is split before the first frame, and nothing can pop.
     started = time.perf_counter()
@@ -99,7 +100,7 @@ def draw_film(
         steps,
         cameras,
         shot,
-        scene=creature.placed(background) if background is not None else None,
+        scene=scene,
         shadow=shadow,
     )
     milliseconds: dict[str, list[float]] = {"deform": [], "render": [], "encode": []}

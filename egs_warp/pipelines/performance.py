@@ -10,14 +10,24 @@ import numpy as np
 
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.frames import box_corners
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.locomotion.rollout import FRAME_RATE, Simulation, roll_out
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.fall import FallWatch
 from egs_warp.motions.script import Script
 from egs_warp.motions.sequence import MotionSequence, Place
-from egs_warp.pipelines.creature import FILMED_FROM, Creature, first_place
+from egs_warp.pipelines.creature import Creature, first_place
 from egs_warp.pipelines.ending import Ending
 from egs_warp.pipelines.planned import planned_com
+
+FILMED_FROM = (0.6, -1.0, 0.22)
+"""From the body to the camera of a film: ahead, left and up; it shows the face and the way."""
+_FROM_ABOVE = 0.5
+"""Up for one along the ground, in a scene, which has a floor to be seen."""
+_IN_THE_WAY = 0.7
+"""Cosine of the angle to a side of the film within which things stand between."""
+_MORE = 0.02
+"""Of all that stands in the scene: so much more in the way than on another side does not matter."""
 
 
 @dataclass(frozen=True)
@@ -53,16 +63,19 @@ class Performance:
         """(n, N, 3) metres, in the frame of the body: the nodes of the cage in each frame of a video at 60 Hz."""
         return self.trajectory.positions[self.simulation.frames]
 
-    def camera(self, size: int, view_from: np.ndarray | None = None) -> Camera:
-        """A fixed camera of ``size`` pixels both ways that holds the whole motion: in front of the motion's side, or in
-        the direction ``view_from`` (3,) of the capture's frame."""
+    def camera(self, size: int, view_from: np.ndarray | None = None, *, scene: GaussianCloud | None = None) -> Camera:
+        """A fixed camera of ``size`` pixels both ways that holds the whole motion: ahead and to the right of it, or in
+        the direction ``view_from`` (3,) of the capture's frame.
+
+        Where the ``scene``, in the frame of the body, has much between, it goes round to the nearest clearer side.
+        """
         ground = self.place.ground
         local = ground.local(self.trajectory.positions).reshape(-1, 3)
         low, high = local.min(axis=0), local.max(axis=0)
         low[2] = min(low[2], 0.0)
         middle = 0.5 * (low + high)
         corners = box_corners(low, high)
-        direction = np.array(FILMED_FROM)
+        direction = np.array(FILMED_FROM) if scene is None else self._clear_side(scene)
         if view_from is not None:
             direction = ground.axes @ (self.creature.frame.axes @ np.asarray(view_from, float))
         direction /= np.linalg.norm(direction)
@@ -84,13 +97,26 @@ class Performance:
             distance *= 1.05
         return camera
 
+    def _clear_side(self, scene: GaussianCloud) -> np.ndarray:
+        """(3,) from the body to the camera, ground axes: of eight sides, from the usual one on, the nearest on which
+        hardly more stands between than on any."""
+        height = self.creature.body.height
+        local = self.place.ground.local(scene.means.numpy().astype(np.float64))
+        level = local[(local[:, 2] > 0.1 * height) & (scene.opacities() > 0.3), :2]
+        ahead, left, _ = FILMED_FROM
+        turns = np.exp(0.25j * np.pi * np.array([0, 1, -1, 2, -2, 3, -3, 4]))
+        sides = (ahead + 1j * left) * turns
+        ways = np.stack([sides.real, sides.imag], axis=1) / np.abs(sides)[:, None]
+        blocked = (level @ ways.T > _IN_THE_WAY * np.linalg.norm(level, axis=1)[:, None]).sum(axis=0)
+        first = int(np.flatnonzero(blocked <= blocked.min() + _MORE * len(level))[0])
+        return np.array([*ways[first], _FROM_ABOVE])
+
 
 def simulate(
     creature: Creature,
     motion: Script,
     *,
     frames: int | None = None,
-    forward: np.ndarray | None = None,
     step: float | None = None,
     parts: Callable[[], Path] | None = None,
     resume: Path | None = None,
@@ -99,12 +125,11 @@ def simulate(
     """Run ``motion`` for ``frames`` at 60 Hz, or else until the body has come to rest or fallen, or the motion is cut
     off.
 
-    ``forward`` (3,) is the way of the motion, the long axis of the footprint if not given; ``step`` the seconds of a
-    solver step, if not the usual; ``parts`` tells the folder that takes the steps as they are done, ``resume`` is
-    that of a run that was cut off and goes on. ``progress`` is told each frame done. Raises ``UserError`` for a motion
-    that the body cannot do, and a folder that another run has left.
+    ``step``: the seconds of a solver step, if not the usual; ``parts`` tells the folder that takes the steps as they
+    are done, ``resume`` is that of a run that was cut off and goes on. ``progress`` is told each frame done. Raises
+    ``UserError`` for a motion that the body cannot do, and a folder that another run has left.
     """
-    place = first_place(creature, forward, step=step)
+    place = first_place(creature, step=step)
     motion.check(place)
     sequence = MotionSequence(place, motion.parts(creature.body.height))
     watch = FallWatch(sequence, place)

@@ -145,22 +145,15 @@ def take_apart(
     return thing, cloud.subset(found.background_mask), notes
 
 
-def viewing_direction(scene: PreparedScene, cameras: Sequence[Camera]) -> np.ndarray:
-    """(3,) from the object to where a picture is best taken: where the capture's own cameras were, or else from half
-    above.
+def viewing_direction(scene: PreparedScene, cameras: Sequence[Camera]) -> np.ndarray | None:
+    """(3,) from the object to where a picture is best taken: where the capture's own cameras were; None where it has
+    none above the plane.
 
     Captures look best from where they were taken; of those cameras it is the one of median height.
     """
     normal, centre = scene.plane.normal, scene.located.centre
     away = [camera.centre - centre for camera in cameras if scene.plane.heights(camera.centre) > 0.0]
-    if away:
-        sines = np.array([direction @ normal / np.linalg.norm(direction) for direction in away])
-        return away[int(np.argsort(sines)[len(sines) // 2])]
-    # Of eight sides, the one on which the least stands between the camera and the object.
-    means, opacity = scene.background.means.numpy().astype(np.float64), scene.background.opacities()
-    first, second = scene.plane.tangents()
-    level = means - centre - ((means - centre) @ normal)[:, None] * normal
-    standing = (scene.plane.heights(means) > 0.1 * scene.located.size) & (opacity > 0.3)
-    directions = [np.cos(a) * first + np.sin(a) * second for a in np.arange(8) * np.pi / 4.0 - 0.5 * np.pi + 0.35]
-    blocked = [int(np.count_nonzero(standing & (level @ d > 0.7 * np.linalg.norm(level, axis=1)))) for d in directions]
-    return directions[int(np.argmin(blocked))] + 0.5 * normal
+    if not away:
+        return None
+    sines = np.array([direction @ normal / np.linalg.norm(direction) for direction in away])
+    return away[int(np.argsort(sines)[len(sines) // 2])]

@@ -14,8 +14,9 @@ from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.locomotion.rollout import FRAME_RATE
-from egs_warp.pipelines.creature import FILMED_FROM, Creature, first_place
+from egs_warp.pipelines.creature import Creature, first_place
 from egs_warp.pipelines.drawn import DrawnCreature
+from egs_warp.pipelines.performance import FILMED_FROM
 from egs_warp.web.messages import LEAST_SAG, MOST_FRICTION, MOST_SAG, read_message
 from egs_warp.web.packets import Frame
 from egs_warp.web.recording import CURVES, creature_header, curve_facts
@@ -84,12 +85,11 @@ class LiveFeed:
         self.session.ask(read_message(message, height=body.height, node_count=len(body.node_mass)))
 
 
-def live_camera(creature: Creature, forward: np.ndarray | None = None, *, size: int = 512) -> Camera:
-    """Looks at the standing creature as a film does, with room around it to move in; ``forward`` (3,): see
-    ``first_place``."""
+def live_camera(creature: Creature, *, size: int = 512) -> Camera:
+    """Looks at the standing creature as a film does, with room around it to move in."""
     nodes, height = creature.start.positions, creature.body.height
     middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
-    direction = np.array(FILMED_FROM) / np.linalg.norm(FILMED_FROM) @ first_place(creature, forward).ground.axes
+    direction = np.array(FILMED_FROM) / np.linalg.norm(FILMED_FROM) @ first_place(creature).ground.axes
     fov = 30.0
     distance = _ROOM * height / np.tan(np.radians(0.5 * fov))
     return Camera.look_at(
@@ -103,6 +103,6 @@ def live_camera(creature: Creature, forward: np.ndarray | None = None, *, size: 
     )
 
 
-def drawn_creature(creature: Creature, splats: GaussianCloud, forward: np.ndarray | None = None) -> DrawnCreature:
+def drawn_creature(creature: Creature, splats: GaussianCloud) -> DrawnCreature:
     """``creature`` as the page draws it, of ``splats`` that were split at rest."""
-    return DrawnCreature.of(splats, live_camera(creature, forward), creature.muscles)
+    return DrawnCreature.of(splats, live_camera(creature), creature.muscles)

@@ -20,7 +20,6 @@ from egs_warp.errors import UserError
 from egs_warp.fem.body import DEFAULT_SAG, BodyState
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.motions.script import MOST_MOTIONS
-from egs_warp.motions.sequence import Place
 from egs_warp.pipelines.creature import Creature, changed_creature, first_place
 from egs_warp.pipelines.drawn import DrawnCreature
 from egs_warp.web.messages import (
@@ -64,8 +63,6 @@ class SessionOptions:
     takes: Path = Path("out/live")
     """Folder for what is recorded."""
     muscles_file: Path | None = None
-    forward: np.ndarray | None = None
-    """(3,) the way of its motions, in the capture."""
     sag: float = DEFAULT_SAG
     """With which ``creature`` was made."""
 
@@ -80,7 +77,7 @@ class Session:
         self.state, self.report = creature.start, None
         self._memory = creature.stepper.initial_memory()
         self._dt, _ = solver_steps(creature.body)
-        self._place = self._first_place(creature)
+        self._place = first_place(creature)
         self.steering = Steering(self._place, self._tell)
         self._spring: Spring | None = None
         self._take: Take | None = None
@@ -279,7 +276,7 @@ class Session:
         self._send({"type": "busy", "on": True})
         try:
             made = changed_creature(self.creature, friction=friction, sag=sag, muscles_file=self.options.muscles_file)
-            place = self._first_place(made)
+            place = first_place(made)
             if sag != self.sag and tilt_degrees(self._place, made.start.positions) > FALLEN:
                 raise UserError(f"sag {sag:g}: so soft a body does not stand; choose a smaller one")
         except (UserError, FloatingPointError, np.linalg.LinAlgError) as error:
@@ -292,9 +289,6 @@ class Session:
         self.steering.place = place
         self._due = time.perf_counter()
         self._send({"type": "busy", "on": False})
-
-    def _first_place(self, creature: Creature) -> Place:
-        return first_place(creature, self.options.forward)
 
     def _record(self, on: bool) -> None:
         if on and self._take is None:

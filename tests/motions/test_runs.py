@@ -69,8 +69,8 @@ def run(script: str, **ground: Any) -> tuple[MotionSequence, list[Reached], np.n
     Asserts the audit.
     """
     thing = pawn(device="cpu")
-    creature = make_creature(thing.cloud, plane=thing.plane, **ground)
-    performance = simulate(creature, motion(script), forward=FORWARD)
+    creature = make_creature(thing.cloud, plane=thing.plane, front=FORWARD, **ground)
+    performance = simulate(creature, motion(script))
     sequence, simulation = performance.sequence, performance.simulation
     trajectory = simulation.trajectory
     assert_audit(trajectory, simulation.reports)

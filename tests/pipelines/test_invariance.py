@@ -21,8 +21,8 @@ from egs_warp.locomotion.rollout import Simulation
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.locomotion.trajectory import Reached, measure
 from egs_warp.motions.script import motion
-from egs_warp.pipelines.creature import FILMED_FROM, Creature, first_place, make_creature
-from egs_warp.pipelines.performance import simulate
+from egs_warp.pipelines.creature import Creature, first_place, make_creature
+from egs_warp.pipelines.performance import FILMED_FROM, simulate
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.base_plane import find_base_plane
 from tests.support.frames import TURN, Lying
@@ -135,7 +135,8 @@ def test_trajectory_leads_back_to_the_capture(elsewhere: tuple[Lying, Creature, 
 
 LIMIT, KNOWN_MISS = 0.01, 0.06
 """Of distance and height: what is wanted, and what rounding that grows in a jump costs today. Measured: the pawn in
-another unit and turned, distance +1.1 % and height -4.4 %; monkey -1.002 % and +0.39 %; plush dog -0.74 % and -1.76 %.
+another unit and turned, distance +1.1 % and height -4.4 %; plush dog +1.6 % and -0.1 %; monkey within
+1 %.
 """
 
 
@@ -181,6 +182,7 @@ def test_front_is_where_the_face_is(monkeypatch: pytest.MonkeyPatch) -> None:
     turned = Lying(made.cloud, made.plane).turned()
     creature = make_creature(turned.cloud, plane=turned.plane)
     face = creature.frame.axes @ TURN @ [0.0, -1.0, 0.0]
-    assert creature.front @ face > 0.8
+    assert creature.front.direction @ face > 0.98
     ground = first_place(creature).ground
-    assert (FILMED_FROM @ ground.axes) @ face > 0.3
+    assert ground.axes[0] @ face > 0.98, "it moves the way it faces"
+    assert (FILMED_FROM @ ground.axes) @ face > 0.5

@@ -173,6 +173,6 @@ def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:
     assert any("straddled the plane: split at it" in note for note in prepared.notes)
     cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.9, count=3, elevations=(20.0, 40.0, 60.0))
     direction = viewing_direction(prepared, cameras)
+    assert direction is not None
     np.testing.assert_allclose(direction, cameras[1].centre - prepared.located.centre)
-    up = viewing_direction(prepared, [])
-    assert 0.3 < up @ prepared.plane.normal / np.linalg.norm(up) < 0.6
+    assert viewing_direction(prepared, []) is None

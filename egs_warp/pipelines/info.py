@@ -1,0 +1,388 @@
+"""What the program finds in a capture: up, front, base, feet, size, muscles, and what the body can be asked for."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import wrap
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from egs_warp.errors import UserError
+from egs_warp.fem.body import SoftBody, make_body
+from egs_warp.geometry.body_frame import GROUND
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.io.atomic import atomic_write
+from egs_warp.locomotion.rollout import solver_steps
+from egs_warp.motions.feet import Base, Foot, around, base_of
+from egs_warp.motions.repertoire import REPERTOIRE
+from egs_warp.motions.request import MotionRequest
+from egs_warp.motions.script import Script
+from egs_warp.motions.sequence import Place
+from egs_warp.motions.stance import SOLE, Ground
+from egs_warp.muscles.fibres import FibreKind
+from egs_warp.muscles.muscle_set import MuscleSet
+from egs_warp.pipelines.creature import Standing, body_muscles, check_front, face, stand
+from egs_warp.pipelines.front import Front
+from egs_warp.pipelines.oddities import oddities
+from egs_warp.render.rasteriser import render_gaussians
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_SIDE = 480
+"""Pixels of a picture of the capture."""
+_NEAR_GROUND = 0.01
+"""Body heights: what is so low at rest touches the ground."""
+_PALE = 0.82
+"""Grey of what is no limb."""
+_LINE = 68
+"""Characters of a line in the picture."""
+_MARGIN = 16
+"""Pixels."""
+
+
+@dataclass(frozen=True)
+class BodyInfo:
+    """A capture as the program sees it, in the frame of its body, metres; at rest, not yet bent by its weight."""
+
+    source: str
+    standing: Standing
+    body: SoftBody
+    muscles: MuscleSet
+    front: Front
+    base: Base
+    place: Place
+    feet: tuple[Foot, ...]
+    """As they are numbered: anticlockwise as seen from above, from straight ahead on."""
+    notes: tuple[str, ...]
+
+    def soles(self) -> np.ndarray:
+        """(feet, 3) middle of each sole: forward, left and up of the centre of mass's foot on the ground."""
+        local = self.place.ground.local(self.place.standing)
+        return np.array([local[foot.sole].mean(axis=0) for foot in self.feet]).reshape(-1, 3)
+
+    def motions(self) -> dict[str, str | None]:
+        """Why the body cannot do a motion, None where it can."""
+        return {name: self._refused(name) for name in REPERTOIRE}
+
+    def _refused(self, name: str) -> str | None:
+        kind = REPERTOIRE[name]
+        if kind.file is not None:
+            return None
+        asked = {value.name: value.default for value in kind.takes}
+        try:
+            Script((MotionRequest(name, asked),)).check(self.place)
+        except UserError as error:
+            return str(error).removeprefix(f"{name}: ")
+        return None
+
+    def lines(self) -> list[str]:
+        """For the terminal; lengths in body heights where no unit is named."""
+        frame, height = self.standing.frame, self.body.height
+        up, ahead = (_numbers(frame.axes.T @ way) for way in (GROUND.normal, self.front.direction))
+        plane = Plane(frame.axes[2], -float(frame.axes[2] @ frame.origin))
+        size = np.ptp(self.place.ground.local(self.place.standing), axis=0) / height
+        mesh, kinds = self.standing.cage.mesh, self._kinds()
+        found = [
+            f"capture  {self.source}: {self.standing.gaussians.count} Gaussians",
+            f"up       {up}",
+            f"ground   {_numbers(plane.normal, 4)},{plane.offset:.4g}",
+            f"front    {ahead}" + (" as given" if self.front.reason is None else f" ({self.front.reason})"),
+            f"height   {height / frame.scale:.4g} of the capture's units, {height:.4g} m; {size[0]:.2f} long,"
+            f" {size[1]:.2f} wide",
+            f"cage     {len(mesh.nodes)} nodes, {len(mesh.tets)} tetrahedra",
+            f"stands   on {self._stands()}",
+        ]
+        for number, (foot, sole) in enumerate(zip(self.feet, self.soles() / height, strict=True), start=1):
+            found.append(f"  foot {number}: {_place(sole)}, leg {foot.length / height:.2f}{_oddity(foot, height)}")
+        found.append(
+            f"muscles  {self.muscles.fibre_count} fibres, {self.muscles.segment_count} segments"
+            f" ({', '.join(f'{count} {kind.value}' for kind, count in kinds.items())})"
+        )
+        for name, why in self.motions().items():
+            needs = REPERTOIRE[name].file
+            can = f"yes, with {needs}" if needs is not None else "yes"
+            found.append(f"{name:<10} {can if why is None else f'no: {why}'}")
+        return [*found, *(f"note: {note}" for note in self.notes)]
+
+    def _kinds(self) -> dict[FibreKind, int]:
+        return dict(Counter(self.muscles.fibre_kinds[fibre] for fibre in self.muscles.fibre_from_segment))
+
+    def _stands(self) -> str:
+        if self.base is Base.FEET:
+            return f"{len(self.feet)} feet, numbered anticlockwise from straight ahead"
+        return {
+            Base.ONE: "one base",
+            Base.ROUND: "a round base: it can roll",
+            Base.LONG: "its length: it has no feet",
+        }[self.base]
+
+
+def _numbers(vector: np.ndarray, digits: int = 2) -> str:
+    # No minus before nothing.
+    return ",".join(f"{x + 0.0:.{digits}f}" for x in np.round(vector, digits))
+
+
+def _place(sole: np.ndarray) -> str:
+    ahead, left, _ = sole
+    along, aside = "ahead" if ahead >= 0.0 else "behind", "left" if left >= 0.0 else "right"
+    return f"{abs(ahead):.2f} {along}, {abs(left):.2f} {aside}"
+
+
+def _oddity(foot: Foot, height: float) -> str:
+    short = f", ends {foot.height / height:.3f} over the ground" if foot.height > 0.0 else ""
+    return f"{short}{', joined to another in the cage' if foot.joined else ''}"
+
+
+def look_into(
+    cloud: GaussianCloud,
+    *,
+    source: str = "capture",
+    up: np.ndarray | None = None,
+    plane: Plane | None = None,
+    front: np.ndarray | None = None,
+    metres_per_unit: float | None = None,
+    muscles_file: Path | None = None,
+    nodes: int = 500,
+    notes: tuple[str, ...] = (),
+    progress: Callable[[str], object] = lambda stage: None,
+) -> BodyInfo:
+    """What ``make_creature`` would find in a capture with the same arguments, without letting it stand.
+
+    Raises ``UserError`` as that does.
+    """
+    normal = plane.normal if plane is not None else up
+    if front is not None and normal is not None:
+        check_front(normal, front)
+    progress("cage")
+    standing = stand(cloud, up=up, plane=plane, metres_per_unit=metres_per_unit, nodes=nodes)
+    mesh = standing.cage.mesh
+    progress("front")
+    faces = face(standing, front)
+    progress("muscles")
+    body = make_body(mesh, GROUND, device=str(cloud.device))
+    muscles = body_muscles(body, muscles_file, standing.frame)
+    place = Place(
+        body,
+        Ground.on(GROUND, faces.direction, body.centre_of_mass(mesh.nodes)),
+        mesh.nodes,
+        mesh.nodes[mesh.nodes[:, 2] < _NEAR_GROUND * body.height],
+        solver_steps(body, None)[0],
+        limbs=standing.limbs,
+    )
+    feet = place.feet()
+    base = base_of(mesh, mesh.nodes[:, 2], len(feet))
+    if len(feet) > 1:
+        soles = np.array([place.ground.local(mesh.nodes[foot.sole])[:, :2].mean(axis=0) for foot in feet])
+        feet = tuple(feet[index] for index in around(soles))
+    notes = (*notes, *oddities(standing.gaussians, mesh, body.height))
+    return BodyInfo(source, standing, body, muscles, faces, base, place, feet, notes)
+
+
+_COLOURS = ("#d62728", "#1f77b4", "#2ca02c", "#ff7f0e", "#9467bd", "#8c564b", "#e377c2", "#17becf")
+_KINDS = {
+    FibreKind.LONGITUDINAL: "#d23c3c",
+    FibreKind.RADIAL: "#3ca03c",
+    FibreKind.CIRCULAR: "#2878c8",
+    FibreKind.OBLIQUE_LEFT: "#aa3cbe",
+    FibreKind.OBLIQUE_RIGHT: "#f0961e",
+    FibreKind.USER: "#5a5a5a",
+}
+
+
+def draw_info(path: Path, info: BodyInfo) -> None:
+    """Write a picture (.png): the capture from the front and its left, its limbs, muscles and feet, and ``lines``.
+
+    Raises ``UserError`` if ``path`` cannot be written.
+    """
+    # Takes a quarter of a second to import.
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(15.0, 10.0), layout="constrained")
+    grid = figure.add_gridspec(2, 6)
+    views = {"from the front": (1.0, 0.0), "from its left": (0.0, 1.0)}
+    for column, (title, way) in enumerate(views.items()):
+        axes = figure.add_subplot(grid[0, 2 * column : 2 * column + 2])
+        _draw_capture(axes, info, np.array(way))
+        axes.set_title(title)
+    _draw_base(figure.add_subplot(grid[0, 4:]), info)
+    _draw_cage(figure.add_subplot(grid[1, :2]), info)
+    _draw_muscles(figure.add_subplot(grid[1, 2:4]), info)
+    _write_lines(figure.add_subplot(grid[1, 4:]), info)
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=100, format="png", facecolor="white")
+
+
+def _draw_capture(axes: Axes, info: BodyInfo, way: np.ndarray) -> None:
+    """The capture from ``way`` (2,), forward and left, with feet, ground and front drawn over it."""
+    ground, nodes, height = info.place.ground, info.place.standing, info.body.height
+    middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
+    direction = np.array([*way, 0.12]) / np.hypot(1.0, 0.12) @ ground.axes
+    distance = 1.1 * float(np.linalg.norm(nodes - middle, axis=1).max()) / np.sin(np.radians(12.0))
+    camera = Camera.look_at(
+        middle + distance * direction,
+        middle,
+        GROUND.normal,
+        width=_SIDE,
+        height=_SIDE,
+        vertical_fov_degrees=24.0,
+        near=0.01 * distance,
+    )
+    image = render_gaussians(info.standing.gaussians, camera, background=(1.0, 1.0, 1.0))
+    axes.imshow(image.colour_srgb8())
+
+    def pixels(points: np.ndarray) -> np.ndarray:
+        seen = np.atleast_2d(points) @ camera.rotation.T + camera.translation
+        return seen[:, :2] / seen[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+
+    for number, foot in enumerate(info.feet):
+        sole = nodes[foot.sole].mean(axis=0)
+        leg = np.flatnonzero(foot.leg > 0.0) if len(info.feet) > 1 else foot.sole
+        top = nodes[leg[nodes[leg, 2] > 0.7 * foot.length]] if len(info.feet) > 1 else nodes[:0]
+        line = pixels(np.stack([sole, top.mean(axis=0)]) if len(top) else sole)
+        colour = _COLOURS[number % len(_COLOURS)]
+        axes.plot(*line.T, color=colour, linewidth=3.0, alpha=0.8)
+        _number(axes, line[0], number + 1, colour)
+    edge = nodes[:, 2].max() * GROUND.normal + middle * [1.0, 1.0, 0.0]
+    aside = ground.axes[1] * way[0] - ground.axes[0] * way[1]
+    reach = float(np.abs((nodes - middle) @ aside).max()) + 0.08 * height
+    bar = pixels(np.stack([edge * [1.0, 1.0, 0.0], edge]) - reach * aside)
+    axes.annotate("", bar[1], bar[0], arrowprops={"arrowstyle": "<->", "color": "0.3"})
+    units = height / info.standing.frame.scale
+    x, y = bar.mean(axis=0).tolist()
+    axes.text(x, y, f"{units:.3g}", rotation=90, ha="right", va="center", color="0.3")
+    seen = np.concatenate([pixels(nodes), bar])
+    if way[0] == 0.0:
+        ahead = float(ground.local(nodes)[:, 0].max())
+        arrow = pixels(ground.world(np.array([[ahead + 0.05 * height, 0.0, 0.0], [ahead + 0.35 * height, 0.0, 0.0]])))
+        _arrow(axes, arrow, "front")
+        seen = np.concatenate([seen, arrow])
+    low, high = seen.min(axis=0) - _MARGIN, seen.max(axis=0) + _MARGIN
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(high[1], low[1])
+    axes.axis("off")
+
+
+def _draw_base(axes: Axes, info: BodyInfo) -> None:
+    """From above, front up: the outline of the body, the soles, the centre of mass."""
+    height = info.body.height
+    local = info.place.ground.local(info.place.standing) / height
+
+    def flat(points: np.ndarray) -> np.ndarray:
+        return np.stack([-points[:, 1], points[:, 0]], axis=1)
+
+    _fill(axes, flat(local), "0.93")
+    _fill(axes, flat(local[local[:, 2] < SOLE]), "0.8")
+    for number, foot in enumerate(info.feet):
+        colour = _COLOURS[number % len(_COLOURS)]
+        points = flat(local[foot.sole])
+        _fill(axes, points, colour, alpha=0.35)
+        axes.plot(*points.T, ".", color=colour, markersize=4.0)
+        _number(axes, points.mean(axis=0), number + 1, colour)
+    axes.plot(0.0, 0.0, "k+", markersize=14.0)
+    reach = float(np.abs(local[:, :2]).max())
+    _arrow(axes, np.array([[0.0, 1.05 * reach], [0.0, 1.35 * reach]]), "front")
+    axes.set_ylim(-1.1 * reach, 1.45 * reach)
+    axes.set_xlim(-1.1 * reach, 1.1 * reach)
+    axes.set_aspect("equal")
+    stands = f"{len(info.feet)} feet" if info.base is Base.FEET else info.base.value
+    axes.set_title(f"stands on {stands}; from above")
+    axes.set_xlabel("to the right, body heights; + is under the centre of mass")
+    axes.set_ylabel("ahead, body heights")
+
+
+def _fill(axes: Axes, points: np.ndarray, colour: str, *, alpha: float = 1.0) -> None:
+    """The hull of points (n, 2)."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        corners = points[ConvexHull(points).vertices]
+    except (QhullError, ValueError):  # Fewer than three, or all in one line.
+        return
+    axes.fill(*corners.T, color=colour, alpha=alpha, linewidth=0.0)
+
+
+def _number(axes: Axes, place: np.ndarray, number: int, colour: str) -> None:
+    style = {"boxstyle": "circle", "facecolor": colour, "edgecolor": "white"}
+    x, y = place.tolist()
+    axes.text(x, y, str(number), color="white", ha="center", va="center", weight="bold", bbox=style, zorder=5)
+
+
+def _arrow(axes: Axes, line: np.ndarray, text: str) -> None:
+    style = {"arrowstyle": "->", "linewidth": 2.0}
+    axes.annotate(text, line[1], line[0], arrowprops=style, ha="center", va="center", annotation_clip=False)
+
+
+def _three_quarters(info: BodyInfo) -> np.ndarray:
+    """(3, 3) right, up and towards the eye that looks from ahead and the left."""
+    eye = np.array([0.8, 0.6, 0.35])
+    eye /= np.linalg.norm(eye)
+    right = np.cross([0.0, 0.0, 1.0], eye)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(eye, right), eye]) @ info.place.ground.axes
+
+
+def _draw_faces(axes: Axes, info: BodyInfo, *, limbs: bool) -> None:
+    from matplotlib.collections import PolyCollection
+    from matplotlib.colors import to_rgb
+
+    nodes, axis = info.place.standing, _three_quarters(info)
+    faces = info.standing.cage.mesh.boundary_faces()
+    corners = nodes[faces] @ axis.T
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    order = np.argsort(corners[:, :, 2].mean(axis=1))
+    order = order[normals[order, 2] > 0.0]
+    colours = np.full((len(nodes), 3), _PALE)
+    if limbs and len(info.feet) > 1:
+        for number, foot in enumerate(info.feet):
+            share = foot.leg[:, None] > 0.0
+            colours = np.where(share, to_rgb(_COLOURS[number % len(_COLOURS)]), colours)
+    shade = (0.65 + 0.35 * normals[order, 2:]) * colours[faces[order]].mean(axis=1)
+    line = 0.3 if limbs else 0.1
+    axes.add_collection(
+        PolyCollection(list(corners[order, :, :2]), facecolors=shade, edgecolors="0.4", linewidths=line)
+    )
+    flat = nodes @ axis[:2].T
+    axes.set_xlim(flat[:, 0].min(), flat[:, 0].max())
+    axes.set_ylim(flat[:, 1].min(), flat[:, 1].max())
+    axes.set_aspect("equal")
+    axes.axis("off")
+
+
+def _draw_cage(axes: Axes, info: BodyInfo) -> None:
+    _draw_faces(axes, info, limbs=True)
+    axis = _three_quarters(info)
+    for number, foot in enumerate(info.feet):
+        place = axis[:2] @ info.place.standing[foot.sole].mean(axis=0)
+        _number(axes, place, number + 1, _COLOURS[number % len(_COLOURS)])
+    axes.set_title(f"cage of {len(info.place.standing)} nodes, legs coloured")
+
+
+def _draw_muscles(axes: Axes, info: BodyInfo) -> None:
+    _draw_faces(axes, info, limbs=False)
+    muscles = info.muscles
+    ends = muscles.end_points(info.place.standing) @ _three_quarters(info)[:2].T
+    kinds = [muscles.fibre_kinds[fibre] for fibre in muscles.fibre_from_segment]
+    for kind, count in info._kinds().items():
+        mine = [segment for segment, its in zip(muscles.segments, kinds, strict=True) if its is kind]
+        for number, (first, last) in enumerate(mine):
+            label = f"{kind.value} ({count})" if number == 0 else None
+            axes.plot(
+                *ends[[first, last]].T, color=_KINDS[kind], linewidth=1.8, marker=".", markersize=4.0, label=label
+            )
+    axes.legend(fontsize="small", loc="lower center", ncols=3, frameon=False, bbox_to_anchor=(0.5, -0.12))
+    axes.set_title(f"{muscles.segment_count} muscle segments")
+
+
+def _write_lines(axes: Axes, info: BodyInfo) -> None:
+    lines = [part for line in info.lines() for part in wrap(line, _LINE, subsequent_indent="         ")]
+    size = min(9.0, 300.0 / max(len(lines), 1))
+    axes.text(0.0, 1.0, "\n".join(lines), family="monospace", fontsize=size, va="top", transform=axes.transAxes)
+    axes.axis("off")

@@ -1,0 +1,165 @@
+"""Limbs and feet of bodies of many shapes: what they stand on is told by the limbs above as much as by the ground."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.meshing.occupancy import LatticeSolid
+from egs_warp.motions.feet import Base, around, base_of, feet_around, find_feet
+from egs_warp.motions.limbs import Sections, find_limbs
+from tests.support.meshes import UP, carved, coarse_stool, column, figure, stool
+
+Shape = Callable[[np.ndarray], np.ndarray]
+"""Which of the points (n, 3) it holds."""
+SIZE = (1.0, 1.0, 1.0)
+
+
+def legged(count: int, *, radius: float = 0.36, thick: float = 0.09, seat: float = 0.7, turn: float = 0.3) -> Shape:
+    """A round seat on so many legs."""
+    angles = turn + 2.0 * np.pi * np.arange(count) / count
+    places = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+    def holds(p: np.ndarray) -> np.ndarray:
+        away = np.linalg.norm(p[:, None, :2] - places, axis=2).min(axis=1)
+        return (away < thick) | ((np.linalg.norm(p[:, :2], axis=1) < 0.47) & (p[:, 2] > seat))
+
+    return holds
+
+
+def ball(p: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(p - [0.0, 0.0, 0.5], axis=1) < 0.5
+
+
+def pawn(p: np.ndarray) -> np.ndarray:
+    radius = np.linalg.norm(p[:, :2], axis=1)
+    return (radius < 0.35) & (p[:, 2] < 0.2) | (radius < 0.15) | (np.linalg.norm(p - [0, 0, 0.8], axis=1) < 0.22)
+
+
+def mesh_of(shape: Shape, size: tuple[float, float, float] = SIZE, cell: float = 0.05) -> TetMesh:
+    return carved(size, cell, shape)
+
+
+def feet_of(mesh: TetMesh, heights: np.ndarray | None = None) -> tuple[int, Base]:
+    heights = mesh.nodes[:, 2] if heights is None else heights
+    feet = find_feet(mesh, heights, float(np.ptp(heights)))
+    return len(feet), base_of(mesh, heights, len(feet))
+
+
+SNAKE = carved((2.4, 0.3, 0.2), 0.05, lambda p: np.abs(p[:, 1] - 0.06 * np.sin(6.0 * p[:, 0])) < 0.09)
+BODIES = {
+    "stool": (stool(), 4, Base.FEET),
+    "coarse stool": (coarse_stool(), 4, Base.FEET),
+    "figure": (figure(), 2, Base.FEET),
+    "column": (column(), 1, Base.ONE),
+    "tripod": (mesh_of(legged(3)), 3, Base.FEET),
+    "six legs": (mesh_of(legged(6)), 6, Base.FEET),
+    "eight legs": (mesh_of(legged(8), cell=0.04), 8, Base.FEET),
+    "snake": (SNAKE, 0, Base.LONG),
+    "ball": (mesh_of(ball), 1, Base.ROUND),
+    "pawn": (mesh_of(pawn), 1, Base.ONE),
+    "block": (mesh_of(lambda p: np.ones(len(p), bool), (0.6, 0.5, 1.0), 0.1), 1, Base.ONE),
+}
+
+
+@pytest.mark.parametrize("name", BODIES)
+@pytest.mark.parametrize("tilt", [0.0, 1.0, -1.0])
+def test_bodies_stand_on_what_they_have(name: str, tilt: float) -> None:
+    """Level, and on a plane that is found a degree off."""
+    mesh, count, base = BODIES[name]
+    normal = Rotation.from_euler("y", tilt, degrees=True).as_matrix()[:, 2]
+    heights = mesh.nodes @ normal
+    assert feet_of(mesh, heights - heights.min()) == (count, base)
+
+
+def short_legged(p: np.ndarray) -> np.ndarray:
+    """Four legs, of which the one at +x, +y ends 0.05 over the ground."""
+    legs = np.abs(np.abs(p[:, :2]) - 0.35).max(axis=1) < 0.1
+    ends = np.where((p[:, :2] > 0.0).all(axis=1), 0.05, 0.0)
+    return (legs & (p[:, 2] > ends)) | (p[:, 2] > 0.7)
+
+
+def test_a_table_with_one_short_leg_has_four_feet() -> None:
+    """It says which is short, and by how much; its sole is its own lowest nodes."""
+    mesh = mesh_of(short_legged)
+    feet = find_feet(mesh, mesh.nodes[:, 2], 1.0)
+    assert len(feet) == 4
+    short = [foot for foot in feet if foot.height > 0.0]
+    assert [foot.height for foot in short] == [pytest.approx(0.05)]
+    assert np.all(mesh.nodes[short[0].sole, :2] > 0.0) and np.all(mesh.nodes[short[0].sole, 2] == pytest.approx(0.05))
+    assert not any(foot.joined for foot in feet)
+
+
+def test_what_hangs_is_no_foot() -> None:
+    """A fifth leg that ends a quarter of the height above the ground."""
+    mesh = mesh_of(lambda p: short_legged(p) | ((np.abs(p[:, :2]).max(axis=1) < 0.1) & (p[:, 2] > 0.25)))
+    assert feet_of(mesh) == (4, Base.FEET)
+
+
+def melted(thickness: float) -> TetMesh:
+    """Four legs on a slab."""
+    four = legged(4, turn=0.25 * np.pi)
+    return mesh_of(lambda p: four(p) | ((np.abs(p[:, :2]).max(axis=1) < 0.4) & (p[:, 2] < thickness)))
+
+
+def test_legs_that_melt_together_at_the_base_are_told_apart() -> None:
+    """Each sole is a quarter of the slab, and a walk is told what keeps it."""
+    mesh = melted(0.05)
+    feet = find_feet(mesh, mesh.nodes[:, 2], 1.0)
+    assert len(feet) == 4 and all(foot.joined for foot in feet)
+    corners = {tuple(np.sign(mesh.nodes[foot.sole, :2].mean(axis=0)).astype(int)) for foot in feet}
+    assert corners == {(1, 1), (1, -1), (-1, 1), (-1, -1)}
+    for foot in feet:
+        assert foot.length == pytest.approx(0.7, abs=0.03)
+        assert np.all(foot.leg[foot.sole] == 1.0)
+    assert len(np.unique(np.concatenate([foot.sole for foot in feet]))) == sum(len(foot.sole) for foot in feet)
+    with pytest.raises(UserError, match="of the body's four 4 are joined to another"):
+        feet_around(feet, mesh.nodes, UP)
+
+
+def test_legs_on_a_thick_slab_stand_on_one_base() -> None:
+    assert feet_of(melted(0.25)) == (1, Base.ONE)
+
+
+def test_a_tail_held_up_from_the_base_carries_nothing() -> None:
+    """Beside a trunk on the same slab."""
+    mesh = mesh_of(
+        lambda p: (
+            (p[:, 2] < 0.1)
+            | (np.linalg.norm(p[:, :2] - [0.2, 0.0], axis=1) < 0.25)
+            | ((np.linalg.norm(p[:, :2] + [0.35, 0.0], axis=1) < 0.1) & (p[:, 2] < 0.8))
+        )
+    )
+    assert feet_of(mesh) == (1, Base.ONE)
+
+
+def test_gaps_finer_than_the_cage_are_seen_in_the_solid() -> None:
+    """Two legs 0.06 apart, in a cage that has no gap: the capture's lattice has it, and its feet are joined."""
+    spacing = 1.0 / 64.0
+    places = np.stack(np.meshgrid(*[np.arange(n) for n in (49, 33, 65)], indexing="ij"), axis=-1)
+    points = spacing * (places - [24, 16, 0])
+    inside = (np.abs(points[..., 0]) > 0.03) | (points[..., 2] > 0.4)
+    solid = LatticeSolid(inside, np.array([-24, -16, 0]), spacing, 1.0, np.ones(1, bool), np.zeros(1, bool), 0)
+    cage = carved((0.8, 0.6, 1.0), 0.1, lambda p: np.ones(len(p), bool))
+    assert len(find_feet(cage, cage.nodes[:, 2], 1.0)) == 1
+    limbs = find_limbs(Sections.of_solid(solid, cage), cage.nodes)
+    feet = find_feet(cage, cage.nodes[:, 2], 1.0, limbs)
+    assert limbs.tops == (pytest.approx(0.4, abs=0.03),) * 2
+    assert [foot.joined for foot in feet] == [True, True]
+    sides = sorted(float(cage.nodes[foot.sole, 0].mean()) for foot in feet)
+    assert sides[0] < -0.1 and sides[1] > 0.1
+
+
+def test_feet_are_numbered_anticlockwise_from_straight_ahead() -> None:
+    """A foot ten degrees to the right of straight ahead is the first, one twenty degrees to the right the last."""
+
+    def at(*degrees: float) -> np.ndarray:
+        return np.stack([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))], axis=1)
+
+    assert around(at(170.0, 80.0, -10.0, -100.0)).tolist() == [2, 1, 0, 3]
+    assert around(at(160.0, 70.0, -20.0, -110.0)).tolist() == [1, 0, 3, 2]

@@ -1,0 +1,118 @@
+"""What ``egs-warp info`` tells and draws."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from egs_warp.assets import pawn, stool
+from egs_warp.assets.object import BuiltInObject
+from egs_warp.cli import main
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.io import write_ply
+from egs_warp.motions.feet import Base
+from egs_warp.motions.repertoire import REPERTOIRE
+from egs_warp.pipelines.info import BodyInfo, draw_info, look_into
+
+COLOURS = {1: (0xD6, 0x27, 0x28), 2: (0x1F, 0x77, 0xB4), 3: (0x2C, 0xA0, 0x2C), 4: (0xFF, 0x7F, 0x0E)}
+"""Of the feet, as they are drawn."""
+
+
+def seen(thing: BuiltInObject) -> BodyInfo:
+    return look_into(thing.cloud, source=thing.name, plane=thing.plane, nodes=200)
+
+
+@pytest.fixture(scope="module")
+def chair() -> BodyInfo:
+    return look_into(stool(gaussian_count=5000).cloud, source="chair.ply", up=np.array([0.0, 0.0, 1.0]), notes=("so",))
+
+
+def test_a_chair_is_told_by_what_can_be_measured(chair: BodyInfo) -> None:
+    """Front right and left, back right and left, in the order of the numbers; lengths in body heights."""
+    assert chair.base is Base.FEET and len(chair.feet) == 4
+    soles = chair.soles() / chair.body.height
+    assert np.sign(soles[:, :2]).astype(int).tolist() == [[1, 1], [-1, 1], [-1, -1], [1, -1]]
+    lines = chair.lines()
+    assert lines[0] == f"capture  chair.ply: {chair.standing.gaussians.count} Gaussians"
+    assert lines[1] == "up       0.00,0.00,1.00"
+    assert lines[3].startswith("front    ") and "-1.00,0.00 (guessed: " in lines[3]
+    height = float(lines[4].split()[1])
+    assert height == pytest.approx(1.0, abs=0.06), "the stool is one unit tall"
+    assert "stands   on 4 feet, numbered anticlockwise from straight ahead" in lines
+    legs = [float(line.split("leg ")[1].split(",")[0]) for line in lines if line.startswith("  foot ")]
+    assert legs == [pytest.approx(0.47, abs=0.06)] * 4
+    assert f"{chair.muscles.fibre_count} fibres, {chair.muscles.segment_count} segments" in "\n".join(lines)
+    assert lines[-1] == "note: so"
+
+
+def test_all_motions_are_told_with_what_is_in_their_way(chair: BodyInfo) -> None:
+    assert chair.motions() == dict.fromkeys(REPERTOIRE)
+    round_one = seen(pawn(gaussian_count=3000))
+    assert len(round_one.feet) == 1 and "stands   on one base" in round_one.lines()
+    why = {name: reason for name, reason in round_one.motions().items() if reason is not None}
+    assert why == {"walk": "a walk needs four separate feet, the body has 1"}
+    assert "walk       no: a walk needs four separate feet, the body has 1" in round_one.lines()
+    assert "jump       yes" in round_one.lines()
+
+
+def has_colour(picture: np.ndarray, colour: tuple[int, int, int]) -> bool:
+    return bool((np.abs(picture[:, :, ::-1].astype(int) - colour).max(axis=2) <= 2).sum() > 30)
+
+
+def test_the_picture_has_every_foot_in_its_colour(chair: BodyInfo, tmp_path: Path) -> None:
+    draw_info(tmp_path / "info.png", chair)
+    picture = cv2.imread(str(tmp_path / "info.png"))
+    assert picture is not None and picture.shape == (1000, 1500, 3)
+    for colour in COLOURS.values():
+        assert has_colour(picture, colour)
+
+
+def snake() -> GaussianCloud:
+    """A bar of ten times its height."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(size=(5000, 3)) * [1.0, 0.1, 0.1] - [0.5, 0.05, 0.0]
+    count = len(points)
+    sizes = np.full((count, 3), np.log(0.012))
+    turns = np.tile([1.0, 0.0, 0.0, 0.0], (count, 1))
+    return GaussianCloud.from_numpy(points, turns, sizes, np.full(count, 4.0), np.zeros((count, 1, 3)), device="cpu")
+
+
+def test_what_lies_has_no_feet_and_is_drawn(tmp_path: Path) -> None:
+    info = look_into(snake(), up=np.array([0.0, 0.0, 1.0]), nodes=300)
+    assert info.feet == () and info.base is Base.LONG
+    assert "stands   on its length: it has no feet" in info.lines()
+    draw_info(tmp_path / "info.png", info)
+    assert (tmp_path / "info.png").stat().st_size > 20_000
+
+
+def test_the_command_prints_the_lines_and_writes_the_picture(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    thing = pawn(gaussian_count=3000)
+    write_ply(tmp_path / "pawn.ply", thing.cloud)
+    flags = ["info", str(tmp_path / "pawn.ply"), "--up", "z"]
+    assert main([*flags, "--front=-y", "--plot", str(tmp_path / "info.png")]) == 0
+    out = capsys.readouterr().out.splitlines()
+    assert out[0].startswith(f"capture  {tmp_path / 'pawn.ply'}: ")
+    assert any(line.startswith("front    ") and line.endswith("as given") for line in out)
+    assert cv2.imread(str(tmp_path / "info.png")) is not None
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--plot", "info.jpg"], "--plot info.jpg: give the name of a .png"),
+        (["--up", "z", "--front", "0,0,1"], "--front 0,0,1: points up or down; give a way along the ground"),
+        (["--metres-per-unit", "-1"], "--metres-per-unit -1.0: give a positive number"),
+    ],
+)
+def test_bad_flags_end_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str], message: str
+) -> None:
+    write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=500).cloud)
+    assert main(["info", str(tmp_path / "pawn.ply"), *flags]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
