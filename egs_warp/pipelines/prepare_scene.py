@@ -15,6 +15,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.holes import Hole, hole_under
+from egs_warp.inpainting.underside import with_underside
 from egs_warp.io.planes import KnownPlane, write_planes
 from egs_warp.io.ply import write_ply
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, on_its_ground
@@ -145,13 +146,16 @@ def take_apart(
         surroundings=cloud.subset(~found.object_mask) if photographs else None,
         options=options.clearing_options,
     )
+    closed = ()
     if ground is not None:
-        thing = _moved(thing, ground.raised)
+        thing, count = with_underside(_moved(thing, ground.raised), ground, found.size)
+        closed = (f"its underside, which no view shows, was closed by {count} Gaussians",) if count else ()
     notes = (
         f"the object has {untouched.count} of {cloud.count} Gaussians; {int(found.buried_mask.sum())} under it and "
         f"{int(found.floater_mask.sum())} floaters beside it were dropped",
         f"{int((np.abs(heights) < reach).sum())} of the object's Gaussians straddled the plane: {_CLEARED[method]}"
         + (f" against {len(photographs)} photographs" if photographs and method is Clearing.FINETUNE else ""),
+        *closed,
     )
     return thing, cloud.subset(found.background_mask), notes
 
