@@ -32,7 +32,7 @@ def audit(trajectory: Trajectory, *, energy: Ledger | None = None, newton_unconv
     t = trajectory
     unit = t.node_mass.sum() * np.linalg.norm(t.gravity) * t.height
     linear, angular = _momentum_residuals(t)
-    normals, start_gaps = _contact_normals(t), _start_gaps(t)
+    normals = _contact_normals(t)
     normal = np.einsum("ci,ci->c", t.contact_force, normals)
     tangential = t.contact_force - normal[:, None] * normals
     rubbing = np.linalg.norm(tangential, axis=1)
@@ -54,7 +54,7 @@ def audit(trajectory: Trajectory, *, energy: Ledger | None = None, newton_unconv
         friction_gap=float(friction_gap.max(initial=0.0) / unit),
         contact_velocity=float(missed[normal > 0.0].max(initial=0.0) / np.sqrt(np.linalg.norm(t.gravity) * t.height)),
         penetration=float(max(-deepest, 0.0) / t.height),
-        complementarity_gap=float((normal * np.maximum(start_gaps + along, 0.0)).max(initial=0.0) / unit),
+        complementarity_gap=float((normal * np.maximum(_start_gaps(t) + along, 0.0)).max(initial=0.0) / unit),
         inverted_elements=int((np.linalg.det(edges) <= 0.0).sum()),
         newton_unconverged=newton_unconverged,
     )

@@ -168,7 +168,7 @@ def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:
         options=SceneOptions(clearing=Clearing.SPLIT, inpaint=False),
         progress=stages.append,
     )
-    assert stages == ["plane", "segment"]
+    assert stages == ["plane", "ground", "segment"]
     assert prepared.background is prepared.bare
     assert any("straddled the plane: split at it" in note for note in prepared.notes)
     cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.9, count=3, elevations=(20.0, 40.0, 60.0))
