@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import warp as wp
 from scipy import ndimage
 
 from egs_warp.geometry.bitmaps import depth_inside, distance_to, nearest_set
@@ -69,5 +72,4 @@ def _of_degree(cloud: GaussianCloud, coefficients: int) -> GaussianCloud:
     """``cloud``, of SH degree 0, with as many ``coefficients`` as another has."""
     sh = np.zeros((cloud.count, coefficients, 3), np.float32)
     sh[:, 0] = cloud.sh.numpy()[:, 0]
-    fields = (cloud.means, cloud.rotations, cloud.log_scales, cloud.opacity_logits)
-    return GaussianCloud.from_numpy(*(field.numpy() for field in fields), sh, device=str(cloud.device))
+    return replace(cloud, sh=wp.array(sh, dtype=wp.vec3, device=cloud.device))
