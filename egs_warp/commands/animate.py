@@ -185,7 +185,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
             scene.object,
             run,
             plane=scene.plane,
-            ground=scene.located.ground,
+            ground=scene.ground,
             background=scene.background,
             view_from=view_from if view_from is not None else viewing_direction(scene, given.cameras),
             notes=(*given.notes, *scene.notes),

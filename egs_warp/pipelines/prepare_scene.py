@@ -13,6 +13,7 @@ import warp as wp
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.holes import Hole, hole_under
 from egs_warp.inpainting.underside import with_underside
@@ -68,6 +69,11 @@ class PreparedScene:
     """What was found and done, for the user."""
     filled: InpaintResult | None = None
     """How the background got its new floor; None where it got none."""
+
+    @property
+    def ground(self) -> HeightField | None:
+        """What the object stands on where that is not flat."""
+        return self.located.ground
 
     def write(self, folder: Path, known: Sequence[KnownPlane] = ()) -> None:
         """``object.ply``, ``background.ply`` and ``plane.json`` into ``folder``.
