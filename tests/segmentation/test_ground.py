@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
+from egs_warp.io.capture import read_capture
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, on_its_ground
 from egs_warp.segmentation.ground import measure_ground
 from egs_warp.segmentation.object_mask import ObjectSpec, segment
@@ -85,3 +87,18 @@ def test_roughness_that_views_do_not_agree_on_is_no_ground() -> None:
     assert not replace(measured, roughness=0.1, noise=0.01).is_flat(1.0)
     away = measure_ground(cloud, truth, LEVEL, centre=np.array([50.0, 0.0, 0.5]), size=1.7)
     assert not away.known.any() and away.is_flat(1.0)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("file", "click"),
+    [("koala.ply", (0.1, -0.7, 0.15)), ("fox.ply", (0.0, 0.0, 2.0)), ("narcissus.sog", (0.0, -0.8, 0.0))],
+)
+def test_real_grounds_that_are_flat_stay_planes(data_dir: Path, file: str, click: tuple) -> None:
+    """Gravel and a plinth, and glossy paper that mirrors the koala: its splats lie 2.4 % of its height off the plane,
+    but views of them differ by 1.1 %.
+    """
+    cloud, spec = read_capture(data_dir / "scenes" / file).cloud, ObjectSpec(point=np.array(click))
+    located = on_its_ground(cloud, locate_plane(cloud, spec), spec)
+    assert located.ground is None
+    assert any("taken as flat" in note for note in located.notes) == (file == "koala.ply")
