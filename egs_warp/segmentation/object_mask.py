@@ -239,12 +239,15 @@ def _body(
 
 
 def _wisps(scene: _Scene, chosen: np.ndarray, size: float) -> np.ndarray:
-    """(n,) bool: wide Gaussians at the object's foot in the floor's colour,
+    """(n,) bool: wide Gaussians at the object's foot in the floor's colour, on uneven ground those that lie flat, too,
     which would go along as shreds of the floor.
     """
     low = scene.heights < _WISP_HEIGHT * size
     length = np.exp(scene.cloud.log_scales.numpy().max(axis=1))
     wide = length > max(_WISP * size, 2.0 * float(np.median(length[chosen])))
+    if isinstance(scene.plane, HeightField):
+        # Under the object the ground is a guess, and what lies there may be higher.
+        wide |= scene.level
     suspects = np.flatnonzero(chosen & low & wide)
     own = np.flatnonzero(chosen & low & ~wide & scene.solid)
     floor = np.flatnonzero(~chosen & low & scene.level & scene.solid & (np.abs(scene.heights) < 0.05 * size))
