@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from egs_warp.errors import ArgumentError, UserError
     from egs_warp.geometry.camera import Camera
     from egs_warp.geometry.gaussians import GaussianCloud, joined
+    from egs_warp.geometry.height_field import HeightField
     from egs_warp.geometry.plane import Plane
     from egs_warp.geometry.tetmesh import TetMesh
     from egs_warp.inpainting.holes import footprint
@@ -65,6 +66,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "errors": ("ArgumentError", "UserError"),
     "geometry.camera": ("Camera",),
     "geometry.gaussians": ("GaussianCloud", "joined"),
+    "geometry.height_field": ("HeightField",),
     "geometry.plane": ("Plane",),
     "geometry.tetmesh": ("TetMesh",),
     "inpainting.holes": ("footprint",),
@@ -111,6 +113,7 @@ __all__ = [
     "Densification",
     "FinetuneOptions",
     "GaussianCloud",
+    "HeightField",
     "InpaintOptions",
     "Inpainter",
     "LocomotionSettings",

@@ -17,7 +17,7 @@ from egs_warp.commands.flags import (
     parse_direction,
     parse_up,
 )
-from egs_warp.commands.scene_flags import add_object_flags, say, start
+from egs_warp.commands.scene_flags import add_flat_flag, add_object_flags, say, start
 from egs_warp.commands.segment import add_straddling_flag, clearing_of
 from egs_warp.errors import UserError
 
@@ -70,6 +70,7 @@ def add_parser(commands: Commands) -> None:
     body.add_argument(
         "--plane", help="nx,ny,nz,d of the ground n.x + d = 0 in the capture's units, or a plane.json; else it is found"
     )
+    add_flat_flag(body)
     body.add_argument("--gravity-up", help="x,y,z or an axis: against gravity, if the ground is a slope")
     body.add_argument(
         "--terrain", type=named_path, help="JSON with steps and walls: solids as lists of faces [nx,ny,nz,d]"
@@ -120,7 +121,7 @@ def animated(chosen: argparse.Namespace) -> int:
 
 def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
     """A capture that is the object alone; returns the report, and what was written besides."""
-    from egs_warp.commands.scene_input import plane_of
+    from egs_warp.commands.scene_input import ground_of, plane_of
     from egs_warp.io import read_capture
     from egs_warp.io.run_folder import run_folder
     from egs_warp.io.video import ffmpeg_program
@@ -150,6 +151,7 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
             run,
             up=up,
             plane=plane,
+            ground=ground_of(chosen.plane, flat=chosen.flat),
             background=background,
             view_from=view_from,
             notes=notes,
@@ -180,7 +182,9 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
     inpainter = chosen_inpainter(chosen)
     view_from = parse_direction("view-from", chosen.view_from) if chosen.view_from is not None else None
     given = read_scene(chosen)
-    options = SceneOptions(clearing=clearing_of(chosen), inpaint=not chosen.no_inpaint, inpainter=inpainter)
+    options = SceneOptions(
+        clearing=clearing_of(chosen), flat=chosen.flat, inpaint=not chosen.no_inpaint, inpainter=inpainter
+    )
     with run_folder(chosen.out, overwrite=chosen.overwrite, resume=chosen.resume) as run:
         run.begin_with(lambda: write_config(run.file(NAME), chosen, chosen.parser))
         scene = given.prepared(options, progress=lambda stage: say(f"{stage} ..."))
@@ -195,6 +199,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
             scene.object,
             run,
             plane=scene.plane,
+            ground=scene.ground,
             background=scene.background,
             view_from=view_from if view_from is not None else viewing_direction(scene, given.cameras),
             seen_from=mean_view(given.cameras, scene.located.centre),

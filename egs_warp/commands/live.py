@@ -76,7 +76,7 @@ def _live(chosen: argparse.Namespace) -> int:
 def _session(chosen: argparse.Namespace) -> Session:
     from tqdm import tqdm
 
-    from egs_warp.commands.scene_input import plane_of
+    from egs_warp.commands.scene_input import ground_of, plane_of
     from egs_warp.io import read_capture
     from egs_warp.io.run_folder import check_out
     from egs_warp.pipelines.animate import AnimateOptions
@@ -99,6 +99,7 @@ def _session(chosen: argparse.Namespace) -> Session:
             capture.cloud,
             up=up,
             plane=plane,
+            ground=ground_of(chosen.plane, flat=False),
             metres_per_unit=options.metres_per_unit,
             friction=options.friction,
             front=front,

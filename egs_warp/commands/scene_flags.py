@@ -20,6 +20,13 @@ def add_object_flags(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--view", help="name or number of the camera that a mask or pixel belongs to")
 
 
+def add_flat_flag(parser: argparse._ActionsContainer) -> None:
+    """Add the flag that keeps to the plane."""
+    parser.add_argument(
+        "--flat", action="store_true", help="stand on the plane where the ground is not flat; else on it as captured"
+    )
+
+
 def add_scene_flags(parser: argparse.ArgumentParser) -> None:
     """Add everything that the commands before the animation share."""
     parser.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")

@@ -16,6 +16,7 @@ from egs_warp.commands.scene_flags import start
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.cameras import PosedImage, read_cameras
 from egs_warp.io.capture import read_capture
@@ -71,6 +72,13 @@ def plane_of(text: str) -> Plane:
     if text.endswith(".json") or Path(text).is_file():
         return read_planes(text)[0].plane
     return parse_plane(text)
+
+
+def ground_of(text: str | None, *, flat: bool) -> HeightField | None:
+    """The ground that is not flat of the first plane of a file, if it tells of one and ``flat`` does not forbid it."""
+    if flat or text is None or not (text.endswith(".json") or Path(text).is_file()):
+        return None
+    return read_planes(text)[0].ground
 
 
 def read_scene(chosen: argparse.Namespace) -> SceneInput:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egs_warp.commands.flags import Commands
-from egs_warp.commands.scene_flags import add_scene_flags, say
+from egs_warp.commands.scene_flags import add_flat_flag, add_scene_flags, say
 
 if TYPE_CHECKING:
     from egs_warp.segmentation.clearance import Clearing
@@ -23,6 +23,7 @@ def add_parser(commands: Commands) -> None:
     segment = commands.add_parser("segment", help="take an object out of a scene")
     add_scene_flags(segment)
     add_straddling_flag(segment)
+    add_flat_flag(segment)
     segment.set_defaults(run=_segment)
 
 
@@ -58,7 +59,7 @@ def _segment(chosen: argparse.Namespace) -> int:
     given = read_scene(chosen)
     known = read_planes(chosen.plane) if chosen.plane and Path(chosen.plane).is_file() else []
     folder = writable_folder(chosen.out)
-    scene = given.prepared(SceneOptions(clearing=clearing_of(chosen), inpaint=False))
+    scene = given.prepared(SceneOptions(clearing=clearing_of(chosen), flat=chosen.flat, inpaint=False))
     for note in (*given.notes, *scene.notes):
         say(note)
     scene.write(folder, known)

@@ -1,8 +1,9 @@
-"""Contact of the Gaussians' bidirectional embeddings with planes (Eq. 8-10): which points touch, and their frames."""
+"""Contact of the Gaussians' bidirectional embeddings with the ground (Eq. 8-10): what touches, and in which frames."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
@@ -14,18 +15,24 @@ from egs_warp.contact.terrain import Solid
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.kernels.contact import gaps as kernels
-from egs_warp.precision import Vec3, Vec4, real
+from egs_warp.kernels.contact.height_field import ground_gaps_kernel
+from egs_warp.precision import Mat33, Vec3, Vec4, real
 
 LEAST_OUTSIDE = 0.1
 """Share of the Gaussians above the ground that are outside of all solids at rest."""
+_SHORTENINGS = 40
+"""Halvings in which an arm finds where it meets uneven ground."""
+_FINE = 0.5
+"""Of the spacing of uneven ground: in each such square of it the lowest point of each tetrahedron counts."""
 
 
 @dataclass(frozen=True)
 class ContactGeometry:
-    """Every point of the body that can ever be the lowest one of its tetrahedron. Constant."""
+    """Every point of the body that can ever be the first of its tetrahedron to touch. Constant."""
 
     mesh: TetMesh
     planes: tuple[Plane, ...]
@@ -41,11 +48,17 @@ class ContactGeometry:
     """Their share of the opacity mass."""
     solid_from_plane: tuple[int, ...] = ()
     """Which solid each plane is a face of, in ascending order; empty: each is a half space of its own."""
+    field: HeightField | None = None
+    """Ground that is not flat, in place of the first plane."""
 
     @property
     def solid_of_each_plane(self) -> np.ndarray:
         """(planes,) int32."""
         return np.array(self.solid_from_plane or range(len(self.planes)), dtype=np.int32)
+
+    def ground_heights(self, points: np.ndarray) -> np.ndarray:
+        """(...,) metres of ``points`` (..., 3) above the ground."""
+        return (self.field or self.planes[0]).heights(points)
 
 
 @dataclass(frozen=True)
@@ -64,6 +77,8 @@ class ContactSet:
     """(n,) signed distance at the start of the step, metres."""
     frame: sparse.csr_matrix
     """(3n, 3N): rows 3i, 3i+1, 3i+2 give the velocity of contact i along its normal and two tangents."""
+    faces: np.ndarray
+    """(n,) int32: which of the geometry's planes each is held to; 0 is the ground, flat or not."""
 
     @property
     def count(self) -> int:
@@ -76,7 +91,9 @@ class ContactSet:
         return self.nodes[np.arange(self.count), np.argmax(self.weights, axis=1)]
 
     def end_gaps(self, dt: float, velocities: np.ndarray) -> np.ndarray:
-        """(n,) gap after a step of ``dt`` with nodal end velocities (N, 3)."""
+        """(n,) gap after a step of ``dt`` with nodal end velocities (N, 3), to the tangent plane of the start where the
+        ground is not flat.
+        """
         return self.gaps + dt * (self.frame @ velocities.ravel())[0::3]
 
 
@@ -85,6 +102,7 @@ def contact_geometry(
     mesh: TetMesh,
     planes: tuple[Plane, ...],
     *,
+    field: HeightField | None = None,
     solids: tuple[Solid, ...] = (),
     friction: float = 0.8,
     gamma: float = 3.0,
@@ -92,9 +110,10 @@ def contact_geometry(
 ) -> ContactGeometry:
     """Points of all T+ and T- (Eq. 3); endpoints below a plane at rest are shortened to it (docs/concepts/contact.md).
 
-    ``planes`` bound half spaces, the first of them the ground; ``solids`` stand on it.
-    Only vertices of the convex hull of each tetrahedron's points are kept: a deformation is affine inside a
-    tetrahedron, so the deepest point of it is always one of those.
+    ``planes`` bound half spaces, the first of them the ground, whose place ``field`` takes where it is not flat;
+    ``solids`` stand on it. Only vertices of the convex hull of each tetrahedron's points are kept: a deformation is
+    affine inside a tetrahedron, so the deepest point of it is always one of those. A bump can be deepest between them:
+    over uneven ground the lowest point of each small square stays as well.
 
     Raises ``UserError`` for a solid that holds the body.
     """
@@ -103,7 +122,8 @@ def contact_geometry(
     axes = Rotation.from_quat(quaternions[:, [1, 2, 3, 0]]).as_matrix()
     arms = gamma * np.exp(cloud.log_scales.numpy().astype(np.float64))[:, None, :] * axes
     obstacles = [Solid((plane,)) for plane in planes] + list(solids)
-    above = np.all([plane.heights(means) >= 0.0 for plane in planes], axis=0)
+    grounds = planes if field is None else (field, *planes[1:])
+    above = np.all([ground.heights(means) >= 0.0 for ground in grounds], axis=0)
     least = LEAST_OUTSIDE * np.count_nonzero(above)
     for number, solid in enumerate(solids, start=1):
         above &= np.any([face.heights(means) >= 0.0 for face in solid.faces], axis=0)
@@ -119,16 +139,21 @@ def contact_geometry(
         for axis in range(3):
             arm = sign * arms[above, :, axis]
             reach = np.ones(len(arm))
-            for solid in obstacles:
+            if field is not None:
+                reach = _reach_over(field, means[above], arm)
+            for solid in obstacles if field is None else obstacles[1:]:
                 rooms = np.stack([face.heights(means[above]) for face in solid.faces])
                 facing = np.argmax(rooms, axis=0)
                 normals = np.stack([face.normal for face in solid.faces])[facing]
                 drop, room = -(arm * normals).sum(axis=1), rooms.max(axis=0)
                 reach = np.minimum(reach, np.where(drop > room, room / np.where(drop > room, drop, 1.0), 1.0))
             points.append(means[above] + reach[:, None] * arm)
-    embedding = embed_points(mesh, np.concatenate(points), device=device)
+    everything = np.concatenate(points)
+    embedding = embed_points(mesh, everything, device=device)
     tet_from_point, weights = embedding.tets.numpy(), embedding.weights.numpy()
     kept = _hull_points(tet_from_point, weights, len(mesh.tets))
+    if field is not None:
+        kept = np.union1d(kept, _lowest_points(tet_from_point, everything, field))
     return ContactGeometry(
         mesh,
         tuple(face for solid in obstacles for face in solid.faces),
@@ -138,7 +163,28 @@ def contact_geometry(
         int((~above).sum()),
         float(opacities[~above].sum() / opacities.sum()),
         tuple(index for index, solid in enumerate(obstacles) for _ in solid.faces),
+        field,
     )
+
+
+def _reach_over(field: HeightField, means: np.ndarray, arms: np.ndarray) -> np.ndarray:
+    """(n,) share of the ``arms`` (n, 3) of ``means`` (n, 3), which are above the ground, that stays above it."""
+    low, high = np.zeros(len(arms)), np.ones(len(arms))
+    low = np.where(field.heights(means + arms) >= 0.0, 1.0, low)
+    for _ in range(_SHORTENINGS):
+        middle = 0.5 * (low + high)
+        free = field.heights(means + middle[:, None] * arms) >= 0.0
+        low, high = np.where(free, np.maximum(middle, low), low), np.where(free, high, middle)
+    return low
+
+
+def _lowest_points(tet_from_point: np.ndarray, points: np.ndarray, field: HeightField) -> np.ndarray:
+    """(k,) of ``points`` (P, 3) the lowest of each tetrahedron over each small square of the ground."""
+    square = np.floor((points - field.origin) @ field.axes[:2].T / (_FINE * field.spacing)).astype(np.int64)
+    place = np.column_stack([tet_from_point, square])
+    order = np.argsort(field.heights(points), kind="stable")
+    _, first = np.unique(place[order], axis=0, return_index=True)
+    return np.sort(order[first])
 
 
 def _hull_points(tet_from_point: np.ndarray, weights: np.ndarray, tet_count: int) -> np.ndarray:
@@ -166,9 +212,16 @@ class ContactDetector:
         self._tet_from_point = wp.array(geometry.tet_from_point, dtype=int, device=device)
         self._weights = wp.array(geometry.weights, dtype=Vec4, device=device)
         self._tets = wp.array(geometry.mesh.tets, dtype=wp.vec4i, device=device)
-        rows = np.array([[*plane.normal, plane.offset] for plane in geometry.planes])
-        self._planes = wp.array(rows, dtype=Vec4, device=device)
-        self._solids = wp.array(geometry.solid_of_each_plane, dtype=int, device=device)
+        # Uneven ground takes the first plane's place.
+        flat = slice(0 if geometry.field is None else 1, None)
+        rows = np.array([[*plane.normal, plane.offset] for plane in geometry.planes])[flat]
+        self._planes = wp.array(rows.reshape(-1, 4), dtype=Vec4, device=device)
+        self._solids = wp.array(geometry.solid_of_each_plane[flat], dtype=int, device=device)
+        self._field: list[Any] = []
+        if geometry.field is not None:
+            coefficients = wp.array(geometry.field.coefficients, dtype=real, device=device)
+            axes, origin = Mat33(*geometry.field.axes.ravel().tolist()), Vec3(*geometry.field.origin.tolist())
+            self._field = [axes, origin, real(geometry.field.spacing), coefficients]
         self._positions = wp.zeros(len(geometry.mesh.nodes), dtype=Vec3, device=device)
         count = len(geometry.tet_from_point)
         self._gaps = wp.zeros(count, dtype=real, device=device)
@@ -177,7 +230,8 @@ class ContactDetector:
     def gaps(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(P,) signed distance of every point at ``positions`` (N, 3) to the nearest solid, and (P,) its face's index.
 
-        Of a solid's faces the one counts that the point is furthest in front of, or least far behind.
+        Of a solid's faces the one counts that the point is furthest in front of, or least far behind; to ground that is
+        not flat the distance is ``HeightField.gaps``.
         """
         self._positions.assign(np.ascontiguousarray(positions))
         wp.launch(
@@ -194,6 +248,14 @@ class ContactDetector:
             outputs=[self._gaps, self._nearest],
             device=self._device,
         )
+        if self._field:
+            wp.launch(
+                ground_gaps_kernel,
+                dim=len(self.geometry.tet_from_point),
+                inputs=[self._tets, self._tet_from_point, self._weights, *self._field, self._positions],
+                outputs=[self._gaps, self._nearest],
+                device=self._device,
+            )
         return self._gaps.numpy().copy(), self._nearest.numpy().copy()
 
     def points_within(self, positions: np.ndarray, distance: float) -> np.ndarray:
@@ -207,15 +269,20 @@ class ContactDetector:
         gaps, nearest = self.gaps(positions)
         nodes = self.geometry.mesh.tets[self.geometry.tet_from_point[points]]
         weights = self.geometry.weights[points]
-        axes = np.stack([np.stack([p.normal, *p.tangents()]) for p in self.geometry.planes])[nearest[points]]
+        faces = nearest[points]
+        axes = np.stack([np.stack([p.normal, *p.tangents()]) for p in self.geometry.planes])[faces]
         count = len(points)
+        if self.geometry.field is not None:
+            uneven = faces == 0
+            places = np.einsum("nw,nwi->ni", weights[uneven], positions[nodes[uneven]])
+            axes[uneven] = self.geometry.field.frames(places)
         values = weights.reshape(-1, 1, 4, 1) * axes[:, :, None, :]
         columns = np.broadcast_to(3 * nodes[:, None, :, None] + np.arange(3), values.shape)
         frame = sparse.csr_matrix(
             (values.ravel(), columns.ravel(), np.arange(0, 36 * count + 1, 12)),
             shape=(3 * count, positions.size),
         )
-        return ContactSet(points, nodes, weights, axes, gaps[points], frame)
+        return ContactSet(points, nodes, weights, axes, gaps[points], frame, faces)
 
 
 def push_out_speeds(gaps: np.ndarray, dt: float, cap: float, factor: float, slop: float) -> np.ndarray:

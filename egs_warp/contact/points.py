@@ -33,7 +33,7 @@ class ContactPoints:
         self.geometry, self.near, self.lower = geometry, near, lower
         corners = geometry.mesh.tets[geometry.tet_from_point]
         places = np.einsum("pw,pwi->pi", geometry.weights, geometry.mesh.nodes[corners])
-        heights = geometry.planes[0].heights(places)
+        heights = geometry.ground_heights(places)
         sole = np.flatnonzero(heights < heights.min() + 2.0 * near)
         spacing = _FINEST * mean_edge_length(geometry.mesh)
         self.cell_from_point = _few_cells(places, heights, sole, spacing, MOST_AT_REST)

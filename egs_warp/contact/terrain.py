@@ -1,5 +1,5 @@
-"""Solid things beside the ground that a body can touch:
-steps, walls, tilted floors, each an intersection of half spaces.
+"""What there is to stand on: uneven ground, and solid things beside it that a body can touch (steps, walls, tilted
+floors, each an intersection of half spaces).
 """
 
 from __future__ import annotations
@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -15,6 +16,14 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.io.text import parse_json, read_text
 
 MOST_FACES = 64
+
+
+class Surface(Protocol):
+    """Something to stand on: a ``Solid`` or a ``HeightField``."""
+
+    def top(self, point: np.ndarray, up: np.ndarray) -> float:
+        """How far along ``up`` (3,) from ``point`` (3,) it ends; -inf where it is not above or below the point."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -82,6 +91,6 @@ def _is_face(face: object) -> bool:
     )
 
 
-def surface_above(solids: Sequence[Solid], point: np.ndarray, up: np.ndarray) -> float:
+def surface_above(solids: Sequence[Surface], point: np.ndarray, up: np.ndarray) -> float:
     """How far along ``up`` (3,) from ``point`` (3,) the highest surface is; -inf over nothing."""
     return max((solid.top(point, up) for solid in solids), default=-np.inf)

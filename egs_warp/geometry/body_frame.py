@@ -10,6 +10,7 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.frames import square_to
+from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 
 GROUND = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
@@ -48,6 +49,15 @@ class BodyFrame:
     def plane(self, plane: Plane) -> Plane:
         """The capture's ``plane`` in the body's frame."""
         return Plane(self.axes @ plane.normal, self.scale * float(plane.heights(self.origin)))
+
+    def height_field(self, field: HeightField) -> HeightField:
+        """The capture's ``field`` in the body's frame."""
+        return HeightField(
+            field.axes @ self.axes.T,
+            self.points(field.origin),
+            self.scale * field.spacing,
+            self.scale * field.coefficients,
+        )
 
     def scaled(self, factor: float) -> BodyFrame:
         """The frame whose lengths are ``factor`` times as many."""

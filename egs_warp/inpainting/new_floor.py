@@ -11,8 +11,8 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.geometry.soap_film import soap_film
 from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, mean_colours
-from egs_warp.inpainting.soap_film import soap_film
 
 _WIDTH = 0.62
 """Standard deviation along the plane, in spacings."""

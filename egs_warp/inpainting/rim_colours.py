@@ -7,7 +7,7 @@ import numpy as np
 from scipy import ndimage
 
 from egs_warp.geometry.bitmaps import connected_parts, nearest_set
-from egs_warp.inpainting.soap_film import soap_film
+from egs_warp.geometry.soap_film import soap_film
 
 _SHADE = 0.1
 """Colours nearer to each other than this are the same."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from egs_warp.errors import UserError
+from egs_warp.geometry.height_field import HeightField, check_grid
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.limits import LARGEST_TEXT, read_bytes
@@ -77,6 +78,8 @@ class KnownPlane:
     """Share of the visible surface that lies on it."""
     hole: HoleOutline | None = None
     """Where the object has left it open."""
+    ground: HeightField | None = None
+    """What is there where it is not flat."""
     others: Mapping[str, Any] = field(default_factory=dict)
     """Further entries of the file, which go along as they are."""
 
@@ -93,6 +96,8 @@ class KnownPlane:
             facts["centre"] = self.centre.tolist()
         if self.hole is not None:
             facts["hole"] = self.hole.to_json()
+        if self.ground is not None:
+            facts["ground"] = _ground_to_json(self.ground)
         return {"normal": self.plane.normal.tolist(), "offset": self.plane.offset, **facts, **self.others}
 
     @classmethod
@@ -116,12 +121,39 @@ class KnownPlane:
                 **numbers,
                 pixels=int(entry["pixels"]) if "pixels" in entry else None,
                 hole=HoleOutline.from_json(entry["hole"], path) if "hole" in entry else None,
+                ground=_ground_from_json(entry["ground"], path) if "ground" in entry else None,
                 others={name: value for name, value in entry.items() if name not in ("normal", "offset", *_FACTS)},
             )
         except (TypeError, ValueError, OverflowError) as error:
             if isinstance(error, UserError):
                 raise
             raise UserError(f"{path}: the facts of plane {number} are damaged; make it again") from error
+
+
+def _ground_to_json(ground: HeightField) -> dict[str, Any]:
+    # A thousandth of a node's spacing is far below what depth tells.
+    digits = max(0, 3 - int(np.floor(np.log10(ground.spacing))))
+    return {
+        "axes": ground.axes.tolist(),
+        "origin": ground.origin.tolist(),
+        "spacing": ground.spacing,
+        "coefficients": np.round(ground.coefficients, digits).tolist(),
+    }
+
+
+def _ground_from_json(entry: Any, path: Path) -> HeightField:
+    """What ``_ground_to_json`` gave. Raises ``UserError`` where something is amiss."""
+    try:
+        ground = HeightField(
+            np.array(entry["axes"], dtype=float).reshape(3, 3),
+            np.array(entry["origin"], dtype=float).reshape(3),
+            float(entry["spacing"]),
+            np.atleast_2d(np.array(entry["coefficients"], dtype=float)),
+        )
+        check_grid(ground)
+    except (TypeError, KeyError, ValueError, OverflowError, AttributeError, UserError) as error:
+        raise UserError(f"{path}: its ground is damaged; make it again with egs-warp segment") from error
+    return ground
 
 
 _NUMBERS = ("size", "noise", "inlier_share", "support")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
 from egs_warp.locomotion.ledger import Ledger, ledger
 from egs_warp.locomotion.trajectory import Trajectory
@@ -31,16 +32,18 @@ def audit(trajectory: Trajectory, *, energy: Ledger | None = None, newton_unconv
     t = trajectory
     unit = t.node_mass.sum() * np.linalg.norm(t.gravity) * t.height
     linear, angular = _momentum_residuals(t)
-    normal = np.einsum("ci,ci->c", t.contact_force, t.contact_normal)
-    tangential = t.contact_force - normal[:, None] * t.contact_normal
+    normals = _contact_normals(t)
+    normal = np.einsum("ci,ci->c", t.contact_force, normals)
+    tangential = t.contact_force - normal[:, None] * normals
     rubbing = np.linalg.norm(tangential, axis=1)
     stored, way = _contact_ways(t)
-    along = np.einsum("ci,ci->c", way, t.contact_normal)
-    slip = way - along[:, None] * t.contact_normal
+    along = np.einsum("ci,ci->c", way, normals)
+    slip = way - along[:, None] * normals
     # Coulomb: mu f_n |slip| + f_t . slip is nowhere negative, and zero where friction is all it can be and opposes
     # slip, or where nothing slips.
     friction_gap = np.abs(t.friction * normal * np.linalg.norm(slip, axis=1) + np.einsum("ci,ci->c", tangential, slip))
     missed = np.linalg.norm(stored - way, axis=1) / t.dt[t.contact_step]
+    deepest = min(float(t.min_gap.min()), float(_uneven_end_gaps(t).min(initial=0.0)))
     edges = t.positions[:, t.tets[:, 1:]] - t.positions[:, t.tets[:, :1]]
     energy = energy or ledger(t)
     return Audit(
@@ -50,7 +53,7 @@ def audit(trajectory: Trajectory, *, energy: Ledger | None = None, newton_unconv
         cone_violation=float(np.maximum(rubbing - t.friction * normal, -normal).max(initial=0.0) * t.height / unit),
         friction_gap=float(friction_gap.max(initial=0.0) / unit),
         contact_velocity=float(missed[normal > 0.0].max(initial=0.0) / np.sqrt(np.linalg.norm(t.gravity) * t.height)),
-        penetration=float(max(-t.min_gap.min(), 0.0) / t.height),
+        penetration=float(max(-deepest, 0.0) / t.height),
         complementarity_gap=float((normal * np.maximum(_start_gaps(t) + along, 0.0)).max(initial=0.0) / unit),
         inverted_elements=int((np.linalg.det(edges) <= 0.0).sum()),
         newton_unconverged=newton_unconverged,
@@ -81,9 +84,59 @@ def _start_points(t: Trajectory) -> np.ndarray:
 
 
 def _start_gaps(t: Trajectory) -> np.ndarray:
-    """(C,) metres from its plane to each contact at the start of its step."""
+    """(C,) metres from its plane, or from the uneven ground's tangent plane, to each contact at the start of its
+    step.
+    """
     planes = t.planes[t.contact_plane]
-    return np.einsum("ci,ci->c", planes[:, :3], _start_points(t)) + planes[:, 3]
+    points = _start_points(t)
+    gaps = np.einsum("ci,ci->c", planes[:, :3], points) + planes[:, 3]
+    uneven = _on_uneven_ground(t)
+    gaps[uneven] = _ground_gaps(t, points[uneven])
+    return gaps
+
+
+def _on_uneven_ground(t: Trajectory) -> np.ndarray:
+    """(C,) bool."""
+    return (t.contact_plane == 0) & (t.ground_coefficients.size > 0)
+
+
+def _contact_normals(t: Trajectory) -> np.ndarray:
+    """(C, 3) as stored, but of uneven ground as its heights have it."""
+    normals, uneven = t.contact_normal.copy(), _on_uneven_ground(t)
+    normals[uneven] = _ground(t, _start_points(t)[uneven])[1]
+    return normals
+
+
+def _uneven_end_gaps(t: Trajectory) -> np.ndarray:
+    """(c,) metres from uneven ground to each contact with it at the end of its step."""
+    after = t.contact_step + 1
+    ends = np.einsum("cw,cwi->ci", t.contact_weights, t.positions[after[:, None], t.contact_nodes])
+    return _ground_gaps(t, ends[_on_uneven_ground(t)])
+
+
+def _ground_gaps(t: Trajectory, points: np.ndarray) -> np.ndarray:
+    """(n,) metres from the tangent plane under each of ``points`` (n, 3)."""
+    lift, normals = _ground(t, points)
+    return ((points - t.ground_origin) @ t.ground_axes[2] - lift) * (normals @ t.ground_axes[2])
+
+
+def _ground(t: Trajectory, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) height of uneven ground at ``points`` (n, 3) and (n, 3) its normal, by SciPy's splines and differences."""
+    if len(points) == 0:
+        return np.zeros(0), np.zeros((0, 3))
+    # The edge goes on level.
+    padded = np.pad(t.ground_coefficients, 3, mode="edge")
+    flat = (points - t.ground_origin) @ t.ground_axes[:2].T / t.ground_spacing + 3.0
+
+    def height(across: float, along: float) -> np.ndarray:
+        at = np.stack([flat[:, 1] + along, flat[:, 0] + across])
+        return np.asarray(ndimage.map_coordinates(padded, at, order=2, mode="nearest", prefilter=False))
+
+    small = 1e-4
+    first = (height(small, 0.0) - height(-small, 0.0)) / (2.0 * small * t.ground_spacing)
+    second = (height(0.0, small) - height(0.0, -small)) / (2.0 * small * t.ground_spacing)
+    normals = np.stack([-first, -second, np.ones(len(points))], axis=1) @ t.ground_axes
+    return height(0.0, 0.0), normals / np.linalg.norm(normals, axis=1)[:, None]
 
 
 def _contact_ways(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from egs_warp.contact.detection import ContactGeometry, ContactSet
+from egs_warp.contact.detection import ContactGeometry
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.io.atomic import writable_folder
@@ -41,10 +41,8 @@ class Recorder:
         """``start_gap``: smallest gap at ``start``, metres; ``frame``: where the body lies in its capture; ``folder``:
         tells, once the first step is done, where the parts go; it is made where it is missing.
         """
-        self._planes = np.array([[*plane.normal, plane.offset] for plane in geometry.planes])
         self._folder, self._path = folder, None
         self._steps = self._written = self._asked_steps = 0
-        self._last = start.positions
         self._reports: list[StepReport] = []
         self._asked: list[tuple[int, int]] = []
         self.start = self._first(body, muscles, geometry, start, start_gap, drag, frame)
@@ -102,7 +100,7 @@ class Recorder:
             "tets": body.mesh.tets,
             "node_mass": body.node_mass,
             "gravity": body.gravity,
-            "planes": self._planes,
+            "planes": np.array([[*plane.normal, plane.offset] for plane in geometry.planes]),
             "solid_from_plane": geometry.solid_of_each_plane,
             "friction": np.float64(geometry.friction),
             "drag": np.float64(drag),
@@ -126,6 +124,13 @@ class Recorder:
             "contact_force": np.zeros((0, 3)),
             "contact_gap": np.zeros(0),
         }
+        if geometry.field is not None:
+            part |= {
+                "ground_axes": geometry.field.axes,
+                "ground_origin": geometry.field.origin,
+                "ground_spacing": np.float64(geometry.field.spacing),
+                "ground_coefficients": geometry.field.coefficients,
+            }
         if frame is not None:
             part |= {
                 "body_axes": frame.axes,
@@ -138,12 +143,10 @@ class Recorder:
         """The steps since the last part."""
         reports, self._reports = self._reports, []
         asked, self._asked = self._asked, []
-        starts = [self._last, *(report.state.positions for report in reports)]
         counts = [report.contacts.count for report in reports]
-        planes = [self._plane(report.contacts, start) for report, start in zip(reports, starts, strict=False)]
         part = {
             "time": np.array([report.state.time for report in reports]),
-            "positions": np.stack(starts[1:]),
+            "positions": np.stack([report.state.positions for report in reports]),
             "velocities": np.stack([report.state.velocities for report in reports]),
             "min_gap": np.array([report.min_gap for report in reports]),
             "dt": np.array([report.dt for report in reports]),
@@ -151,7 +154,7 @@ class Recorder:
             "contact_step": np.repeat(np.arange(self._steps, self._steps + len(reports)), counts).astype(np.int32),
             "contact_nodes": np.concatenate([report.contacts.nodes for report in reports]).astype(np.int32),
             "contact_weights": np.concatenate([report.contacts.weights for report in reports]),
-            "contact_plane": np.concatenate(planes).astype(np.int32),
+            "contact_plane": np.concatenate([report.contacts.faces for report in reports]).astype(np.int32),
             "contact_normal": np.concatenate([report.contacts.axes[:, 0] for report in reports]),
             "contact_force": np.concatenate([np.einsum("na,nai->ni", r.forces, r.contacts.axes) for r in reports]),
             "contact_gap": np.concatenate([report.end_gaps for report in reports]),
@@ -162,15 +165,8 @@ class Recorder:
             **{name: np.array([getattr(report, name) for report in reports]) for name in REPORTED},
             **_laps(reports),
         }
-        self._last, self._steps = starts[-1], self._steps + len(reports)
+        self._steps += len(reports)
         return part
-
-    def _plane(self, contacts: ContactSet, positions: np.ndarray) -> np.ndarray:
-        """(n,) the plane that each contact is held to: of those with its normal, that at its gap."""
-        points = np.einsum("nw,nwi->ni", contacts.weights, positions[contacts.nodes])
-        gaps = points @ self._planes[:, :3].T + self._planes[:, 3]
-        turned = np.abs(contacts.axes[:, None, 0] - self._planes[None, :, :3]).max(axis=2)
-        return np.argmin(np.abs(gaps - contacts.gaps[:, None]) + np.where(turned < 1e-9, 0.0, np.inf), axis=1)
 
 
 def _laps(reports: Sequence[StepReport]) -> dict[str, np.ndarray]:

@@ -68,7 +68,8 @@ class Trajectory:
     gravity: np.ndarray
     """(3,)."""
     planes: np.ndarray
-    """(P, 4) rows n, d of n.x + d = 0; the first is the ground."""
+    """(P, 4) rows n, d of n.x + d = 0; the first is the ground, or where it is not flat the level that its heights are
+    told from in the body's frame."""
     solid_from_plane: np.ndarray
     """(P,) int32: a point is inside a solid if it is below all of its planes; a solid of one plane is a half space."""
     friction: float
@@ -88,13 +89,13 @@ class Trajectory:
     contact_weights: np.ndarray
     """(C, 4)."""
     contact_plane: np.ndarray
-    """(C,) int32: row of ``planes``."""
+    """(C,) int32: row of ``planes``; 0 is the ground, flat or not."""
     contact_normal: np.ndarray
-    """(C, 3) unit, of that plane."""
+    """(C, 3) unit, of that plane, or of uneven ground where the contact was at the start of the step."""
     contact_force: np.ndarray
     """(C, 3) newtons on the body, world axes."""
     contact_gap: np.ndarray
-    """(C,) metres at the end of the step."""
+    """(C,) metres at the end of the step, from the plane that it is held to in the step."""
     min_gap: np.ndarray
     """(F+1,) metres, smallest gap of all contact Gaussians."""
     activations: np.ndarray
@@ -112,6 +113,14 @@ class Trajectory:
     """(M,)."""
     muscle_stiffness: np.ndarray
     """(M,) N/m."""
+    ground_axes: np.ndarray = field(default_factory=lambda: np.eye(3))
+    """(3, 3) rows: along columns, rows and heights of uneven ground."""
+    ground_origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    """(3,) where its node (0, 0) lies at height 0."""
+    ground_spacing: float = 1.0
+    """Metres between its nodes."""
+    ground_coefficients: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    """(rows, columns) metres, of its biquadratic B-spline (``HeightField``); of none where the ground is flat."""
     planned_com: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     """(F+1, 3) centre of mass as planned, NaN where nothing was; or no rows."""
     body_axes: np.ndarray = field(default_factory=lambda: np.eye(3))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from egs_warp.contact.terrain import Solid, surface_above
+from egs_warp.contact.terrain import Surface, surface_above
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
@@ -34,7 +34,7 @@ class Place:
     """(k, 3) points of the body on the ground, metres."""
     step: float
     """Seconds of a solver step."""
-    solids: tuple[Solid, ...] = ()
+    solids: tuple[Surface, ...] = ()
     """What there is to stand on, the ground among it."""
     friction: float = 0.8
     """Coulomb coefficient."""

@@ -12,6 +12,7 @@ from tqdm import tqdm
 from egs_warp.contact.terrain import Solid
 from egs_warp.errors import ArgumentError
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
 from egs_warp.io.run_folder import RunFolder, run_folder
@@ -112,6 +113,7 @@ def animate(
     motion: str = "jump",
     up: np.ndarray | None = None,
     plane: Plane | None = None,
+    ground: HeightField | None = None,
     background: GaussianCloud | None = None,
     view_from: np.ndarray | None = None,
     muscles_file: Path | None = None,
@@ -132,8 +134,8 @@ def animate(
 
     ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.motions.script``).
     ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
-    the object to the camera; ``shot``: how it is filmed. ``muscles_file``, ``solids``, ``gravity_up``, ``front``,
-    ``seen_from``, ``settings``: see ``make_creature``. Returns what it wrote as ``report.json``
+    the object to the camera; ``shot``: how it is filmed. ``ground``, ``muscles_file``, ``solids``, ``gravity_up``,
+    ``front``, ``seen_from``, ``settings``: see ``make_creature``. Returns what it wrote as ``report.json``
     (docs/guide/report.md). A folder belongs to one run (``egs_warp.io.run_folder``): one with an earlier run is
     refused, or that run moved aside (``overwrite``), or gone on with if it was cut off (``resume``): with the same
     arguments to the same bits. Raises ``UserError`` for bad input, before any file of an earlier run is touched.
@@ -149,6 +151,7 @@ def animate(
                 cloud,
                 up=up,
                 plane=plane,
+                ground=ground,
                 metres_per_unit=options.metres_per_unit,
                 friction=options.friction,
                 muscles_file=muscles_file,

@@ -9,13 +9,15 @@ from pathlib import Path
 import numpy as np
 
 from egs_warp.contact.detection import ContactGeometry, contact_geometry
-from egs_warp.contact.terrain import Solid
+from egs_warp.contact.terrain import Solid, Surface
 from egs_warp.deformation.rigid import in_body_frame
 from egs_warp.errors import ArgumentError
 from egs_warp.fem.body import DEFAULT_SAG, BodyState, SoftBody, make_body
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.tetmesh import mean_edge_length
 from egs_warp.locomotion.rollout import settle, solver_steps
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.stepper import LocomotionStepper
@@ -34,6 +36,10 @@ SMALLEST_SAG = 0.004
 """A body is not made stiffer than this column's sag, whatever it bends."""
 STEEPEST_SLOPE = 45.0
 """Degrees: nothing stands on a steeper one."""
+_GROUND_SPACING = 0.5
+"""Edges of the cage between the nodes of uneven ground: points of contact are 0.4 apart."""
+_FOOT = 0.1
+"""Of the height over uneven ground: what is lower may stand on it."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +59,8 @@ class Creature:
     """Body, muscles and contact."""
     start: BodyState
     """At rest on the ground."""
-    solids: tuple[Solid, ...]
-    """All that there is to stand on, the ground (z = 0) first."""
+    solids: tuple[Surface, ...]
+    """All that there is to stand on, the ground first."""
 
     def placed(self, cloud: GaussianCloud) -> GaussianCloud:
         """Something else of the same capture, such as what is behind it, in the frame of the body."""
@@ -85,6 +91,7 @@ def make_creature(
     friction: float = 0.8,
     sag: float = DEFAULT_SAG,
     muscles_file: Path | None = None,
+    ground: HeightField | None = None,
     solids: tuple[Solid, ...] = (),
     gravity_up: np.ndarray | None = None,
     front: np.ndarray | None = None,
@@ -93,7 +100,8 @@ def make_creature(
     nodes: int = 500,
     progress: Callable[[str], object] = lambda stage: None,
 ) -> Creature:
-    """Give a capture (scene units) a body that stands on ``plane``, or on its own base, square to ``up`` (3,).
+    """Give a capture (scene units) a body that stands on ``plane``, or on its own base, square to ``up`` (3,), or on
+    ``ground`` that is not flat.
 
     All that is given is in the capture's frame and units; what is made is in the body's, so nothing hangs on how the
     file lies. ``muscles_file``: see ``body_muscles``. ``solids`` are steps and walls beside the ground; ``gravity_up``
@@ -103,6 +111,8 @@ def make_creature(
     states and the QP solver. The body is as stiff as makes it sag by ``sag`` of its height; one that its weight would
     bend out of shape is made stiffer. ``nodes``: of its cage, about. ``progress`` is told the name of each stage.
     """
+    if ground is not None:
+        plane = plane_below(cloud, ground)
     normal = plane.normal if plane is not None else up
     if normal is None:
         advice = "neither the ground nor which way is up is known; give one of them"
@@ -116,8 +126,12 @@ def make_creature(
     progress("contact")
     device, frame, cage = str(cloud.device), standing.frame, standing.cage
     solids = tuple(Solid(tuple(frame.plane(face) for face in solid.faces)) for solid in solids)
+    field = None
+    if ground is not None:
+        # A cage gives way to nothing finer than it is itself.
+        field = frame.height_field(ground).coarser(_GROUND_SPACING * mean_edge_length(cage.mesh))
     geometry = contact_geometry(
-        standing.gaussians, cage.mesh, (GROUND,), solids=solids, friction=friction, device=device
+        standing.gaussians, cage.mesh, (GROUND,), field=field, solids=solids, friction=friction, device=device
     )
     against_gravity = None if gravity_up is None else frame.axes @ gravity_up
     progress("front")
@@ -130,10 +144,23 @@ def make_creature(
         progress("stand")
         start = settle(stepper)
         if sag < SMALLEST_SAG or _stands(stepper, start):
-            everything = (Solid((GROUND,)), *solids)
+            everything = (field or Solid((GROUND,)), *solids)
             placed = in_body_frame(cloud, frame)
             return Creature(frame, placed, faces, standing.limbs, cage, stepper, start, everything)
         sag *= 0.5
+
+
+def plane_below(cloud: GaussianCloud, ground: HeightField) -> Plane:
+    """The plane that ``ground`` tells its heights from, moved up or down to the lowest place under the object's
+    foot.
+    """
+    means = cloud.means.numpy()[cloud.opacities() > 0.3].astype(np.float64)
+    heights = ground.heights(means)
+    if len(means) == 0 or not (heights > 0.0).any():
+        raise ArgumentError("ground", "nothing of the object lies above it; check the plane", check=("plane",))
+    low = means[(heights > 0.0) & (heights < _FOOT * float(np.quantile(heights, 0.99)))]
+    lift = float(ground.lift(low).min()) if len(low) else 0.0
+    return Plane(ground.normal, ground.plane.offset - lift)
 
 
 def changed_creature(creature: Creature, *, friction: float, sag: float, muscles_file: Path | None) -> Creature:

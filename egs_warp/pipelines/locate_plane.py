@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,18 +12,28 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera, shrunk
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.planes import KnownPlane
 from egs_warp.segmentation.base_plane import guess_up
+from egs_warp.segmentation.ground import ROUGH, measure_ground
 from egs_warp.segmentation.object_mask import ObjectSpec, Segmentation, segment, votes_of_masks
 from egs_warp.segmentation.plane_fit import PlaneFit
-from egs_warp.segmentation.plane_search import find_planes, plane_under, refine_plane
+from egs_warp.segmentation.plane_search import FoundPlane, find_planes, plane_under, refine_plane
+from egs_warp.segmentation.table_top import planes_below, surface_around
 
 _PLANE_ELEVATIONS = (40.0, 58.0, 75.0)
 """Degrees: seen at a grazing angle, splats in front hide those behind, and the floor seems to lie higher."""
 _CLEAR_SUPPORT = 0.1
 """Share of the visible surface: a plane as wide as this is no accident."""
 _LEVEL_DEGREES = 5.0
+_TOP = 0.995
+"""Quantile of the Gaussians' heights that is the object's."""
+_HIGHER = 0.7
+"""Of the way from a point down to the wide plane: a table top is higher than that."""
+_GOES_ON = 0.25
+"""Share of an object's surroundings in which what it stands on must go on: slabs and laps of real objects do in none or
+next to none, the cloth on the bonsai's narrow table in 0.4."""
 _PLANE_SIDE = 400
 """Pixels of the pictures that the plane is fitted to."""
 
@@ -40,10 +51,12 @@ class LocatedPlane:
     """Scene units: diagonal of the object's bounding box."""
     segmentation: Segmentation
     notes: tuple[str, ...]
+    ground: HeightField | None = None
+    """What is there, scene units, where it is not flat."""
 
     def known(self) -> KnownPlane:
         """What ``plane.json`` says of it."""
-        found = KnownPlane(self.plane, centre=self.centre, size=self.size)
+        found = KnownPlane(self.plane, centre=self.centre, size=self.size, ground=self.ground)
         return found if self.fit is None else found.over(known_of_fit(self.fit))
 
 
@@ -62,9 +75,9 @@ def locate_plane(
 ) -> LocatedPlane:
     """The plane under the object, and the object on it.
 
-    A coarse plane is sampled from the Gaussians, the object found on it, and the plane then fitted to the depth
-    rendered beside the object, through ``cameras`` or else a ring of steep ones; then the object is found again. With
-    ``plane`` given, only the object is sought.
+    A coarse plane is sampled from the Gaussians (a table top goes before a wider floor), the object found on it, and
+    the plane then fitted to the depth rendered beside the object, through ``cameras`` or else a ring of steep ones;
+    then the object is found again. With ``plane`` given, only the object is sought.
     """
     notes: list[str] = []
     if plane is not None:
@@ -73,8 +86,7 @@ def locate_plane(
     if up is None:
         up, reason = _up_of(cloud, cameras)
         notes.append(f"up is taken to be {','.join(f'{x:.2f}' for x in up)} ({reason}); if not, say which way is up")
-    coarse = _coarse_plane(cloud, spec, up)
-    found = segment(cloud, coarse, spec)
+    coarse, found = _standing(cloud, spec, up)
     centre = _middle(cloud, found)
     radius = 0.75 * found.size
     if cameras:
@@ -89,6 +101,41 @@ def locate_plane(
         f"to {100 * fit.noise:.2f} % of depth, {100 * fit.inlier_share:.0f} % of them inliers"
     )
     return LocatedPlane(fit.plane, fit, _middle(cloud, found), found.size, found, tuple(notes))
+
+
+def on_its_ground(
+    cloud: GaussianCloud, located: LocatedPlane, spec: ObjectSpec, cameras: Sequence[Camera] = ()
+) -> LocatedPlane:
+    """``located``, and where the ground is not flat, what is there, and the object down to it; or why not."""
+    found = located.segmentation
+    means = cloud.means.numpy()[found.object_mask]
+    height = float(np.quantile(located.plane.heights(means), _TOP))
+    measured = measure_ground(
+        cloud, ~found.background_mask, located.plane, cameras=cameras, centre=located.centre, size=located.size
+    )
+    rough, noise = (f"{100.0 * value / height:.1f} %" for value in (measured.roughness, measured.noise))
+    if measured.is_flat(height):
+        if measured.roughness < ROUGH * height:
+            return located
+        note = f"the ground seems rough by {rough} of the object's height, but views differ by {noise}: taken as flat"
+        return replace(located, notes=(*located.notes, note))
+    try:
+        found = segment(cloud, measured.field, spec, size=located.size)
+    except UserError as error:
+        note = f"the ground is rough by {rough} of the object's height, but taken for flat ({error})"
+        return replace(located, notes=(*located.notes, note))
+    note = (
+        f"the ground is not flat: it differs from its plane by {rough} of the object's height (views of it by {noise});"
+        " the object stands on it as captured"
+    )
+    return replace(
+        located,
+        centre=_middle(cloud, found),
+        size=found.size,
+        segmentation=found,
+        notes=(*located.notes, note),
+        ground=measured.field,
+    )
 
 
 def _middle(cloud: GaussianCloud, found: Segmentation) -> np.ndarray:
@@ -108,12 +155,40 @@ def _up_of(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray,
     return guess_up(cloud)
 
 
-def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> Plane:
-    means = cloud.means.numpy().astype(np.float64)
+def _standing(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> tuple[Plane, Segmentation]:
+    """A coarse plane, and the object on it: that of the capture's wide planes that is under the object, or a higher one
+    that only its surroundings show (a table top).
+    """
     everywhere = find_planes(cloud, up)
-    # The widest plane tells up better than a guess does, and what objects stand on is level.
-    if everywhere and everywhere[0].support > _CLEAR_SUPPORT:
-        up = everywhere[0].plane.normal
+    found, wide, failure = None, None, None
+    try:
+        wide = _coarse_plane(cloud, spec, up, everywhere)
+        found = segment(cloud, wide, spec)
+    except UserError as error:
+        failure = error
+    if spec.point is not None or (failure is not None and spec.masks):
+        point = spec.point if spec.point is not None else _low_point(cloud, spec, cloud.means.numpy(), up)
+        for plane in planes_below(cloud, _level(up, everywhere), point):
+            if wide is not None and plane.heights(point) > _HIGHER * wide.heights(point):
+                break
+            with contextlib.suppress(UserError):
+                standing = segment(cloud, plane, spec)
+                if surface_around(cloud, plane, standing) > _GOES_ON:
+                    return plane, standing
+    if wide is None or found is None:
+        assert failure is not None
+        raise failure
+    return wide, found
+
+
+def _level(up: np.ndarray, everywhere: Sequence[FoundPlane]) -> np.ndarray:
+    """(3,) the widest plane tells up better than a guess does, and what objects stand on is level."""
+    return everywhere[0].plane.normal if everywhere and everywhere[0].support > _CLEAR_SUPPORT else up
+
+
+def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, everywhere: Sequence[FoundPlane]) -> Plane:
+    means = cloud.means.numpy().astype(np.float64)
+    up = _level(up, everywhere)
     searched, least_share = cloud, 0.3
     if spec.box is not None:
         if not spec.box.holds(means).any():

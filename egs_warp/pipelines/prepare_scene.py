@@ -8,15 +8,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import warp as wp
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.holes import Hole, hole_under
+from egs_warp.inpainting.underside import with_underside
 from egs_warp.io.planes import KnownPlane, write_planes
 from egs_warp.io.ply import write_ply
-from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane
+from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, on_its_ground
 from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane, reach_across
 from egs_warp.segmentation.object_mask import ObjectSpec
 from egs_warp.training import has_torch
@@ -40,6 +43,8 @@ class SceneOptions:
 
     clearing: Clearing | None = None
     """None: fine-tuning where PyTorch is installed, else the static split."""
+    flat: bool = False
+    """Stand on the plane, whatever the ground is like."""
     inpaint: bool = True
     inpainter: Inpainter | None = None
     """None: patch synthesis."""
@@ -64,6 +69,11 @@ class PreparedScene:
     """What was found and done, for the user."""
     filled: InpaintResult | None = None
     """How the background got its new floor; None where it got none."""
+
+    @property
+    def ground(self) -> HeightField | None:
+        """What the object stands on where that is not flat."""
+        return self.located.ground
 
     def write(self, folder: Path, known: Sequence[KnownPlane] = ()) -> None:
         """``object.ply``, ``background.ply`` and ``plane.json`` into ``folder``.
@@ -96,6 +106,9 @@ def prepare_scene(
     options = options or SceneOptions()
     progress("plane")
     located = locate_plane(cloud, spec, cameras=cameras, up=up, plane=plane)
+    if not options.flat:
+        progress("ground")
+        located = on_its_ground(cloud, located, spec, cameras)
     progress("segment")
     thing, bare, notes = take_apart(cloud, located, options, photographs)
     filled, hole = None, hole_under(cloud, located.plane, located.segmentation)
@@ -124,7 +137,10 @@ def take_apart(
     """Object, clear of the plane; background with a hole; and what there is to say."""
     found = located.segmentation
     method = options.clearing or (Clearing.FINETUNE if has_torch() else Clearing.SPLIT)
-    untouched = cloud.subset(found.object_mask)
+    untouched, ground = cloud.subset(found.object_mask), located.ground
+    if ground is not None:
+        # Where the ground is the plane, what stands on it can be cleared of the plane.
+        untouched, photographs = _moved(untouched, ground.levelled), None
     heights, reach = reach_across(untouched, located.plane, options.clearing_options.reach)
     if not found.background_mask.any():
         raise UserError("object: it is the whole capture, so there is no background; animate the capture itself")
@@ -136,13 +152,24 @@ def take_apart(
         surroundings=cloud.subset(~found.object_mask) if photographs else None,
         options=options.clearing_options,
     )
+    closed = ()
+    if ground is not None:
+        thing, count = with_underside(_moved(thing, ground.raised), ground, found.size)
+        closed = (f"its underside, which no view shows, was closed by {count} Gaussians",) if count else ()
     notes = (
         f"the object has {untouched.count} of {cloud.count} Gaussians; {int(found.buried_mask.sum())} under it and "
         f"{int(found.floater_mask.sum())} floaters beside it were dropped",
         f"{int((np.abs(heights) < reach).sum())} of the object's Gaussians straddled the plane: {_CLEARED[method]}"
         + (f" against {len(photographs)} photographs" if photographs and method is Clearing.FINETUNE else ""),
+        *closed,
     )
     return thing, cloud.subset(found.background_mask), notes
+
+
+def _moved(cloud: GaussianCloud, to: Callable[[np.ndarray], np.ndarray]) -> GaussianCloud:
+    """``cloud`` with its means moved."""
+    means = to(cloud.means.numpy().astype(np.float64)).astype(np.float32)
+    return replace(cloud, means=wp.array(means, dtype=wp.vec3, device=cloud.device))
 
 
 def viewing_direction(scene: PreparedScene, cameras: Sequence[Camera]) -> np.ndarray | None:

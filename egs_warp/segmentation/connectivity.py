@@ -10,13 +10,16 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 
 _ARM = 1.5
 """Standard deviations: how far a Gaussian reaches to touch another."""
 
 
-def connected_parts(cloud: GaussianCloud, chosen: np.ndarray, *, cell: float, plane: Plane, above: float) -> np.ndarray:
+def connected_parts(
+    cloud: GaussianCloud, chosen: np.ndarray, *, cell: float, plane: Plane | HeightField, above: float
+) -> np.ndarray:
     """(m,) int32 part of each of the ``chosen`` (m,) indices; their opacity masses say which part matters.
 
     Gaussians are connected that reach, with centre or arms, into one cell of a grid. ``cell`` is its least side (scene

@@ -4,6 +4,7 @@ then what is connected above the plane.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,6 +14,7 @@ from scipy.spatial import KDTree
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.connectivity import close_to, connected_parts, enclosed
 from egs_warp.segmentation.plane_search import lies_along
@@ -43,6 +45,10 @@ a Gaussian may be a shred of the floor.
 """
 _NEIGHBOURS = 16
 """Gaussians whose median colour is that of a place."""
+_HALVINGS = 6
+"""Of the first guess of an object's size, about a point in a large room."""
+_LIKELY, _LARGEST = 0.3, 4.0
+"""Of a guess: smaller and larger objects are not what it was made for."""
 _FOOT = 0.015
 """Of the object's size: within this height above the plane, floor and object cannot be told apart by connection."""
 
@@ -90,11 +96,15 @@ class Segmentation:
         return ~(self.object_mask | self.buried_mask | self.floater_mask)
 
 
-def segment(cloud: GaussianCloud, plane: Plane, spec: ObjectSpec) -> Segmentation:
-    """Find the object that ``spec`` means and that stands on ``plane``.
+def segment(
+    cloud: GaussianCloud, plane: Plane | HeightField, spec: ObjectSpec, *, size: float | None = None
+) -> Segmentation:
+    """Find the object that ``spec`` means and that stands on ``plane``, or on ground that is not flat.
 
-    Raises ``UserError`` where masks are empty, miss the object or have the wrong size, where box or point hold nothing,
-    and where the object does not touch the plane.
+    Around a point the object is first taken to be half as large as the capture; where nothing so large stands on the
+    plane, as in a room, half as large again, and so on; ``size`` (scene units) tells better. Raises ``UserError`` where
+    masks are empty, miss the object or have the wrong size, where box or point hold nothing, and where the object does
+    not touch the plane.
     """
     scene = _Scene.of(cloud, plane)
     if spec.masks:
@@ -102,12 +112,31 @@ def segment(cloud: GaussianCloud, plane: Plane, spec: ObjectSpec) -> Segmentatio
     else:
         wanted = spec.box.holds(scene.means) if spec.box is not None else np.ones(cloud.count, bool)
         unknown = np.zeros(cloud.count, bool)
-    size = _first_size(scene, wanted, spec)
+    size = size or _first_size(scene, wanted, spec)
+    try:
+        return _of_size(scene, wanted, unknown, spec, size)
+    except UserError:
+        if spec.point is None:
+            raise
+        for halvings in range(1, _HALVINGS + 1):
+            smaller = size * 0.5**halvings
+            with contextlib.suppress(UserError):
+                found = _of_size(scene, wanted, unknown, spec, smaller)
+                # A shred of what is meant is found by a wrong guess as well.
+                if found.size > _LIKELY * smaller:
+                    return found
+        raise
+
+
+def _of_size(scene: _Scene, wanted: np.ndarray, unknown: np.ndarray, spec: ObjectSpec, size: float) -> Segmentation:
+    """The object, if it is roughly of ``size`` (scene units)."""
     foot = _FOOT * size
     # The first round tells how large the object is and how rough its floor; the second goes by that.
     for _ in range(2):
         chosen, small = _body(scene, wanted, unknown, spec, foot, size)
         size = _diagonal(scene.means[chosen])
+        if size == 0.0:
+            raise UserError(_NOTHING_ABOVE, check=("plane",))
         floor = _floor_top(scene, chosen, size)
         foot = max(_FOOT * size, 1.2 * floor)
     outline = scene.under(chosen, max(3.0 * foot, FOOTPRINT_HEIGHT * size), size)
@@ -142,7 +171,7 @@ class _Scene:
     """What is asked of the capture again and again; all (n, ...)."""
 
     cloud: GaussianCloud
-    plane: Plane
+    plane: Plane | HeightField
     means: np.ndarray
     flat: np.ndarray
     """(n, 2) along the plane."""
@@ -154,7 +183,7 @@ class _Scene:
     """(n,) bool: flat, and lying along the plane as a floor's Gaussians do."""
 
     @classmethod
-    def of(cls, cloud: GaussianCloud, plane: Plane) -> _Scene:
+    def of(cls, cloud: GaussianCloud, plane: Plane | HeightField) -> _Scene:
         means, opacity = cloud.means.numpy().astype(np.float64), cloud.opacities()
         level = lies_along(cloud, plane)
         flat = means @ np.stack(plane.tangents(), axis=1)
@@ -200,6 +229,9 @@ def _body(
     # Loose matter inside a hollow body would stay behind as a ghost. The floor closes the body from below: its mirror
     # image in the floor does as well.
     shell = scene.means[chosen]
+    if _diagonal(shell) > _LARGEST * size:
+        # Cells made for a small object would fill a room.
+        raise UserError(_NOTHING_ABOVE, check=("plane",))
     mirrored = shell - 2.0 * (scene.heights[chosen, None] - foot) * scene.plane.normal
     chosen |= enclosed(scene.means, np.concatenate([shell, mirrored]), 2.0 * size / CELLS) & (scene.heights > foot)
     chosen |= lying & scene.under(chosen, 0.1 * size, size)
@@ -207,12 +239,15 @@ def _body(
 
 
 def _wisps(scene: _Scene, chosen: np.ndarray, size: float) -> np.ndarray:
-    """(n,) bool: wide Gaussians at the object's foot in the floor's colour,
+    """(n,) bool: wide Gaussians at the object's foot in the floor's colour, on uneven ground those that lie flat, too,
     which would go along as shreds of the floor.
     """
     low = scene.heights < _WISP_HEIGHT * size
     length = np.exp(scene.cloud.log_scales.numpy().max(axis=1))
     wide = length > max(_WISP * size, 2.0 * float(np.median(length[chosen])))
+    if isinstance(scene.plane, HeightField):
+        # Under the object the ground is a guess, and what lies there may be higher.
+        wide |= scene.level
     suspects = np.flatnonzero(chosen & low & wide)
     own = np.flatnonzero(chosen & low & ~wide & scene.solid)
     floor = np.flatnonzero(~chosen & low & scene.level & scene.solid & (np.abs(scene.heights) < 0.05 * size))

@@ -12,6 +12,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.bitmaps import connected_parts
 from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.plane_fit import PlaneFit, PlaneView, fit_plane
@@ -200,7 +201,7 @@ def near_plane(cloud: GaussianCloud, plane: Plane, thickness: float) -> np.ndarr
     return np.abs(plane.heights(cloud.means.numpy())) < thickness
 
 
-def lies_along(cloud: GaussianCloud, plane: Plane) -> np.ndarray:
+def lies_along(cloud: GaussianCloud, plane: Plane | HeightField) -> np.ndarray:
     """(n,) bool: flat Gaussians that lie along ``plane``, at whatever height, as a floor's do."""
     scales = cloud.log_scales.numpy()
     turns = Rotation.from_quat(cloud.rotations.numpy()[:, [1, 2, 3, 0]]).as_matrix()

@@ -17,28 +17,11 @@ from egs_warp.contact.terrain import Solid, step
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
-from egs_warp.geometry.tetmesh import TetMesh
+from tests.support.clouds import surface_cloud
 from tests.support.meshes import block_mesh
 
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 GRAVITY = 9.81
-
-
-def surface_cloud(mesh: TetMesh, count: int, *, lowest: float = 0.0, scale: float = 0.01) -> GaussianCloud:
-    """Gaussians of random rotation scattered over the mesh's surface, means kept above ``lowest``."""
-    rng = np.random.default_rng(0)
-    faces = mesh.boundary_faces()
-    shares = rng.dirichlet([1.0, 1.0, 1.0], count)
-    means = np.einsum("ni,nij->nj", shares, mesh.nodes[faces[rng.integers(len(faces), size=count)]])
-    means[:, 2] = np.maximum(means[:, 2], lowest)
-    return GaussianCloud.from_numpy(
-        means,
-        rng.standard_normal((count, 4)),
-        np.log(scale * rng.uniform(0.3, 1.0, (count, 3))),
-        rng.uniform(-2, 3, count),
-        np.zeros((count, 1, 3)),
-        device="cpu",
-    )
 
 
 def seven_points(cloud: GaussianCloud, gamma: float = 3.0) -> np.ndarray:

@@ -1,20 +1,36 @@
-"""Solids beside the ground: where their tops are, and every mistake of a terrain file named in one line."""
+"""What there is to stand on: tops of solids, mistakes of a terrain file named in one line; uneven ground: gaps, frames
+against their twins, and a body that comes to rest on waves.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from egs_warp.assets import pawn
+from egs_warp.contact.detection import ContactDetector, ContactGeometry, contact_geometry
 from egs_warp.contact.terrain import Solid, read_terrain, step, surface_above
+from egs_warp.deformation.embedding import embed_points
 from egs_warp.errors import UserError
+from egs_warp.fem.body import BodyState
 from egs_warp.geometry.plane import Plane
+from egs_warp.locomotion.audit import audit
+from egs_warp.locomotion.recorder import Recorder
+from egs_warp.locomotion.stepper import LocomotionStepper
+from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.report import AUDIT_LIMITS
+from tests.support.clouds import surface_cloud
+from tests.support.creatures import coarse_creature
+from tests.support.meshes import block_mesh
+from tests.support.places import DT, FLOOR, FORWARD
+from tests.support.waves import wavy_ground
 
 UP = np.array([0.0, 0.0, 1.0])
-FLOOR = Plane(UP, 0.0)
 
 
 def test_tops_of_a_step_a_ramp_a_wall_and_a_box() -> None:
@@ -84,3 +100,137 @@ def test_a_solid_that_holds_the_body_is_named(tmp_path: Path) -> None:
         "solids: the body is inside number 2; inside is where n.x + d < 0 for every face [nx, ny, nz, d]:"
         " turn the signs of a face, or move the solid"
     )
+
+
+WALL = Solid((Plane.from_coefficients(-1.0, 0.0, 0.0, 0.15),))
+
+
+def test_the_kernel_equals_its_twin(device: str) -> None:
+    """Eq. (8): gaps to waves and to a wall beside them, which of both is nearer, and frames, against plain NumPy."""
+    mesh = block_mesh()
+    field = wavy_ground(reach=0.3)
+    cloud = surface_cloud(mesh, 400, lowest=0.04)
+    wall = Solid((Plane.from_coefficients(-1.0, 0.0, 0.0, 0.25),))
+    geometry = contact_geometry(cloud, mesh, (FLOOR,), field=field, solids=(wall,), device=device)
+    detector = ContactDetector(geometry, device=device)
+    random = np.random.default_rng(2)
+    # Half of it far beyond the grid.
+    x = 2.0 * mesh.nodes + 0.2 * random.standard_normal(mesh.nodes.shape) - [0.0, 0.0, 0.3]
+    points = np.einsum("pw,pwi->pi", geometry.weights, x[mesh.tets[geometry.tet_from_point]])
+    both = np.stack([field.gaps(points), wall.faces[0].heights(points)])
+    gaps, faces = detector.gaps(x)
+    assert np.abs(gaps - both.min(axis=0)).max() < 1e-12
+    assert np.array_equal(faces, both.argmin(axis=0)) and set(faces) == {0, 1}
+    contacts = detector.contact_set(np.arange(len(points)), x)
+    on_ground = faces == 0
+    assert np.array_equal(contacts.faces, faces)
+    assert np.array_equal(contacts.axes[on_ground], field.frames(points[on_ground]))
+    assert np.allclose(contacts.axes[~on_ground, 0], [-1.0, 0.0, 0.0])
+
+
+def test_contact_velocities_are_the_gaps_change(device: str) -> None:
+    """For points on the ground: the gap after a short way is what the frame's normal row says, to second order."""
+    mesh = block_mesh()
+    field = wavy_ground()
+    x = mesh.nodes.copy()
+    x[:, 2] += field.lift(x)
+    soles = embed_points(mesh, mesh.nodes[mesh.nodes[:, 2] == 0.0], device="cpu")
+    geometry = ContactGeometry(mesh, (FLOOR,), 0.8, soles.tets.numpy(), soles.weights.numpy(), 0, 0.0, field=field)
+    detector = ContactDetector(geometry, device=device)
+    contacts = detector.contact_set(np.arange(len(geometry.weights)), x)
+    # Weights are of single precision.
+    assert np.abs(contacts.gaps).max() < 1e-6
+    v = np.random.default_rng(3).standard_normal(x.shape)
+    for dt in (1e-3, 1e-4):
+        moved, _ = detector.gaps(x + dt * v)
+        assert np.abs(contacts.end_gaps(dt, v) - moved).max() < 10.0 * dt**2
+
+
+def test_arms_end_on_the_ground_at_rest_and_bumps_between_them_are_seen() -> None:
+    """Eq. (3): no point begins inside; more points stay than on flat ground, and none is lower than they, by bumps as
+    wide as two edges of a cage whose base is flat.
+    """
+    mesh = block_mesh()
+    field = wavy_ground(0.02, spacing=0.05)
+    cloud = surface_cloud(mesh, 20000, lowest=0.03)
+    geometry = contact_geometry(cloud, mesh, (FLOOR,), field=field, device="cpu")
+    flat = contact_geometry(cloud, mesh, (FLOOR,), device="cpu")
+    assert len(geometry.weights) > 1.2 * len(flat.weights) and geometry.left_out == 0
+    detector = ContactDetector(geometry, device="cpu")
+    assert detector.gaps(mesh.nodes)[0].min() > -1e-6
+    means = cloud.means.numpy().astype(np.float64)
+    for shift in np.linspace(0.0, 0.4, 9):
+        down = np.array([shift, 0.5 * shift, -0.05])
+        assert detector.gaps(mesh.nodes + down)[0].min() < field.gaps(means + down).min() + 1e-3
+
+
+def test_the_highest_of_ground_and_solids_is_stood_on() -> None:
+    field = wavy_ground()
+    point = np.array([0.3, 0.2, 1.0])
+    block = Solid((Plane(np.array([0.0, 0.0, 1.0]), -0.5), WALL.faces[0]))
+    up = np.array([0.0, 0.0, 1.0])
+    assert surface_above((field, block), point, up) == pytest.approx(-0.5)
+    assert surface_above((field, block), point - [0.3, 0.0, 0.0], up) == pytest.approx(
+        float(field.lift(point - [0.3, 0.0, 0.0])) - 1.0
+    )
+
+
+@cache
+def drop() -> tuple[Trajectory, LocomotionStepper, int]:
+    """A squat block let fall by 0.1 m onto waves, without muscle work, until it has come to rest."""
+    made = coarse_creature(block_mesh(4, 4, 3, size=(0.6, 0.6, 0.4)), forward=FORWARD, settled=False)
+    body, muscles = made.stepper.body, made.stepper.muscles
+    base = np.stack(np.meshgrid(*[np.linspace(-0.3, 0.3, 13)] * 2, [0.0]), axis=-1).reshape(-1, 3)
+    soles = embed_points(body.mesh, base, device="cpu")
+    field = wavy_ground(0.03)
+    geometry = ContactGeometry(body.mesh, (FLOOR,), 0.8, soles.tets.numpy(), soles.weights.numpy(), 0, 0.0, field=field)
+    stepper = LocomotionStepper(body, muscles, geometry, device="cpu")
+    lift = 0.1 + float(field.lift(base).max())
+    start = BodyState(body.mesh.nodes + [0.0, 0.0, lift], np.zeros_like(body.mesh.nodes))
+    gaps, _ = stepper.detector.gaps(start.positions)
+    recorder = Recorder(body, muscles, geometry, start, float(gaps.min()), drag=0.0)
+    state, memory, unconverged = start, stepper.initial_memory(), 0
+    for _ in range(210):
+        state, memory, report = stepper.held_step(state, memory, memory.activations, DT)
+        recorder.add([report])
+        unconverged += not report.converged
+    return recorder.trajectory(), stepper, unconverged
+
+
+def test_a_body_dropped_onto_waves_comes_to_rest_in_balance() -> None:
+    """It stops, at more than one slope; forces carry the weight, and without slip their torque about its middle is
+    nothing.
+    """
+    t, stepper, _ = drop()
+    speed = np.linalg.norm(t.velocities[-1], axis=1).max()
+    assert speed < 2e-3 * np.sqrt(9.81)
+    last = t.contact_step == len(t.dt) - 1
+    assert np.ptp(t.contact_normal[last], axis=0).max() > 0.05
+    force = t.contact_force[last]
+    assert force.sum(axis=0) == pytest.approx([0.0, 0.0, stepper.body.weight], abs=2e-3 * stepper.body.weight)
+    points = np.einsum("cw,cwi->ci", t.contact_weights[last], t.positions[-1][t.contact_nodes[last]])
+    torque = np.cross(points - stepper.body.centre_of_mass(t.positions[-1]), force).sum(axis=0)
+    assert np.abs(torque).max() < 2e-3 * stepper.body.weight
+
+
+def test_the_drop_passes_the_audit() -> None:
+    """All of its bounds, from the file alone: nothing goes deeper than 0.5 % of its height, the ledger closes."""
+    t, _, unconverged = drop()
+    found = audit(t, newton_unconverged=unconverged)
+    for name, limit in AUDIT_LIMITS.items():
+        assert getattr(found, name) <= limit, name
+    assert found.penetration < 5e-3 and found.energy_residual < 1e-9
+
+
+def test_the_audit_recomputes_the_ground() -> None:
+    """Ground that was another, or normals that are not the ground's, are seen."""
+    t, _, _ = drop()
+    lifted = replace(t, ground_coefficients=t.ground_coefficients + 0.02)
+    assert audit(lifted).penetration > 0.015
+    lowered = replace(t, ground_coefficients=t.ground_coefficients - 1e-3)
+    assert audit(lowered).complementarity_gap > 1e-4
+    moved = replace(t, ground_origin=t.ground_origin + [0.2, 0.0, 0.0])
+    assert audit(moved).complementarity_gap > 1e-3 or audit(moved).cone_violation > 1e-3
+    # What is stored of normals is of no account: forces obey the ground's.
+    upright = replace(t, contact_normal=np.tile([0.0, 0.0, 1.0], (len(t.contact_normal), 1)))
+    assert audit(upright).cone_violation == audit(t).cone_violation

@@ -14,12 +14,12 @@ from egs_warp.cli import main
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud, joined
+from egs_warp.geometry.soap_film import soap_film
 from egs_warp.inpainting.holes import Hole, disc, footprint, unseen
 from egs_warp.inpainting.inpaint import InpaintOptions, InpaintResult, inpaint
 from egs_warp.inpainting.inpainters import OpenCvInpainter
 from egs_warp.inpainting.new_floor import rim_heights, with_gloss
 from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, mean_colours, rectify
-from egs_warp.inpainting.soap_film import soap_film
 from egs_warp.io import read_capture, write_ply
 from egs_warp.io.planes import KnownPlane, write_planes
 from egs_warp.render import render_gaussians

@@ -11,17 +11,22 @@ import pytest
 from egs_warp.errors import UserError
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.planes import HoleOutline, KnownPlane, read_planes, write_planes
+from tests.support.waves import wavy_ground
 
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), -0.25)
+GROUND = wavy_ground(spacing=0.5)
 HOLE = HoleOutline(np.array([1.0, 2.0, 0.25]), 0.5, (8, 6), (np.array([[1, 1], [4, 1], [4, 5]]),))
 
 
 def test_all_that_is_known_comes_back(tmp_path: Path) -> None:
-    known = KnownPlane(FLOOR, np.array([1.0, 2.0, 3.0]), 0.7, 0.01, 0.9, 120, 0.3, HOLE, {"remark": ["a", 1]})
+    known = KnownPlane(FLOOR, np.array([1.0, 2.0, 3.0]), 0.7, 0.01, 0.9, 120, 0.3, HOLE, GROUND, {"remark": ["a", 1]})
     write_planes(tmp_path / "plane.json", [known, KnownPlane(FLOOR)])
     full, bare = read_planes(tmp_path / "plane.json")
     assert full.to_json() == known.to_json() and full.pixels == 120 and full.others == {"remark": ["a", 1]}
     assert full.hole is not None and full.hole.texels == (8, 6) and np.array_equal(full.hole.outlines, HOLE.outlines)
+    assert full.ground is not None and full.ground.lift(np.zeros(3)) == pytest.approx(
+        GROUND.lift(np.zeros(3)), abs=1e-4
+    )
     assert bare.to_json() == {"normal": [0.0, 0.0, 1.0], "offset": -0.25}
 
 
@@ -36,6 +41,12 @@ def test_what_is_found_anew_takes_the_place_of_what_was_known() -> None:
     [
         ({"hole": {"texels": [8, 6]}}, "its hole is damaged; make it again with egs-warp segment"),
         ({"hole": 3}, "its hole is damaged; make it again with egs-warp segment"),
+        ({"ground": {"spacing": 1.0}}, "its ground is damaged; make it again with egs-warp segment"),
+        ({"ground": [1, 2]}, "its ground is damaged; make it again with egs-warp segment"),
+        (
+            {"ground": {"axes": [[0] * 3] * 3, "origin": [0] * 3, "spacing": 1, "coefficients": [[0] * 4] * 4}},
+            "its ground is damaged; make it again with egs-warp segment",
+        ),
         ({"noise": "low"}, "the facts of plane 0 are damaged; make it again"),
         ({"centre": [1.0]}, "the facts of plane 0 are damaged; make it again"),
     ],

@@ -23,7 +23,8 @@ from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
 from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.performance import simulate
-from tests.support.runs import Run
+from tests.support.runs import Run, coarse_block_run
+from tests.support.waves import wavy_ground
 
 UP = np.array([0.0, 0.0, 1.0])
 FORWARD = np.array([1.0, 0.0, 0.0])
@@ -61,6 +62,20 @@ def test_a_coarse_run_ends_at_rest_with_all_motions_done(coarse_run: Run) -> Non
     assert [done.motion.notes() for done in coarse_run.sequence.done] == [[], []]
     speed = coarse_run.body.centre_of_mass(coarse_run.reports[-1].state.velocities)
     assert np.linalg.norm(speed) < 0.05 * np.sqrt(9.81 * coarse_run.body.height)
+
+
+def test_a_coarse_block_jumps_on_waves() -> None:
+    """It begins and lands on folds 1.5 % of its height high either way; the audit recomputes the ground."""
+    field = wavy_ground(0.015)
+    base = np.stack(np.meshgrid(*[np.linspace(-0.25, 0.25, 11)] * 2, [0.0]), axis=-1)
+    run = coarse_block_run("jump 0.4 0.2", field.moved(np.array([0.0, 0.0, -float(field.lift(base).max())])))
+    assert run.trajectory.ground_coefficients.size > 0
+    assert_audit(run.trajectory, run.reports)
+    jumped = measure(run.trajectory)
+    assert run.sequence.finished and jumped.tilt_degrees < 10.0 and jumped.airborne_frames > 10.0
+    assert jumped.distance == pytest.approx(0.4, abs=0.06) and jumped.height == pytest.approx(0.2, abs=0.04)
+    last = run.trajectory.contact_step == len(run.trajectory.dt) - 1
+    assert np.ptp(run.trajectory.contact_normal[last], axis=0).max() > 0.02
 
 
 def run(script: str, **ground: Any) -> tuple[MotionSequence, list[Reached], np.ndarray]:

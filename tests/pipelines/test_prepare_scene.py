@@ -14,9 +14,11 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.inpainting.inpainters import OpenCvInpainter, OpenCvMethod
 from egs_warp.io import read_capture, write_ply
+from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene, viewing_direction
 from egs_warp.segmentation.clearance import Clearing
 from egs_warp.segmentation.object_mask import ObjectSpec
+from tests.support.grounds import on_folds
 from tests.support.scenes import FLOOR, ball_on_floor
 
 
@@ -121,6 +123,37 @@ def test_the_parts_of_earlier_steps_are_animated(
     np.testing.assert_allclose(told["plane"].normal, prepared.plane.normal, atol=1e-9)
 
 
+def test_ground_that_is_not_flat_goes_along_with_the_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measured, told, written beside the plane, read again and handed to the animation; ``--flat`` keeps to the plane;
+    and the object settles on it where it stood.
+    """
+    cloud, truth = on_folds(0.04, length=0.9)
+    click = ObjectSpec(point=np.array([0.0, 0.0, 0.5]))
+    options = SceneOptions(clearing=Clearing.SPLIT, inpaint=False)
+    prepared = prepare_scene(cloud, click, up=FLOOR.normal, options=options)
+    ground = prepared.ground
+    assert ground is not None and any(note.startswith("the ground is not flat") for note in prepared.notes)
+    heights = ground.heights(prepared.object.means.numpy())
+    # None of it is cut off at the plane.
+    assert heights.min() > -0.01 and prepared.object.count > 0.95 * truth.sum()
+    prepared.write(tmp_path)
+    for flag in ((), ("--flat",)):
+        told: dict[str, Any] = {}
+        monkeypatch.setattr("egs_warp.pipelines.animate.animate", _noting(told))
+        line = ["animate", str(tmp_path / "object.ply"), "--plane", str(tmp_path / "plane.json"), *flag]
+        assert main([*line, "--out", str(tmp_path / "out")]) == 2
+        if flag:
+            assert told["ground"] is None
+        else:
+            nodes = ground.nodes().reshape(-1, 3)
+            assert np.abs(told["ground"].heights(nodes)).max() < 1e-3
+    creature = make_creature(prepared.object, ground=ground, nodes=120)
+    body, start = creature.body, creature.start.positions
+    assert creature.geometry.field is not None
+    assert np.linalg.norm(body.centre_of_mass(start) - body.centre_of_mass(body.mesh.nodes)) < 0.03 * body.height
+    assert creature.stepper.detector.gaps(start)[0].min() > -0.01 * body.height
+
+
 def test_one_command_from_a_scene_to_a_film(
     scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -168,7 +201,7 @@ def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:
         options=SceneOptions(clearing=Clearing.SPLIT, inpaint=False),
         progress=stages.append,
     )
-    assert stages == ["plane", "segment"]
+    assert stages == ["plane", "ground", "segment"]
     assert prepared.background is prepared.bare
     assert any("straddled the plane: split at it" in note for note in prepared.notes)
     cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.9, count=3, elevations=(20.0, 40.0, 60.0))

@@ -9,6 +9,7 @@ import numpy as np
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.fem.body import BodyState, make_body
+from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.rollout import settle
 from egs_warp.locomotion.stepper import LocomotionStepper
@@ -36,14 +37,20 @@ def coarse_creature(
     sag: float = 0.05,
     strength: float = 4.0,
     settled: bool = True,
+    field: HeightField | None = None,
 ) -> CoarseCreature:
-    """A body of ``mesh`` on its lowest nodes, facing ``forward`` (3,); ``up`` (3,) is against gravity."""
+    """A body of ``mesh`` on its lowest nodes, facing ``forward`` (3,); ``up`` (3,) is against gravity. On ``field`` in
+    place of the floor it may stand on all of its base."""
     body = make_body(mesh, FLOOR, up=up, sag=sag, device="cpu")
     muscles = automatic_muscles(
         mesh, UP, body_weight=body.weight, height=body.height, young_modulus=body.young_modulus, strength=strength
     )
-    soles = embed_points(mesh, mesh.nodes[mesh.nodes[:, 2] == 0.0], device="cpu")
-    geometry = ContactGeometry(mesh, (FLOOR,), 0.8, soles.tets.numpy(), soles.weights.numpy(), 0, 0.0)
+    places = mesh.nodes[mesh.nodes[:, 2] == 0.0]
+    if field is not None:
+        sides = [np.linspace(low, high, 11) for low, high in zip(places.min(axis=0), places.max(axis=0), strict=True)]
+        places = np.stack(np.meshgrid(*sides[:2], [0.0]), axis=-1).reshape(-1, 3)
+    soles = embed_points(mesh, places, device="cpu")
+    geometry = ContactGeometry(mesh, (FLOOR,), 0.8, soles.tets.numpy(), soles.weights.numpy(), 0, 0.0, field=field)
     stepper = LocomotionStepper(body, muscles, geometry, device="cpu")
     start = settle(stepper) if settled else BodyState(mesh.nodes, np.zeros_like(mesh.nodes))
     ground = Ground.on(FLOOR, forward, body.centre_of_mass(start.positions), up=up)

@@ -330,6 +330,21 @@ BESIDE_THE_PAPER: list[Mutation] = [
             *("np.cross(_start_points(t) - com[t.contact_step]", "np.cross(_start_points(t)"),
             "locomotion/test_audit.py::test_a_run_that_slides_passes",
         ),
+        (
+            *("uneven ground: the distance from its tangent plane", "kernels/contact/height_field.py"),
+            *("real(1.0) + first * first + second * second", "real(1.0) + first * first"),
+            "contact/test_terrain.py::test_the_kernel_equals_its_twin",
+        ),
+        (
+            *("uneven ground: its normal", "geometry/height_field.py"),
+            *("np.stack([-first, -second, one], axis=1)", "np.stack([-first, second, one], axis=1)"),
+            "geometry/test_height_field.py::test_normals_are_the_gradient_of_the_gap",
+        ),
+        (
+            *("audit: the gap to uneven ground", "locomotion/audit.py"),
+            *("- lift) * (normals @ t.ground_axes[2])", "- 1.01 * lift) * (normals @ t.ground_axes[2])"),
+            "contact/test_terrain.py::test_the_drop_passes_the_audit",
+        ),
     ]
 ]
 """Formulas that the paper leaves open."""

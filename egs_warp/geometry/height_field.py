@@ -1,0 +1,162 @@
+"""Ground that is not flat: heights over a plane, smooth enough to have a normal everywhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.plane import Plane
+
+_FIT = "mirror"
+_TOP_STEPS = 8
+_DAMAGED = "ground: it is damaged; make it again"
+_MOST_NODES = 1 << 22
+"""Of a grid."""
+
+
+@dataclass(frozen=True)
+class HeightField:
+    """A biquadratic B-spline over a square grid: heights and slopes are continuous, so is the normal.
+
+    Beyond the grid its edge goes on level. Lengths are those of the frame that it lies in.
+    """
+
+    axes: np.ndarray
+    """(3, 3) rows: the grid's columns run along the first, its rows along the second, heights along the third;
+    right-handed."""
+    origin: np.ndarray
+    """(3,) where node (0, 0) lies at height 0."""
+    spacing: float
+    """Of the nodes."""
+    coefficients: np.ndarray
+    """(rows, columns) float64, of the spline."""
+
+    @classmethod
+    def through(cls, axes: np.ndarray, origin: np.ndarray, spacing: float, heights: np.ndarray) -> HeightField:
+        """The field that has ``heights`` (rows, columns) at its nodes."""
+        return cls(axes, origin, spacing, ndimage.spline_filter(heights, order=2, output=np.float64, mode=_FIT))
+
+    @property
+    def normal(self) -> np.ndarray:
+        """(3,) unit, of the plane that heights are told from."""
+        return self.axes[2]
+
+    @property
+    def plane(self) -> Plane:
+        """The plane that heights are told from."""
+        return Plane(self.axes[2], -float(self.axes[2] @ self.origin))
+
+    def tangents(self) -> tuple[np.ndarray, np.ndarray]:
+        """Two unit vectors (3,) that span that plane."""
+        return self.axes[0], self.axes[1]
+
+    def lift(self, points: np.ndarray) -> np.ndarray:
+        """(...,) height of the ground over its plane, under or over ``points`` (..., 3)."""
+        return self._spline(np.asarray(points, float))[0]
+
+    def heights(self, points: np.ndarray) -> np.ndarray:
+        """(...,) height of ``points`` (..., 3) over the ground, along the plane's normal; positive above."""
+        points = np.asarray(points, float)
+        return (points - self.origin) @ self.axes[2] - self._spline(points)[0]
+
+    def gaps(self, points: np.ndarray) -> np.ndarray:
+        """(...,) distance of ``points`` (..., 3) from the tangent plane under them; negative inside.
+
+        It is zero on the ground, where its gradient is the normal; off it, it is the distance to first order.
+        """
+        points = np.asarray(points, float)
+        height, (first, second) = self._spline(points)
+        return ((points - self.origin) @ self.axes[2] - height) / np.sqrt(1.0 + first**2 + second**2)
+
+    def frames(self, points: np.ndarray) -> np.ndarray:
+        """(n, 3, 3) rows: the ground's normal under ``points`` (n, 3) and two tangents, unit, right-handed after it;
+        they turn with it without a jump."""
+        _, (first, second) = self._spline(np.asarray(points, float))
+        zero, one = np.zeros_like(first), np.ones_like(first)
+        normal = np.stack([-first, -second, one], axis=1) / np.sqrt(1.0 + first**2 + second**2)[:, None]
+        along = np.stack([one, zero, first], axis=1) / np.sqrt(1.0 + first**2)[:, None]
+        return np.stack([normal, along, np.cross(normal, along)], axis=1) @ self.axes
+
+    def top(self, point: np.ndarray, up: np.ndarray) -> float:
+        """How far along ``up`` (3,) from ``point`` (3,) the ground is."""
+        way = 0.0
+        for _ in range(_TOP_STEPS):
+            way -= float(self.heights(point + way * up)) / float(up @ self.axes[2])
+        return way
+
+    def levelled(self, points: np.ndarray) -> np.ndarray:
+        """``points`` (n, 3) moved along the plane's normal until their heights over the ground are over the plane."""
+        return points - self.lift(points)[:, None] * self.axes[2]
+
+    def raised(self, points: np.ndarray) -> np.ndarray:
+        """The inverse of ``levelled``."""
+        return points + self.lift(points)[:, None] * self.axes[2]
+
+    def nodes(self) -> np.ndarray:
+        """(rows, columns, 3) the nodes, on the ground."""
+        at = np.stack(np.meshgrid(*(np.arange(count) for count in self.coefficients.shape[::-1])), axis=-1)
+        flat = self.origin + self.spacing * (at @ self.axes[:2])
+        return flat + self._spline(flat)[0][..., None] * self.axes[2]
+
+    def scaled(self, factor: float) -> HeightField:
+        """The same ground after all lengths are multiplied by ``factor``."""
+        return replace(
+            self,
+            origin=factor * self.origin,
+            spacing=factor * self.spacing,
+            coefficients=factor * self.coefficients,
+        )
+
+    def moved(self, shift: np.ndarray) -> HeightField:
+        """The same ground after all points have moved by ``shift`` (3,)."""
+        return replace(self, origin=self.origin + shift)
+
+    def coarser(self, spacing: float) -> HeightField:
+        """The ground without what is narrower than two of ``spacing``; itself if it is as coarse already."""
+        if spacing <= self.spacing:
+            return self
+        ratio = spacing / self.spacing
+        heights = (self.nodes() - self.origin) @ self.axes[2]
+        # Half a spacing wide: what is two spacings long keeps 30 % of its height, four 74 %.
+        smooth = np.asarray(ndimage.gaussian_filter(heights, 0.5 * ratio, mode="nearest"))
+        rows, columns = (max(int(np.ceil((count - 1) / ratio)) + 1, 3) for count in heights.shape)
+        at = np.stack(np.meshgrid(ratio * np.arange(rows), ratio * np.arange(columns), indexing="ij"))
+        sampled = ndimage.map_coordinates(smooth, at, order=1, mode="nearest")
+        return HeightField.through(self.axes, self.origin, spacing, sampled)
+
+    def _spline(self, points: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """(...,) height and its two slopes at ``points`` (..., 3)."""
+        away = (points - self.origin) / self.spacing
+        (column, across), (row, along) = (_weights(away @ axis) for axis in self.axes[:2])
+        rows, columns = self.coefficients.shape
+        height, first, second = (np.zeros(away.shape[:-1]) for _ in range(3))
+        for j in range(3):
+            for i in range(3):
+                c = self.coefficients[np.clip(row + j - 1, 0, rows - 1), np.clip(column + i - 1, 0, columns - 1)]
+                height += along[0][j] * across[0][i] * c
+                first += along[0][j] * across[1][i] * c
+                second += along[1][j] * across[0][i] * c
+        return height, (first / self.spacing, second / self.spacing)
+
+
+def check_grid(field: HeightField) -> None:
+    """Raises ``UserError`` for a field that is no ground: too small or large, not finite, or with skewed axes."""
+    if field.coefficients.ndim != 2:
+        raise UserError(_DAMAGED)
+    rows, columns = field.coefficients.shape
+    finite = np.isfinite(field.coefficients).all() and np.isfinite(field.origin).all() and 0.0 < field.spacing < np.inf
+    square = np.abs(field.axes @ field.axes.T - np.eye(3)).max() < 1e-6 if np.isfinite(field.axes).all() else False
+    if not (min(rows, columns) >= 3 and rows * columns <= _MOST_NODES and finite and square):
+        raise UserError(_DAMAGED)
+
+
+def _weights(place: np.ndarray) -> tuple[np.ndarray, tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]]:
+    """Nearest node of each ``place`` (in spacings), weights of it and its neighbours, and their derivatives."""
+    nearest = np.floor(place + 0.5)
+    f = place - nearest
+    weights = (0.5 * (0.5 - f) ** 2, 0.75 - f * f, 0.5 * (0.5 + f) ** 2)
+    # Far out the index is of no account, but it has to be one.
+    return np.clip(nearest, -2.0, 1e9).astype(np.int64), (weights, (f - 0.5, -2.0 * f, f + 0.5))

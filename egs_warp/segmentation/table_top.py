@@ -1,0 +1,79 @@
+"""What an object stands on in a room, where the widest plane is another: the level surface that goes on around it."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from egs_warp.geometry.bitmaps import distance_to
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.segmentation.connectivity import enclosed
+from egs_warp.segmentation.object_mask import FOOTPRINT_HEIGHT, Segmentation
+from egs_warp.segmentation.plane_search import find_planes, lies_along
+
+_LEVELS = 4
+"""Halvings of the capture's half diagonal: how far about a point planes are looked for."""
+_LEAST_SUPPORT = 0.1
+"""Of what lies level so near to a point: less is no table."""
+_THICKNESS = 0.02
+"""Of that distance."""
+_LEVEL_DEGREES = 5.0
+_CELL = 0.03
+"""Of the object's size."""
+_APRON = 3
+"""Cells about the object's outline in which the surface must go on; the cell at the outline does not count."""
+_COVERED = 0.3
+"""Of a cell, for the surface to be there."""
+_NEAR = 0.03
+"""Of the object's size: what is further from the plane is not of it."""
+
+
+def planes_below(cloud: GaussianCloud, up: np.ndarray, point: np.ndarray) -> list[Plane]:
+    """Level planes below ``point`` (3,) among what lies within a half, a quarter, ... of the capture's size of it, the
+    highest first.
+    """
+    means, opaque = cloud.means.numpy().astype(np.float64), cloud.opacities() > 0.3
+    if not opaque.any():
+        return []
+    low, high = np.quantile(means[opaque], [0.02, 0.98], axis=0)
+    away = means - point
+    rise = away @ up
+    across = np.linalg.norm(away - rise[:, None] * up, axis=1)
+    lying = lies_along(cloud, Plane(up, 0.0))
+    found: list[tuple[float, Plane]] = []
+    for level in range(_LEVELS):
+        reach = 0.5 * float(np.linalg.norm(high - low)) * 0.5**level
+        near = lying & (across < reach) & (rise < 0.1 * reach) & (rise > -2.0 * reach)
+        if not near.any():
+            break
+        for one in find_planes(
+            cloud.subset(near), up, count=2, tilt_degrees=_LEVEL_DEGREES, thickness=_THICKNESS * reach
+        ):
+            height = float(one.plane.heights(point))
+            if height > 0.0 and one.support > _LEAST_SUPPORT:
+                found.append((height, one.plane))
+    return [plane for _, plane in sorted(found, key=lambda entry: entry[0])]
+
+
+def surface_around(cloud: GaussianCloud, plane: Plane, found: Segmentation) -> float:
+    """Share, 0 to 1, of the surroundings of the object's outline on ``plane`` in which a surface lies along it."""
+    cell, tangents = _CELL * found.size, np.stack(plane.tangents(), axis=1)
+    means = cloud.means.numpy().astype(np.float64)
+    heights, flat = plane.heights(means), means @ tangents
+    low = found.object_mask & (heights < FOOTPRINT_HEIGHT * found.size)
+    if not low.any():
+        return 0.0
+    corner = flat[low].min(axis=0) - 2.0 * _APRON * cell
+    shape = np.ceil((flat[low].max(axis=0) + 2.0 * _APRON * cell - corner) / cell).astype(int) + 1
+    middles = corner + cell * (np.indices(tuple(shape)).reshape(2, -1).T + 0.5)
+    foot = enclosed(middles, flat[low], cell).reshape(shape)
+    surface = lies_along(cloud, plane) & (np.abs(heights) < _NEAR * found.size) & ~found.object_mask
+    place = np.floor((flat - corner) / cell).astype(int)
+    surface &= ((place >= 0) & (place < shape)).all(axis=1)
+    area = 2.0 * np.pi * cloud.opacities() * np.exp(np.sort(cloud.log_scales.numpy(), axis=1)[:, 1:].sum(axis=1))
+    cover = np.zeros(tuple(shape))
+    np.add.at(cover, tuple(place[surface].T), area[surface] / cell**2)
+    away = distance_to(foot)
+    apron = (away > 1.0) & (away <= 1.0 + _APRON)
+    return float((ndimage.gaussian_filter(cover, 1.0)[apron] > _COVERED).mean())

@@ -1,0 +1,46 @@
+"""The underside of what stood sunk into its ground: closed from the rim, in the rim's colours, and only where open."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+
+from egs_warp.geometry.gaussians import SH_BAND_0
+from egs_warp.inpainting.underside import with_underside
+from tests.support.grounds import RADIUS, ball
+from tests.support.waves import wavy_ground
+
+SIZE = 1.7
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_a_ball_sunk_into_folds_is_closed(degree: int) -> None:
+    """A fifth of its radius deep: all of what is new lies within the rim, between its heights, and covers it."""
+    ground = wavy_ground(0.03, spacing=0.04)
+    whole = ball(-0.2 * RADIUS)
+    thing = whole.subset(ground.heights(whole.means.numpy()) > 0.005)
+    sh = np.zeros((thing.count, (degree + 1) ** 2, 3), np.float32)
+    sh[:, :1] = thing.sh.numpy()
+    thing = replace(thing, sh=wp.array(sh, dtype=wp.vec3, device=thing.device))
+    closed, count = with_underside(thing, ground, SIZE)
+    assert count > 50 and closed.count == thing.count + count and closed.sh_degree == degree
+    new = closed.means.numpy()[thing.count :].astype(np.float64)
+    rim = thing.means.numpy()[ground.heights(thing.means.numpy()) < 0.05]
+    radius = np.hypot(*rim[:, :2].T)
+    assert np.hypot(*new[:, :2].T).max() < radius.max()
+    assert rim[:, 2].min() - 0.01 < new[:, 2].min() and new[:, 2].max() < rim[:, 2].max() + 0.01
+    spots = np.random.default_rng(0).uniform(-0.15, 0.15, (200, 2))
+    nearest = np.linalg.norm(new[None, :, :2] - spots[:, None], axis=2).min(axis=1)
+    assert nearest.max() < 0.03
+    colour = closed.sh.numpy()[thing.count :, 0] * SH_BAND_0 + 0.5
+    assert np.abs(colour - [0.8, 0.3, 0.2]).max() < 0.02
+
+
+def test_what_is_closed_already_stays_as_it_is() -> None:
+    ground = wavy_ground(0.03, spacing=0.04).moved(np.array([0.0, 0.0, -0.06]))
+    thing = ball()
+    same, count = with_underside(thing, ground, SIZE)
+    assert same is thing and count == 0
