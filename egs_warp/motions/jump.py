@@ -201,7 +201,7 @@ class Jump:
         if self.phase is JumpPhase.CROUCH:
             position, velocity = self.plan.crouch(self._start_com, elapsed)
         velocity = self._following(seen, position, velocity, dt)
-        pose = self.pose.over_base(position, self._start_base)
+        pose = self.pose.bent_over_base(position, self._start_base)
         velocity, spin = self.pose.balanced(state, seen, velocity, self._upright(state, pose), dt)
         return self._write(state, velocity, pose, spin, dt)
 
@@ -227,7 +227,7 @@ class Jump:
         # From what keeps it upright to what brings it to the landing's tilt by then.
         share = min(elapsed / plan.thrust_time, 1.0)
         tilt = share * self.pose.turn_towards(state, upright) / plan.flight_time
-        standing = self.pose.over_base(position, self._start_base, self.facing.turned)
+        standing = self.pose.bent_over_base(position, self._start_base, self.facing.turned)
         tilt = tilt + (1.0 - share) * self._upright(state, standing)
         spin = self.facing.thrust_spin(tilt, state, self.ground.axes[2], plan.flight_time)
         velocity, spin = self.pose.balanced(state, seen, velocity, spin, dt)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
 from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.geometry.frames import best_turn
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.objectives import (
@@ -20,6 +22,10 @@ from egs_warp.locomotion.objectives import (
 )
 from egs_warp.locomotion.stepper import StepReport
 
+_SHEAR = np.einsum("ki,j->kij", np.eye(3)[:2], np.eye(3)[2])
+"""(2, 3, 3) what a unit of lean ahead and to the left adds to a pose that is sheared by it."""
+_PINNED = 1e6
+"""Of the largest stiffness: what holds a node where it stands."""
 SOLE = 0.06
 """Body heights: what is at most this far above a standing body's lowest node is its sole."""
 CALM = 0.03
@@ -253,25 +259,48 @@ class PoseFamily:
         """Radians about the ground's normal by which the feet alone are turned from the standing pose."""
         return heading_between(self._arms, positions, self._sole_share, self.ground)
 
-    def affine(self, stretch: float, lean: np.ndarray, heading: float = 0.0) -> np.ndarray:
-        """(3, 3) world matrix: ``stretch`` along up, half the volume kept by bulging, sheared by ``lean`` (2,),
-        then turned.
-        """
-        bulge = stretch**-0.25
-        local = np.diag([bulge, bulge, stretch])
-        local[:2, 2] = lean
-        local = Rotation.from_rotvec([0.0, 0.0, heading]).as_matrix() @ local
-        return self.ground.axes.T @ local @ self.ground.axes
-
     def over_base(self, com: np.ndarray, base: np.ndarray, heading: float = 0.0) -> np.ndarray:
         """(3, 3) the pose whose sole is flat at ``base`` (2,) while the centre of mass is at ``com`` (3,),
-        ground coordinates.
+        ground coordinates: sheared by the lean between them.
         """
-        turned = Rotation.from_rotvec([0.0, 0.0, heading]).as_matrix()[:2, :2] @ self.base_offset
-        lean = (com[:2] - base + turned) / self.standing_height
+        return self._leaning(com, base, heading, _SHEAR)
+
+    def bent_over_base(self, com: np.ndarray, base: np.ndarray, heading: float = 0.0) -> np.ndarray:
+        """(3, 3) the same of a body that bends as it does by itself: turned as far as that strains it least."""
+        return self._leaning(com, base, heading, self._bending)
+
+    def _leaning(self, com: np.ndarray, base: np.ndarray, heading: float, leans: np.ndarray) -> np.ndarray:
+        """(3, 3) world matrix: stretch along up, half the volume kept by bulging, ``leans`` (2, 3, 3) for each unit of
+        lean, then turned by ``heading`` radians."""
+        turn = Rotation.from_rotvec([0.0, 0.0, heading]).as_matrix()
+        lean = (com[:2] - base + turn[:2, :2] @ self.base_offset) / self.standing_height
         lean = lean * min(1.0, 0.5 / max(float(np.linalg.norm(lean)), 1e-9))
         stretch = float(np.clip(com[2] / self.standing_height, 0.6, 1.25))
-        return self.affine(stretch, lean, heading)
+        bulge = stretch**-0.25
+        local = turn @ (np.diag([bulge, bulge, stretch]) + np.einsum("k,kij->ij", lean, leans))
+        return self.ground.axes.T @ local @ self.ground.axes
+
+    @cached_property
+    def _bending(self) -> np.ndarray:
+        """(2, 3, 3) ground axes: what a unit of lean ahead and to the left adds to the pose of a body that a pull along
+        the ground bends, its sole held: the affine map nearest to its small displacements, by mass."""
+        body, assembly, axes = self.body, self.body.assembly, self.ground.axes
+        entries = assembly.hessian_entries(self._standing, projected=True)
+        held = np.repeat(self._sole_share > 0.0, 3)
+        entries[assembly.diagonal_entries] += _PINNED * entries.max() * held
+        factors = SparseFactors(assembly.upper_pattern)
+        factors.update(entries)
+        pulls = np.stack([np.kron(body.node_mass, axis) for axis in axes[:2]], axis=1)
+        bent = factors.solve(pulls * ~held[:, None]).reshape(len(body.node_mass), 3, 2)
+        arms = self._standing - body.centre_of_mass(self._standing)
+        spread = np.linalg.inv(np.einsum("n,ni,nj->ij", body.node_mass, arms, arms))
+        fits = []
+        for k in range(2):
+            moved = body.centre_of_mass(bent[:, :, k])
+            unit = self.standing_height / float(axes[k] @ moved)
+            fit = unit * np.einsum("n,ni,nj->ij", body.node_mass, bent[:, :, k] - moved, arms) @ spread
+            fits.append(axes @ fit @ axes.T)
+        return np.stack(fits)
 
     def objectives(
         self,

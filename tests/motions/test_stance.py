@@ -7,7 +7,7 @@ import pytest
 
 from egs_warp.fem.body import BodyState
 from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import MARGIN, Measurement, PoseFamily, _share_in_cone
+from egs_warp.motions.stance import MARGIN, SOLE, Measurement, PoseFamily, _share_in_cone
 
 GRAVITY, EDGE, DT = 9.81, 0.2, 1 / 60
 
@@ -130,3 +130,30 @@ def test_a_body_that_turns_forward_is_caught_further_ahead(place: Place) -> None
     caught = pose.caught(pose.measure(turning, None), seen.com[:2])
     same = swing(place, state, seen, 0.5 * place.ground.axes[1])
     np.testing.assert_allclose(caught, -2.0 * np.sqrt(GRAVITY / seen.com[2]) * same, atol=1e-9)
+
+
+def test_a_body_that_leans_turns_as_far_as_strains_it_least(place: Place) -> None:
+    """The static bend under a pull along the ground, its sole taken out of a dense system: the pose is the affine map
+    nearest to it by mass, found by least squares."""
+    pose, _, seen = stood(place, 0.8, (0.0, 0.0, 0.0))
+    body, assembly = place.body, place.body.assembly
+    upper = assembly.matrix(assembly.hessian_entries(place.standing, projected=True)).toarray()
+    stiffness = upper + np.triu(upper, 1).T
+    heights = place.standing @ place.ground.surface_normal
+    free = np.repeat(heights >= heights.min() + SOLE * body.height, 3)
+    bend = np.zeros(len(free))
+    ahead = place.ground.axes[0]
+    bend[free] = np.linalg.solve(stiffness[np.ix_(free, free)], np.kron(body.node_mass, ahead)[free])
+    lean = 0.1
+    moved = bend.reshape(-1, 3) * lean * pose.standing_height / (ahead @ body.centre_of_mass(bend.reshape(-1, 3)))
+    arms = place.standing - body.centre_of_mass(place.standing)
+    weights = np.sqrt(body.node_mass)[:, None]
+    ends = arms + moved - body.centre_of_mass(moved)
+    nearest = np.linalg.lstsq(weights * arms, weights * ends, rcond=None)[0].T
+    goal = seen.com + lean * pose.standing_height * np.array([1.0, 0.0, 0.0])
+    assert np.allclose(pose.bent_over_base(goal, seen.base), nearest, atol=1e-5)
+    state, left = BodyState(place.standing, 0.0 * place.standing), place.ground.axes[1]
+    sheared, bent = (
+        left @ pose.turn_towards(state, of(goal, seen.base)) for of in (pose.over_base, pose.bent_over_base)
+    )
+    assert 1.1 * sheared < bent
