@@ -21,8 +21,8 @@ from egs_warp.io.run_folder import MANIFEST
 
 PATIENCE = 300.0
 """Seconds that a run may take on a busy machine."""
-MOMENTS = 20
-"""At which each command is killed once."""
+MOMENTS = int(os.environ.get("EGS_WARP_MOMENTS", "4"))
+"""At which each command is killed once; the short form of docs/reliability.md unless told."""
 SMALL = ("--up", "z", "--size", "32")
 COMMANDS = {
     "jump": ("pawn.ply", "--frames", "28"),
