@@ -234,6 +234,8 @@ class _Graph:
                     if mine != other:
                         root[other] = mine
                         mass[mine] += mass[other]
+            if not level:
+                continue
             # What stands apart from the body all the way up, such as a tail, carries nothing.
             body = max(map(find, level), key=lambda one: mass[one])
             crossing = [section for section in level if find(section) == body and grounded[section]]

@@ -166,9 +166,9 @@ def test_what_a_step_loses_holds_for_crushed_elements(crushed: float) -> None:
 
 
 def test_it_shares_no_code_with_the_solver() -> None:
-    """It imports NumPy and the record that it reads; that record imports nothing of bodies, muscles or contact."""
+    """It imports NumPy, SciPy and the record it reads; that record imports nothing of bodies, muscles or contact."""
     for path in (Path(module.__file__), Path(module.__file__).with_name("audit.py")):
-        assert imported(path) <= {"numpy", "egs_warp.locomotion.trajectory", "egs_warp.locomotion.ledger"}
+        assert imported(path) <= {"numpy", "scipy", "egs_warp.locomotion.trajectory", "egs_warp.locomotion.ledger"}
     rooms = {name.split(".")[1] for name in imported(Path(module.__file__).with_name("trajectory.py")) if "." in name}
     assert rooms <= {"geometry", "io"}
 
