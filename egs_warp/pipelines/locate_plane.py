@@ -134,7 +134,7 @@ def on_its_ground(
         size=found.size,
         segmentation=found,
         notes=(*located.notes, note),
-        ground=measured.field,
+        ground=measured.touched_by(cloud.subset(found.object_mask), found.size),
     )
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from egs_warp.geometry.bitmaps import connected_parts
+from egs_warp.geometry.bitmaps import connected_parts, depth_inside
 from egs_warp.geometry.camera import Camera, camera_rays, shrunk
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -46,6 +46,10 @@ _SAME = 0.005
 """Of the depth: what lies no nearer without the object was seen with it."""
 _STEEPEST = 1.2
 """Rise over run from node to node: steeper ground is an edge, beyond which the plane goes on."""
+_RAISED = 0.05
+"""Of the object's size: an object that is further above the ground does not stand on it."""
+_SOLID = 0.3
+"""Opacity of what is taken to touch."""
 _PATCH = 0.05
 """Of the widest connected patch of ground: smaller ones are specks."""
 
@@ -66,6 +70,24 @@ class MeasuredGround:
     def is_flat(self, height: float) -> bool:
         """Whether an object of ``height`` (scene units) may as well stand on the plane."""
         return self.roughness < max(ROUGH * height, _SIGNAL * self.noise)
+
+    def touched_by(self, thing: GaussianCloud, size: float) -> HeightField:
+        """``field``, raised where no view shows it until ``thing``, of ``size`` (scene units), stands on it: the top of
+        the fold under an object is unseen, and the smoothest continuation leaves it out.
+        """
+        points = thing.means.numpy()[thing.opacities() > _SOLID].astype(np.float64)
+        field, unseen = self.field, ~self.known
+        column, row = np.rint((points - field.origin) @ field.axes[:2].T / field.spacing).astype(int).T
+        inside = (column >= 0) & (column < unseen.shape[1]) & (row >= 0) & (row < unseen.shape[0])
+        points, column, row = points[inside], column[inside], row[inside]
+        gaps = field.heights(points)
+        lowest = int(np.argmin(gaps)) if len(gaps) else -1
+        if lowest < 0 or not 0.0 < gaps[lowest] < _RAISED * size or not unseen[row[lowest], column[lowest]]:
+            return field
+        depth = depth_inside(unseen)
+        share = np.minimum(depth / depth[row[lowest], column[lowest]], 1.0)
+        heights = (field.nodes() - field.origin) @ field.normal + gaps[lowest] * share * share * (3.0 - 2.0 * share)
+        return HeightField.through(field.axes, field.origin, field.spacing, heights)
 
 
 def measure_ground(

@@ -150,8 +150,10 @@ def test_ground_that_is_not_flat_goes_along_with_the_parts(tmp_path: Path, monke
     creature = make_creature(prepared.object, ground=ground, nodes=120)
     body, start = creature.body, creature.start.positions
     assert creature.geometry.field is not None
-    # A coarse cage sinks and leans by less than the folds are high: 0.024 down and 0.031 sideways, folds of 0.04.
-    assert np.linalg.norm(body.centre_of_mass(start) - body.centre_of_mass(body.mesh.nodes)) < 0.045 * body.height
+    # It touches the ground where it was captured, and sinks no more than it sags. A ball on the slope of a fold rolls:
+    # on the folds themselves its middle goes 0.075 aside.
+    assert abs(creature.stepper.detector.gaps(body.mesh.nodes)[0].min()) < 0.005 * body.height
+    assert abs((body.centre_of_mass(start) - body.centre_of_mass(body.mesh.nodes))[2]) < 0.03 * body.height
     assert creature.stepper.detector.gaps(start)[0].min() > -0.01 * body.height
 
 

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.capture import read_capture
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, on_its_ground
-from egs_warp.segmentation.ground import measure_ground
+from egs_warp.segmentation.ground import MeasuredGround, measure_ground
 from egs_warp.segmentation.object_mask import ObjectSpec, segment
-from tests.support.grounds import RADIUS, on_folds
+from tests.support.grounds import RADIUS, ball, on_folds
 from tests.support.waves import wave
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -102,3 +103,20 @@ def test_real_grounds_that_are_flat_stay_planes(data_dir: Path, file: str, click
     located = on_its_ground(cloud, locate_plane(cloud, spec), spec)
     assert located.ground is None
     assert any("taken as flat" in note for note in located.notes) == (file == "koala.ply")
+
+
+def test_ground_reaches_up_to_what_stands_on_it() -> None:
+    """Level ground with a hill that the object hides: it is raised to the object there, and nowhere that is seen."""
+    heights = np.zeros((41, 41))
+    known = np.ones((41, 41), bool)
+    known[12:29, 12:29] = False
+    field = HeightField.through(np.eye(3), np.array([-1.0, -1.0, 0.0]), 0.05, heights)
+    measured = MeasuredGround(field, known, 0.0, 0.0)
+    thing = ball(0.04)
+    raised = measured.touched_by(thing, 1.0)
+    means = thing.means.numpy().astype(np.float64)
+    assert field.heights(means).min() > 0.035 and abs(raised.heights(means).min()) < 0.002
+    lifted = raised.nodes()[..., 2]
+    assert np.abs(lifted[known]).max() < 1e-9 and lifted.max() == pytest.approx(field.heights(means).min())
+    # What hovers is not stood on.
+    assert measured.touched_by(ball(0.2), 1.0) is field
