@@ -16,7 +16,7 @@ import numpy as np
 from bodies import Body, body
 from egs_warp.errors import UserError
 from egs_warp.geometry.body_frame import GROUND
-from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera_ring import camera_from
 from egs_warp.io.video import contact_sheet
 from egs_warp.pipelines.creature import Standing, face, stand
 from egs_warp.render.rasteriser import render_gaussians
@@ -65,16 +65,8 @@ def picture(standing: Standing, front: np.ndarray, *, size: int = 240) -> np.nda
     nodes = standing.cage.mesh.nodes
     middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
     way = front + 0.2 * GROUND.normal
-    distance = 1.05 * float(np.linalg.norm(nodes - middle, axis=1).max()) / np.sin(np.radians(12.0))
-    camera = Camera.look_at(
-        middle + distance * way / np.linalg.norm(way),
-        middle,
-        GROUND.normal,
-        width=size,
-        height=size,
-        vertical_fov_degrees=24.0,
-        near=0.01 * distance,
-    )
+    radius = 1.05 * float(np.linalg.norm(nodes - middle, axis=1).max())
+    camera = camera_from(way, middle, radius, GROUND.normal, size=size, vertical_fov_degrees=24.0)
     return render_gaussians(standing.gaussians, camera, background=(1.0, 1.0, 1.0)).colour_srgb8()
 
 

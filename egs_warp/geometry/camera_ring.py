@@ -13,6 +13,19 @@ ELEVATIONS = (12.0, 30.0, 52.0)
 """Degrees above the plane."""
 
 
+def camera_from(
+    way: np.ndarray, centre: np.ndarray, radius: float, up: np.ndarray, *, size: int, vertical_fov_degrees: float
+) -> Camera:
+    """The camera that holds the ball of ``radius`` about ``centre`` (3,) and stands the ``way`` (3,) from it; ``size``
+    in pixels, both sides.
+    """
+    distance = radius / np.sin(np.radians(vertical_fov_degrees / 2.0))
+    eye = centre + distance * way / np.linalg.norm(way)
+    return Camera.look_at(
+        eye, centre, up, width=size, height=size, vertical_fov_degrees=vertical_fov_degrees, near=0.01 * distance
+    )
+
+
 def ring_cameras(
     plane: Plane,
     centre: np.ndarray,

@@ -15,6 +15,7 @@ import warp as wp
 
 from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera_ring import camera_from
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.render.rasteriser import render_gaussians
@@ -25,7 +26,7 @@ _SIDE, _COARSE_SIDE = 128, 64
 """Pixels, to look for detail and for symmetry."""
 _ELEVATION = 0.2
 """Of the way from the body to the camera, up to along the ground."""
-_HALF_FOV_DEGREES = 10.0
+_FOV_DEGREES = 20.0
 """So narrow that a mirrored body gives nearly a mirrored picture."""
 _MOST_GAUSSIANS = 50_000
 """More are thinned out, and widened: nothing so small is looked for."""
@@ -117,19 +118,10 @@ def _look_around(cloud: GaussianCloud, mesh: TetMesh) -> tuple[np.ndarray, float
         cloud = replace(thinned, log_scales=wp.array(wider, dtype=wp.vec3, device=cloud.device))
     middle = np.append(np.median(mesh.nodes[:, :2], axis=0), 0.5 * (low[2] + high[2]))
     radius = float(np.linalg.norm(mesh.nodes - middle, axis=1).max())
-    distance = radius / np.sin(np.radians(_HALF_FOV_DEGREES))
     pictures = []
     for angle in 2.0 * np.pi * np.arange(_VIEWS) / _VIEWS:
         way = np.array([np.cos(angle), np.sin(angle), _ELEVATION])
-        camera = Camera.look_at(
-            middle + distance * way / np.linalg.norm(way),
-            middle,
-            GROUND.normal,
-            width=_SIDE,
-            height=_SIDE,
-            vertical_fov_degrees=2.0 * _HALF_FOV_DEGREES,
-            near=0.01 * distance,
-        )
+        camera = camera_from(way, middle, radius, GROUND.normal, size=_SIDE, vertical_fov_degrees=_FOV_DEGREES)
         image = render_gaussians(cloud, camera, background=(0.0, 0.0, 0.0))
         cover = np.clip(image.alpha.numpy(), 0.0, 1.0)
         colour = np.clip(image.colour.numpy() / np.maximum(cover, 1e-3)[..., None], 0.0, 1.0)

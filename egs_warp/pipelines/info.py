@@ -14,7 +14,7 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.fem.body import SoftBody, make_body
 from egs_warp.geometry.body_frame import GROUND
-from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera_ring import camera_from
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
@@ -224,16 +224,8 @@ def _draw_capture(axes: Axes, info: BodyInfo, way: np.ndarray) -> None:
     ground, nodes, height = info.place.ground, info.place.standing, info.body.height
     middle = 0.5 * (nodes.min(axis=0) + nodes.max(axis=0))
     direction = np.array([*way, 0.12]) / np.hypot(1.0, 0.12) @ ground.axes
-    distance = 1.1 * float(np.linalg.norm(nodes - middle, axis=1).max()) / np.sin(np.radians(12.0))
-    camera = Camera.look_at(
-        middle + distance * direction,
-        middle,
-        GROUND.normal,
-        width=_SIDE,
-        height=_SIDE,
-        vertical_fov_degrees=24.0,
-        near=0.01 * distance,
-    )
+    radius = 1.1 * float(np.linalg.norm(nodes - middle, axis=1).max())
+    camera = camera_from(direction, middle, radius, GROUND.normal, size=_SIDE, vertical_fov_degrees=24.0)
     image = render_gaussians(info.standing.gaussians, camera, background=(1.0, 1.0, 1.0))
     axes.imshow(image.colour_srgb8())
 
