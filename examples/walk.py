@@ -12,7 +12,7 @@ def main(arguments: list[str] | None = None) -> egs.Report:
     """Run the example; returns the report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/walk"))
-    parser.add_argument("--steps", type=int, default=4)
+    parser.add_argument("--distance", type=float, default=0.4, help="body heights")
     parser.add_argument("--step-length", type=float, default=0.1, help="body heights")
     parser.add_argument("--frames", type=int, help="default: until it rests")
     parser.add_argument("--size", type=int, default=512)
@@ -24,7 +24,7 @@ def main(arguments: list[str] | None = None) -> egs.Report:
     report = egs.animate(
         built_in.object,
         chosen.out,
-        motion=f"walk {chosen.steps} {chosen.step_length}",
+        motion=f"walk {chosen.distance} {chosen.step_length}",
         plane=built_in.plane,
         options=options,
         overwrite=True,

@@ -31,7 +31,7 @@ def example(name: str) -> ModuleType:
     [
         ("twist", {"heading_degrees": 180.0, "distance": 0.0, "height": 0.3}),
         ("hop", {"distance": 0.7, "height": 0.3, "square": 1.0}),
-        ("walk", {"steps": 4.0, "step_length": 0.1, "distance": 0.4}),
+        ("walk", {"distance": 0.4, "step_length": 0.1, "speed": 1.0}),
     ],
 )
 def test_example_writes_its_files(tmp_path: Path, name: str, asked: dict[str, float]) -> None:
@@ -49,7 +49,7 @@ def test_example_writes_its_files(tmp_path: Path, name: str, asked: dict[str, fl
 @pytest.mark.parametrize(
     ("name", "flags", "message"),
     [
-        ("walk", ["--steps", "0"], "walk.py: motion 1 ('walk 0 0.1'): steps 0: give a whole number of steps"),
+        ("walk", ["--distance", "99"], "walk.py: motion 1 ('walk 99.0 0.1'): distance 99.0: give a number of"),
         ("jump", ["--size", "0"], "jump.py: --size 0: give a number of pixels from 16 to 4096"),
         ("twist", ["--device", "tpu"], "twist.py: --device tpu: this machine has cpu"),
         ("hop", ["--hops", "0"], "hop.py: motion 1 ('hop x0'): repeat 0; give a whole number"),

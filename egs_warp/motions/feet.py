@@ -14,7 +14,6 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from egs_warp.contact.detection import ContactSet
-from egs_warp.errors import UserError
 from egs_warp.geometry.tetmesh import TetMesh, edge_graph
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.limbs import Limbs, Sections, find_limbs
@@ -30,6 +29,9 @@ _LONG = 3.0
 _ROUND_SOLE, _ROUND = 0.6, 0.15
 """A ball stands on less than this part of its width, and its surface is as far from its middle everywhere but for a
 standard deviation of this part."""
+_HALF, _MIDDLE, _BETWEEN = 0.3, 0.2, 0.6
+"""Of a base that is taken for two feet: body heights up to which a side of it moves as a foot does, the part of its
+half width next to the middle that belongs to none, and the part over which the one side goes over into the other."""
 AHEAD = np.radians(15.0)
 """A foot this little to the right of straight ahead is still the first."""
 
@@ -132,20 +134,25 @@ def around(places: np.ndarray) -> np.ndarray:
     return np.argsort((np.arctan2(left, ahead) + AHEAD) % (2.0 * np.pi))
 
 
-def feet_around(feet: Sequence[Foot], positions: np.ndarray, up: np.ndarray) -> tuple[int, int, int, int]:
-    """Indices of the feet of a four-legged body at ``positions`` (N, 3), anticlockwise seen against ``up`` (3,),
-    unit.
+def halves(place_of_sole: np.ndarray, heights: np.ndarray, sole: np.ndarray, body_height: float) -> tuple[Foot, Foot]:
+    """The left and the right side of a base as two feet, each without what is near the middle.
+
+    ``place_of_sole`` (N, 2) is ahead and to the left of each node, ``heights`` (N,) over the ground, ``sole`` (k,) the
+    nodes that stand on it.
     """
-    if len(feet) != 4:
-        raise UserError(f"walk: a walk needs four separate feet, the body has {len(feet)}")
-    if any(foot.joined for foot in feet):
-        joined = sum(foot.joined for foot in feet)
-        raise UserError(f"walk: a walk needs four separate feet, of the body's four {joined} are joined to another")
-    centres = np.array([positions[foot.sole].mean(axis=0) for foot in feet])
-    arms = centres - centres.mean(axis=0)
-    side = arms[0] - (arms[0] @ up) * up
-    first, second, third, fourth = np.argsort(np.arctan2(arms @ np.cross(up, side), arms @ side) % (2.0 * np.pi))
-    return int(first), int(second), int(third), int(fourth)
+    left = place_of_sole[:, 1]
+    middle = float(left[sole].mean())
+    half = 0.5 * float(np.ptp(left[sole]))
+    low = 1.0 - smooth_step(heights / (_HALF * body_height))
+    first, second = (
+        Foot(
+            sole[side * (left[sole] - middle) > _MIDDLE * half],
+            smooth_step(0.5 + side * (left - middle) / (_BETWEEN * half)) * low,
+            _HALF * body_height,
+        )
+        for side in (1.0, -1.0)
+    )
+    return first, second
 
 
 def foot_of_node(feet: Sequence[Foot]) -> np.ndarray:
@@ -203,6 +210,11 @@ def _patches(graph: csr_matrix, kept: np.ndarray) -> np.ndarray:
 
 def _leg_weights(heights: np.ndarray, limb: np.ndarray, top: float) -> np.ndarray:
     weights = np.zeros(len(heights))
-    s = np.clip((heights[limb] / top - _FLAT) / (1.0 - _FLAT), 0.0, 1.0)
-    weights[limb] = 1.0 - s * s * (3.0 - 2.0 * s)
+    weights[limb] = 1.0 - smooth_step((heights[limb] / top - _FLAT) / (1.0 - _FLAT))
     return weights
+
+
+def smooth_step(s: np.ndarray) -> np.ndarray:
+    """From 0 at 0 to 1 at 1, at rest at both."""
+    s = np.clip(s, 0.0, 1.0)
+    return s * s * (3.0 - 2.0 * s)

@@ -13,10 +13,13 @@ from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.keyframes import Key, read_keyframes
 from egs_warp.motions.request import LARGEST_TARGET, LARGEST_TURN, MotionRequest, Value
+from egs_warp.motions.route import Route, along, read_path, straight, turning
 from egs_warp.motions.sequence import BodyMotion, Part, Place
 from egs_warp.motions.turn import Turn
 from egs_warp.motions.walk import Walk
 
+_PACE = 0.1
+"""Body heights."""
 TRAJECTORY_TAIL = 200
 """Frames after the last key of a trajectory within which the body is at rest."""
 
@@ -64,10 +67,46 @@ def _turns(request: MotionRequest, height: float) -> list[Part]:
     return _repeated(request, request.asked, lambda place: Turn(place, target, turn))
 
 
+def _walking(request: MotionRequest, asked: Mapping[str, float], route: Route, height: float) -> list[Part]:
+    length = asked.get("step_length", _PACE) * height
+    return _repeated(request, asked, lambda place: Walk(place, route, length, speed=asked["speed"]))
+
+
 def _walks(request: MotionRequest, height: float) -> list[Part]:
-    steps, length = request.asked["steps"], request.asked["step_length"]
-    asked = {**request.asked, "distance": steps * length}
-    return _repeated(request, asked, lambda place: Walk(place, int(steps), length * height))
+    return _walking(request, request.asked, straight(request.asked["distance"] * height), height)
+
+
+def _walks_to(request: MotionRequest, height: float) -> list[Part]:
+    goal = np.array([[request.asked["ahead"], request.asked["left"]]])
+    asked = {**request.asked, "distance": float(np.linalg.norm(goal))}
+    return _walking(request, asked, along(goal * height), height)
+
+
+def _walks_along(request: MotionRequest, height: float) -> list[Part]:
+    points = _path(request)
+    asked = {**request.asked, "distance": float(np.linalg.norm(points[-1]))}
+    return _walking(request, asked, along(points * height), height)
+
+
+def _turns_on_the_spot(request: MotionRequest, height: float) -> list[Part]:
+    angle = float(np.radians(request.asked["heading_degrees"]))
+    return _walking(request, {**request.asked, "distance": 0.0}, turning(angle), height)
+
+
+def _path(request: MotionRequest) -> np.ndarray:
+    assert request.file is not None
+    return read_path(request.file)
+
+
+def _way(points: np.ndarray) -> float:
+    """Body heights from the start past ``points`` (n, 2), with what turns on the spot take."""
+    steps = np.diff(np.concatenate([np.zeros((1, 2)), points]), axis=0)
+    return float(np.linalg.norm(steps, axis=1).sum()) + _ROUND
+
+
+def _paces(way: float, request: MotionRequest) -> int:
+    """Frames at 60 Hz within which a ``way`` of so many body heights is walked, in paces of half of the usual."""
+    return 170 + int(np.ceil(36 * way / (0.5 * _PACE) / request.asked["speed"]))
 
 
 def _follows(request: MotionRequest, height: float) -> list[Part]:
@@ -79,6 +118,12 @@ def _follows(request: MotionRequest, height: float) -> list[Part]:
 def _keys(request: MotionRequest) -> tuple[Key, ...]:
     assert request.file is not None
     return read_keyframes(request.file)
+
+
+_SPEED = Value("speed", 1.0, 0.3, 1.6, "times the usual")
+_STEP_LENGTH = Value("step_length", _PACE, 0.0, LARGEST_TARGET, "body heights", above=True)
+_ROUND = 0.06 * 24
+"""Body heights of way that take as long as a turn on the spot all the way round."""
 
 
 def _length(name: str, default: float, *, above: bool = False) -> Value:
@@ -100,9 +145,34 @@ REPERTOIRE: Mapping[str, MotionKind] = {
         lambda request: 480,
     ),
     "walk": MotionKind(
-        (Value("steps", 4, 1, 50, "steps", whole=True), _length("step_length", 0.1, above=True)),
+        (
+            Value("distance", 0.4, -LARGEST_TARGET, LARGEST_TARGET, "body heights"),
+            _STEP_LENGTH,
+            _SPEED,
+        ),
         _walks,
-        lambda request: 170 + 36 * int(request.asked["steps"]),
+        lambda request: _paces(abs(request.asked["distance"]), request),
+    ),
+    "walk to": MotionKind(
+        (
+            Value("ahead", 0.4, -LARGEST_TARGET, LARGEST_TARGET, "body heights"),
+            Value("left", 0.0, -LARGEST_TARGET, LARGEST_TARGET, "body heights"),
+            _STEP_LENGTH,
+            _SPEED,
+        ),
+        _walks_to,
+        lambda request: _paces(_way(np.array([[request.asked["ahead"], request.asked["left"]]])), request),
+    ),
+    "walk along": MotionKind(
+        (_STEP_LENGTH, _SPEED),
+        _walks_along,
+        lambda request: _paces(_way(_path(request)) + 2.0 * _ROUND, request),
+        file="a file of points, as walk along way.csv",
+    ),
+    "turn": MotionKind(
+        (Value("heading_degrees", 90.0, -LARGEST_TURN, LARGEST_TURN, "degrees"), _SPEED),
+        _turns_on_the_spot,
+        lambda request: _paces(_ROUND * abs(request.asked["heading_degrees"]) / 360.0, request),
     ),
     "trajectory": MotionKind(
         (),

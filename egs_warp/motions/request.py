@@ -52,4 +52,4 @@ class MotionRequest:
     """Values by name, lengths in body heights, as reports give them."""
     repeat: int = 1
     file: Path | None = None
-    """Key frames of a trajectory."""
+    """Key frames of a trajectory, points of a path."""

@@ -1,7 +1,7 @@
 """What a user asks for: one motion or several in a row, as a line of text or a JSON file.
 
 A line names motions, separated by commas, each with its numbers in their order, or by name, and ``xN`` for N times:
-``hop x3, twist 180, walk 2``, ``jump 0.5 height=0.3``. A JSON file holds a list of objects:
+``hop x3, twist 180, walk 2``, ``jump 0.5 height=0.3``, ``walk to 1,0.5``. A JSON file holds a list of objects:
 ``[{"motion": "hop", "repeat": 3}, {"motion": "twist", "heading_degrees": 180}]``.
 """
 
@@ -52,8 +52,8 @@ class Script:
 
 
 def motion(text: str, **values: float | None) -> Script:
-    """One motion by name (``jump``, ``hop``, ``twist``, ``walk``), several as a line of text, or the JSON file that
-    ``text`` names.
+    """One motion by name (``jump``, ``hop``, ``twist``, ``walk``, ``walk to``, ``turn`` ...), several as a line of
+    text, or the JSON file that ``text`` names.
 
     ``values`` (lengths in body heights) hold for motions that take them and do not say their own; those that are None
     are left out. Raises ``UserError`` for the first mistake.
@@ -62,7 +62,8 @@ def motion(text: str, **values: float | None) -> Script:
     if text.strip().lower().endswith(".json") and "," not in text and len(text.split()) == 1:
         requests = _from_json(Path(text.strip()), given)
     else:
-        pieces = [piece.strip() for piece in text.split(",")]
+        # A comma before a number parts two numbers, as in walk to 1,2.
+        pieces = [piece.strip() for piece in re.split(r",(?!\s*[-+.]?\d)", text)]
         requests = [_from_words(piece, given, f"motion {number}") for number, piece in enumerate(pieces, start=1)]
     count = sum(request.repeat for request in requests)
     if count > MOST_MOTIONS:
@@ -74,13 +75,15 @@ def motion(text: str, **values: float | None) -> Script:
 
 
 def _from_words(piece: str, defaults: Mapping[str, float], where: str) -> MotionRequest:
-    words = piece.split()
+    words = piece.replace(",", " ").split()
     if not words:
         raise UserError(f"{where}: nothing between two commas; name a motion: {_NAMES}")
-    name, repeat, values, file = words[0].lower(), None, {}, None
+    both = " ".join(words[:2]).lower()
+    name, words = (both, words[2:]) if both in REPERTOIRE else (words[0].lower(), words[1:])
+    repeat, values, file = None, {}, None
     kind = _kind(name, where)
     order = [value.name for value in kind.takes]
-    for word in words[1:]:
+    for word in words:
         if re.fullmatch(r"[xX]\d+", word):
             if repeat is not None:
                 raise UserError(f"{where} ({piece!r}): {word!r} is a second number of repeats; give one")

@@ -22,7 +22,7 @@ from egs_warp.locomotion.objectives import (
 )
 from egs_warp.locomotion.stepper import StepReport
 
-_SHEAR = np.einsum("ki,j->kij", np.eye(3)[:2], np.eye(3)[2])
+SHEAR = np.einsum("ki,j->kij", np.eye(3)[:2], np.eye(3)[2])
 """(2, 3, 3) what a unit of lean ahead and to the left adds to a pose that is sheared by it."""
 _PINNED = 1e6
 """Of the largest stiffness: what holds a node where it stands."""
@@ -263,7 +263,7 @@ class PoseFamily:
         """(3, 3) the pose whose sole is flat at ``base`` (2,) while the centre of mass is at ``com`` (3,),
         ground coordinates: sheared by the lean between them.
         """
-        return self._leaning(com, base, heading, _SHEAR)
+        return self._leaning(com, base, heading, SHEAR)
 
     def bent_over_base(self, com: np.ndarray, base: np.ndarray, heading: float = 0.0) -> np.ndarray:
         """(3, 3) the same of a body that bends as it does by itself: turned as far as that strains it least."""

@@ -1,17 +1,19 @@
-"""Walk: diagonal pairs of feet swing and stand in turn, and the body moves on evenly over them.
+"""Walk: groups of feet swing and stand in turn, and the body is balanced over them as an inverted pendulum.
 
 See docs/concepts/motions.md.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
 from egs_warp.geometry.frames import best_turn
 from egs_warp.locomotion.objectives import (
@@ -27,23 +29,33 @@ from egs_warp.locomotion.objectives import (
 )
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.feet import feet_around, foot_loads, foot_of_contact, foot_of_node
+from egs_warp.motions.carriage import carried_on
+from egs_warp.motions.feet import around, foot_loads, foot_of_contact, foot_of_node
 from egs_warp.motions.footfalls import Footfalls, footfalls
-from egs_warp.motions.gait import Gait, Passage, nearest_in_hull
+from egs_warp.motions.gait import Gait, smooth
+from egs_warp.motions.pendulum import PendulumPlan, drift, is_line, nearest_in_hull
+from egs_warp.motions.route import Pace, Route
 from egs_warp.motions.sequence import Place
 
-FORWARD = np.array([1.0, 0.0])
-REACH = 0.5
-"""Longest step over the shortest leg's length."""
 LOADED = 0.01
 """Share of the weight that a foot must carry to count as landed."""
+DOWN = 0.005
+"""Body heights over the ground at which a foot at the end of its swing counts as landed, too."""
+HIGHEST_STEP = 0.03
+"""Body heights: what is higher above the ground, or lower below it, stands in the way."""
+_BETWEEN = 0.3
+"""Of the distance of two feet: what is about as near to the one as to the other belongs to neither."""
+_SHIFT, _GATHER, _REST = 1.5, 3.0, 1.0
+"""Of sqrt(H / g): how long the first and the last phase take, and how long the body stands then."""
+_PLAN_STEP, _PLANNED = 1.0 / 12.0, 8
+"""Of sqrt(H / g), and phases: the steps of a plan, and how far it looks ahead."""
 
 
 class WalkPhase(Enum):
     """Phases of a walk; swing and stand alternate."""
 
     SHIFT = "shift"
-    """The body rises and leans until its centre of mass comes over the crossing of the diagonals at walking speed."""
+    """The body leans to where it can lift its first feet."""
     SWING = "swing"
     STAND = "stand"
     GATHER = "gather"
@@ -55,12 +67,14 @@ class WalkPhase(Enum):
 class WalkPlan:
     """Numbers of a walk; metres, seconds."""
 
-    steps: float
-    step_length: float
+    paces: float
+    pace_length: float
+    """The longest."""
     swing_time: float
     double_time: float
     lift: float
     stride: float
+    """Longest way between two footprints of one foot."""
 
 
 @dataclass(frozen=True)
@@ -85,63 +99,94 @@ class WalkControl:
     """Of a swinging foot's error that is removed in one step."""
     margin: float = 0.8
     """Part of each sole over which the centre of pressure may move."""
+    planned_margin: float = 0.6
+    """Part of each sole over which it is planned to be."""
+    sidestep: float = 5.5
+    """Rate, in sqrt(g / H), at which a swinging foot's goal goes to where it would catch the body."""
 
 
 class Walk:
     """Shifts its weight, swings and stands until the last swing has closed the feet, and gathers itself."""
 
-    def __init__(self, place: Place, steps: int, step_length: float, *, control: WalkControl | None = None) -> None:
-        """``step_length`` in metres, shortened to what the legs reach. Raises ``UserError`` unless the body has four
-        separate feet.
-
-        It walks along the side of its feet that is nearest to the forward of ``place``.
-        """
+    def __init__(
+        self,
+        place: Place,
+        route: Route,
+        pace_length: float,
+        *,
+        speed: float = 1.0,
+        control: WalkControl | None = None,
+    ) -> None:
+        """``pace_length`` in metres, shortened to what the body can do; ``speed`` over the usual. Raises ``UserError``
+        for a body without a foot, and where something stands in the way."""
         body = place.body
-        feet = place.feet()
-        order = feet_around(feet, place.standing, place.ground.axes[2])
-        corners = np.array([place.standing[feet[index].sole].mean(axis=0) for index in order])
-        sides = [corners[0] + corners[1] - corners[2] - corners[3], corners[1] + corners[2] - corners[3] - corners[0]]
-        ways = [sign * side / np.linalg.norm(side) for side in sides for sign in (1.0, -1.0)]
-        place = place.facing(max(ways, key=lambda way: float(way @ place.ground.axes[0])))
-        self.body, self.ground, self.feet = body, place.ground, feet
+        feet, carriage = carried_on(place)
+        if not feet:
+            raise UserError("walk: the body has no feet, and no flat base of which it could lift a side")
+        self.body, self.ground = body, place.ground
         self.control = control or WalkControl()
         normal = place.ground.axes @ place.ground.surface_normal
         self._slope = -normal[:2] / normal[2]
         """Metres that the ground rises for each metre forward and to the left."""
-        self.pairs = (order[0], order[2]), (order[1], order[3])
-        self.gravity = float(np.linalg.norm(body.gravity))
-        self._asked_length = step_length
-        reachable = min(step_length, REACH * min(foot.length for foot in feet))
-        self.gait = Gait.of(steps, reachable, height=body.height, gravity=self.gravity)
-        self._time_unit = float(np.sqrt(body.height / self.gravity))
         self._standing = self.ground.local(place.standing)
+        feet = tuple(feet[k] for k in around(np.array([self._standing[foot.sole, :2].mean(axis=0) for foot in feet])))
+        self.feet = feet
+        self._carriage = carriage(body, self._standing, feet)
         self._soles = np.array([self._standing[foot.sole].mean(axis=0) for foot in feet])
-        self._legs = np.array([foot.leg for foot in feet])
-        self._leg_mass = self._legs @ body.node_mass / body.mass
+        self._grips = self._touching(self.ground.local(place.touching)[:, :2])
+        self._start_com = body.centre_of_mass(self._standing)
+        self.gravity = float(np.linalg.norm(body.gravity))
+        self._time_unit = float(np.sqrt(body.height / self.gravity))
+        self._asked_length = pace_length
+        pace = Pace(min(pace_length, self._carriage.pace.length), self._carriage.pace.turn)
+        self.places = route(pace)
+        """(P+1, 3) the body before the first and after each pace: see ``motions.route``."""
+        self._check_way(place)
+        paces, lift = len(self.places) - 1, self._carriage.lift
+        self.gait = Gait.of(len(feet), paces, lift, time_unit=self._time_unit / speed)
+        self._pace = pace
         self._parts = [BodyPart.of(body, f"foot {index}", foot.sole) for index, foot in enumerate(feet)]
         self._near = [np.flatnonzero(foot_of_node(feet) == index) for index in range(len(feet))]
         """Nodes that go with each foot."""
-        self._start_com = body.centre_of_mass(self._standing)
-        self._passages = self._plan_passages()
+        self._rate = float(np.sqrt(self.gravity / self._start_com[2]))
         self.phase = WalkPhase.SHIFT
         self.swing = -1
         self._entered: float | None = None
-        self._places = self._soles.copy()
-        """(4, 3) where each foot stands, or was lifted from."""
+        self._footprints = np.column_stack([self._soles, np.zeros(len(feet))])
+        """(F, 4) where each foot stands, or was lifted from: see ``motions.carriage``."""
         self.swinging: tuple[int, ...] = ()
         """The feet that are lifted, carried and set down."""
+        self._sidestep = np.zeros(2)
+        """Metres that the feet which swing come down off their place to catch the body."""
+        self._pressed: np.ndarray | None = None
+        """(2,) the centre of pressure that was asked for last."""
         self._late = 0
 
-    def _plan_passages(self) -> dict[WalkPhase, Passage]:
-        gait, still = self.gait, np.zeros(2)
-        centre, velocity = self._soles[:, :2].mean(axis=0), self.gait.speed * FORWARD
-        first = centre + gait.place(0, 0.0) * FORWARD
-        last = centre + gait.place(gait.swings - 1, gait.swing_time) * FORWARD
-        start, end = self._start_com[:2], self._start_com[:2] + gait.distance * FORWARD
-        return {
-            WalkPhase.SHIFT: Passage(start, still, first, velocity, 1.5 * self._time_unit),
-            WalkPhase.GATHER: Passage(last, velocity, end, still, 3.0 * self._time_unit),
-        }
+    def _touching(self, points: np.ndarray) -> list[np.ndarray]:
+        """For each foot (k, 2) where it touches the ground at rest, from the middle of its sole, of ``points`` (n, 2);
+        its whole sole where it hangs."""
+        centres = self._soles[:, :2]
+        away = np.linalg.norm(points[:, None] - centres, axis=2)
+        owner = np.argmin(away, axis=1)
+        nearest, second = np.sort(away, axis=1)[:, :2].T
+        clear = second - nearest > _BETWEEN * np.linalg.norm(centres[owner] - centres[np.argsort(away)[:, 1]], axis=1)
+        grips = []
+        for index, foot in enumerate(self.feet):
+            own = points[clear & (owner == index)]
+            if len(own) < 3 or is_line(own):
+                own = self._standing[foot.sole, :2]
+            grips.append((own if is_line(own) else own[ConvexHull(own).vertices]) - centres[index])
+        return grips
+
+    def _check_way(self, place: Place) -> None:
+        for x, y, _ in self.places:
+            level = np.array([self._start_com[0] + x, self._start_com[1] + y, 0.0])
+            level[2] = self._slope @ level[:2]
+            rise = place.rise_at(self.ground.world(level)) / self.body.height
+            if abs(rise) > HIGHEST_STEP:
+                where = f"{x / self.body.height:.2f} ahead and {y / self.body.height:.2f} to the left"
+                found = f"what is there is {abs(rise):.2f} body heights {'higher' if rise > 0.0 else 'lower'}"
+                raise UserError(f"walk: the way leads over a step, {where}: {found}; walk round it, or jump or hop")
 
     @property
     def resting(self) -> bool:
@@ -150,24 +195,30 @@ class Walk:
 
     def planned(self) -> WalkPlan:
         """What the walk aims at."""
-        gait = self.gait
-        return WalkPlan(
-            float(gait.steps), gait.step_length, gait.swing_time, gait.double_time, gait.lift, stride=gait.stride
-        )
+        gait, paces = self.gait, np.diff(self.places, axis=0)
+        length = float(np.linalg.norm(paces[:, :2], axis=1).max())
+        return WalkPlan(float(gait.paces), length, gait.swing_time, gait.double_time, gait.lift, self._stride())
+
+    def _stride(self) -> float:
+        """Metres: the longest way between two footprints of one foot, of what turns as well."""
+        rounds = len(self.gait.groups)
+        prints = np.array([[self._home(place, foot)[:2] for place in self.places] for foot in range(len(self.feet))])
+        apart = prints[:, min(rounds, self.gait.paces) :] - prints[:, : -min(rounds, self.gait.paces)]
+        return float(np.linalg.norm(apart, axis=2).max())
 
     def notes(self) -> list[str]:
         """What kept the walk from its target, for the user."""
         found = []
-        if self.gait.step_length < self._asked_length:
-            asked, reached = self._asked_length / self.body.height, self.gait.step_length / self.body.height
-            found.append(f"steps of {asked:.2f} body heights were asked; the legs are long enough for {reached:.2f}")
+        if self._pace.length < self._asked_length:
+            asked, reached = self._asked_length / self.body.height, self._pace.length / self.body.height
+            found.append(f"steps of {asked:.2f} body heights were asked; the body goes by {reached:.2f} at most")
         if self._late:
             found.append(f"{self._late} swings took too long: a foot found no ground")
         return found
 
     def reached(self, trajectory: Trajectory, first: int, last: int) -> Footfalls:
         """What the feet did between two states of a trajectory."""
-        return footfalls(trajectory, self.feet, stride=self.gait.stride, first=first, last=last)
+        return footfalls(trajectory, self.feet, stride=self._stride(), first=first, last=last)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
@@ -179,7 +230,8 @@ class Walk:
         com = body.centre_of_mass(local)
         com_velocity = self._com_velocity(local, axes @ body.centre_of_mass(state.velocities), elapsed, dt)
         before, after = self._foot_targets(elapsed - dt), self._foot_targets(elapsed)
-        pose, next_pose = self._pose(com, before), self._pose(com + dt * com_velocity, after)
+        pose = self._carriage.pose(com, self._heading(elapsed - dt), before)
+        next_pose = self._carriage.pose(com + dt * com_velocity, self._heading(elapsed), after)
         spin = control.turn_rate / self._time_unit * self._turn(local, pose) + self._turn(pose, next_pose) / dt
         follow = min(control.follow / self._time_unit, 0.7 / dt)
         return [
@@ -193,87 +245,174 @@ class Walk:
 
     def _advance_phase(self, local: np.ndarray, report: StepReport | None, time: float) -> None:
         if self._entered is None:
-            self._entered = time
+            self._enter(WalkPhase.SHIFT, time)
+        assert self._entered is not None
         elapsed, gait = time - self._entered + 1e-9, self.gait
         if self.swinging and elapsed >= gait.carried_until:
             loads = foot_loads(self.feet, report, self.body.weight)
             for index in self.swinging:
-                if loads[index] > LOADED:
+                if loads[index] > LOADED or (elapsed >= gait.swing_time and self._is_down(index, local)):
                     self._stands(index, local)
         if self.phase is WalkPhase.SWING and elapsed >= gait.swing_time:
             if not self.swinging or elapsed >= 2.0 * gait.swing_time:
                 self._late += bool(self.swinging)
                 for index in self.swinging:
                     self._stands(index, local)
-                last = self.swing == gait.swings - 1
-                self.phase, self._entered = WalkPhase.GATHER if last else WalkPhase.STAND, time
-        elif (self.phase is WalkPhase.STAND and elapsed >= gait.double_time) or (
-            self.phase is WalkPhase.SHIFT and elapsed >= self._passages[self.phase].duration
-        ):
-            self.phase, self._entered = WalkPhase.SWING, time
+                self._enter(self._after_swing(self.swing), time)
+        elif self.phase in (WalkPhase.SHIFT, WalkPhase.STAND) and elapsed >= self._duration(self.phase):
             self.swing += 1
-            self.swinging = self.pairs[self.swing % 2]
-        elif self.phase is WalkPhase.GATHER and elapsed >= self._passages[self.phase].duration + self._time_unit:
-            self.phase = WalkPhase.REST
+            self.swinging, self._sidestep = gait.group(self.swing), np.zeros(2)
+            self._enter(WalkPhase.SWING, time)
+        elif self.phase is WalkPhase.GATHER and elapsed >= self._duration(self.phase):
+            self._enter(WalkPhase.REST, time)
+
+    def _enter(self, phase: WalkPhase, time: float) -> None:
+        self.phase, self._entered = phase, time
+        self._plan = self._planned_pendulum()
+
+    def _after_swing(self, swing: int) -> WalkPhase:
+        return WalkPhase.GATHER if swing == self.gait.swings - 1 else WalkPhase.STAND
+
+    def _duration(self, phase: WalkPhase) -> float:
+        """Seconds."""
+        return {
+            WalkPhase.SHIFT: _SHIFT * self._time_unit,
+            WalkPhase.SWING: self.gait.swing_time,
+            WalkPhase.STAND: self.gait.double_time,
+            WalkPhase.GATHER: (_GATHER + _REST) * self._time_unit,
+            WalkPhase.REST: _REST * self._time_unit,
+        }[phase]
+
+    def _is_down(self, index: int, local: np.ndarray) -> bool:
+        """Whether foot ``index`` is on the ground, and if it carries nothing."""
+        sole = local[self.feet[index].sole].mean(axis=0)
+        return bool(sole[2] - self._on_ground(index, sole[:2], 0.0)[2] < DOWN * self.body.height)
 
     def _stands(self, index: int, local: np.ndarray) -> None:
         """Foot ``index`` has landed where it is."""
         self.swinging = tuple(foot for foot in self.swinging if foot != index)
-        self._places[index] = self._on_ground(index, local[self.feet[index].sole, :2].mean(axis=0))
+        sole = self.feet[index].sole
+        now, rest = (x[sole, :2] - x[sole, :2].mean(axis=0) for x in (local, self._standing))
+        heading = np.arctan2((rest[:, 0] * now[:, 1] - rest[:, 1] * now[:, 0]).sum(), (rest * now).sum())
+        self._footprints[index] = self._on_ground(index, local[sole, :2].mean(axis=0), float(heading))
 
-    def _com_reference(self, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
-        """Place and velocity (2,) of the centre of mass ``elapsed`` seconds into the phase."""
-        if self.phase is WalkPhase.REST:
-            return self._passages[WalkPhase.GATHER].at(np.inf)
-        if self.phase in self._passages:
-            return self._passages[self.phase].at(elapsed)
-        gait = self.gait
-        if self.phase is WalkPhase.STAND:
-            elapsed = gait.swing_time + min(elapsed, gait.double_time)
-        place = self._soles[:, :2].mean(axis=0) + gait.place(self.swing, elapsed) * FORWARD
-        return place, gait.speed * FORWARD
-
-    def _rise(self, elapsed: float) -> float:
-        """Metres by which the body stands taller than at rest.
-
-        Legs that push are stretched, and swing at their length at rest; legs drawn in by their muscles would buckle.
-        """
-        if self.phase is WalkPhase.REST:
+    def _progress(self, phase: WalkPhase, swing: int, elapsed: float) -> float:
+        """Paces that the body should have done ``elapsed`` seconds into a phase."""
+        if phase is WalkPhase.SHIFT:
             return 0.0
-        s = min(elapsed / self._passages[self.phase].duration, 1.0) if self.phase in self._passages else 1.0
-        s = 1.0 - s if self.phase is WalkPhase.GATHER else s
-        return self.gait.lift * s * s * (3.0 - 2.0 * s)
+        if phase in (WalkPhase.GATHER, WalkPhase.REST):
+            return float(self.gait.paces)
+        if phase is WalkPhase.STAND:
+            elapsed = self.gait.swing_time + min(elapsed, self.gait.double_time)
+        return self.gait.progress(swing, elapsed)
+
+    def _place_at(self, progress: float) -> np.ndarray:
+        """(3,) the body's place after so many paces."""
+        count = self.gait.paces
+        progress = min(max(progress, 0.0), float(count))
+        k = min(int(progress), count - 1)
+        return self.places[k] + (progress - k) * (self.places[k + 1] - self.places[k])
+
+    def _heading(self, elapsed: float) -> float:
+        return float(self._place_at(self._progress(self.phase, self.swing, elapsed))[2])
+
+    def _home(self, place: np.ndarray, index: int) -> np.ndarray:
+        """(4,) where foot ``index`` belongs when the body is at ``place`` (3,)."""
+        centre = self._start_com[:2]
+        level = centre + place[:2] + _flat(place[2]) @ (self._soles[index, :2] - centre)
+        return self._on_ground(index, level, float(place[2]))
+
+    def _on_ground(self, index: int, level: np.ndarray, heading: float) -> np.ndarray:
+        """(4,) foot ``index`` on the ground at ``level`` (2,)."""
+        start = self._soles[index]
+        return np.array([*level, start[2] + self._slope @ (level - start[:2]), heading])
+
+    def _planned_pendulum(self) -> PendulumPlan:
+        """From the start of this phase on: the centre of pressure as near as the feet let it to where the centre of
+        mass should be, and from the one swing to the next by the way."""
+        step = _PLAN_STEP * self._time_unit
+        phases = list(self._pressures(step))
+        pieces = []
+        for number, (phase, pressure) in enumerate(phases):
+            if phase is not WalkPhase.SWING:
+                ways = (np.arange(len(pressure)) + 0.5) / len(pressure)
+                start = phases[number - 1][1][-1] if number else self._pressed
+                if start is None or phase is WalkPhase.SHIFT:
+                    start = pressure[0]
+                end = phases[number + 1][1][0] if number + 1 < len(phases) else pressure[-1]
+                if phase is WalkPhase.SHIFT:
+                    ways = np.array([smooth(way) for way in ways])
+                elif phase is WalkPhase.GATHER:
+                    ways = np.array([smooth(way * (_GATHER + _REST)) for way in ways])
+                pressure = start + ways[:, None] * (end - start)
+            pieces.append(pressure)
+        return PendulumPlan.over(np.concatenate(pieces), step, self._rate)
+
+    def _pressures(self, step: float) -> Iterator[tuple[WalkPhase, np.ndarray]]:
+        """This phase and those to come, each with the centre of pressure (n, 2) every ``step`` seconds that would keep
+        the centre of mass on its way."""
+        footprints, phase, swing = self._footprints.copy(), self.phase, self.swing
+        for _ in range(_PLANNED):
+            count = max(round(self._duration(phase) / step), 1)
+            wanted = np.array([self._com_at(self._progress(phase, swing, (k + 0.5) * step)) for k in range(count)])
+            if phase is not WalkPhase.SWING:
+                yield phase, wanted
+                if phase in (WalkPhase.GATHER, WalkPhase.REST):
+                    return
+                phase, swing = WalkPhase.SWING, swing + 1
+                continue
+            lifted = self.gait.group(swing)
+            standing = [self._sole_at(foot, footprints[foot]) for foot in range(len(self.feet)) if foot not in lifted]
+            yield phase, np.array([nearest_in_hull(np.concatenate(standing), place) for place in wanted])
+            for foot in lifted:
+                footprints[foot] = self._home(self.places[self.gait.landing(swing)], foot)
+            phase = self._after_swing(swing)
+
+    def _com_at(self, progress: float) -> np.ndarray:
+        """(2,) where the centre of mass belongs after so many paces."""
+        return self._start_com[:2] + self._place_at(progress)[:2]
+
+    def _sole_at(self, index: int, footprint: np.ndarray) -> np.ndarray:
+        """(k, 2) where foot ``index`` on its ``footprint`` (4,) is planned to press, drawn in towards its middle."""
+        return footprint[:2] + _drawn_in(self._grips[index], self.control.planned_margin) @ _flat(footprint[3]).T
 
     def _com_velocity(self, local: np.ndarray, velocity: np.ndarray, elapsed: float, dt: float) -> np.ndarray:
         """(3,) m/s at the end of the step; steered by a centre of pressure under the standing feet, so that the
-        divergent part of the motion (com + v sqrt(h/g), linear inverted pendulum) follows the reference."""
+        divergent part of the motion follows the plan. What these cannot catch, the next footprints are to."""
         com = self.body.centre_of_mass(local)
-        place, speed = self._com_reference(elapsed)
-        rate = np.sqrt(self.gravity / self._start_com[2])
-        off = com[:2] + velocity[:2] / rate - (place + speed / rate)
-        pressure = nearest_in_hull(self._support(local), place + self.control.balance * off)
-        level = velocity[:2] + dt * rate**2 * (com[:2] - pressure)
-        height = self._start_com[2] + self._rise(elapsed) + self._slope @ (com[:2] - self._start_com[:2])
+        pressure, divergent = self._plan.at(elapsed)
+        off = com[:2] + velocity[:2] / self._rate - divergent
+        pressed = nearest_in_hull(self._support(local), pressure + self.control.balance * off)
+        self._pressed = pressed
+        if self.swinging and elapsed < self.gait.carried_until:
+            left = max(self.gait.swing_time - elapsed, 0.0)
+            caught = drift(off, pressed - pressure, float(np.exp(self._rate * left)))
+            caught *= min(1.0, self._carriage.catch / max(float(np.linalg.norm(caught)), 1e-12))
+            share = 1.0 - float(np.exp(-self.control.sidestep * dt / self._time_unit))
+            self._sidestep = self._sidestep + share * (caught - self._sidestep)
+        level = velocity[:2] + dt * self._rate**2 * (com[:2] - pressed)
+        height = self._start_com[2] + self._slope @ (com[:2] - self._start_com[:2])
         up = self._slope @ velocity[:2] + 6.0 / self._time_unit * (height - com[2])
         return np.array([*level, up])
 
     def _support(self, local: np.ndarray) -> np.ndarray:
-        """(k, 2) the soles of the standing feet, each drawn in towards its middle."""
-        soles = [local[foot.sole, :2] for index, foot in enumerate(self.feet) if index not in self.swinging]
-        return np.concatenate([s.mean(axis=0) + self.control.margin * (s - s.mean(axis=0)) for s in soles])
-
-    def _on_ground(self, index: int, place: np.ndarray) -> np.ndarray:
-        """(3,) where foot ``index`` stands at ``place`` (2,)."""
-        start = self._soles[index]
-        return np.array([*place, start[2] + self._slope @ (place - start[:2])])
+        """(k, 2) where the standing feet may press, each drawn in towards its middle."""
+        pieces = []
+        for index, foot in enumerate(self.feet):
+            if index not in self.swinging:
+                turn = _flat(self._footprints[index, 3])
+                grip = _drawn_in(self._grips[index], self.control.margin)
+                pieces.append(local[foot.sole, :2].mean(axis=0) + grip @ turn.T)
+        return np.concatenate(pieces)
 
     def _foot_targets(self, elapsed: float) -> np.ndarray:
-        """(4, 3) where the feet should be ``elapsed`` seconds into the phase."""
-        targets, gait = self._places.copy(), self.gait
+        """(F, 4) where the feet should be ``elapsed`` seconds into the phase."""
+        targets, gait = self._footprints.copy(), self.gait
         for index in self.swinging:
             progress = elapsed / gait.swing_time
-            goal = self._on_ground(index, self._soles[index, :2] + gait.landing(self.swing) * FORWARD)
-            targets[index] += gait.carried(progress) * (goal - self._places[index])
+            goal = self._home(self.places[gait.landing(self.swing)], index)
+            goal[:3] += [*self._sidestep, self._slope @ self._sidestep]
+            targets[index] += gait.carried(progress) * (goal - self._footprints[index])
             # One that has found no ground in time reaches down for it.
             targets[index, 2] += gait.lifted(progress) - 0.02 * self.body.height * max(progress - 1.0, 0.0)
         return targets
@@ -282,10 +421,14 @@ class Walk:
         self, index: int, local: np.ndarray, before: np.ndarray, after: np.ndarray, elapsed: float, dt: float
     ) -> Objective:
         sole, part, control = self.feet[index].sole, self._parts[index], self.control
-        error = before[index] - self._soles[index] + self._standing[sole] - local[sole]
+        arms = self._standing[sole] - self._soles[index]
+        now, then = (
+            np.column_stack([arms[:, :2] @ _flat(place[3]).T, arms[:, 2]]) + place[:3]
+            for place in (before[index], after[index])
+        )
         # The sole that stood is not the flat one that swings: torn straight in the first step, it would drag.
         share = control.foot_share * self.gait.eased(elapsed / self.gait.swing_time)
-        velocity = (share * error + after[index] - before[index]) / dt
+        velocity = (share * (now - local[sole]) + then - now) / dt
         return part_nodes(self.body, part, velocity @ self.ground.axes, control.swing)
 
     def _let_go(self, index: int, elapsed: float) -> LoadObjective:
@@ -301,13 +444,18 @@ class Walk:
             contacts, np.where(stands, report.forces[:, 0], 0.0) / self.body.weight, self.control.support
         )
 
-    def _pose(self, com: np.ndarray, targets: np.ndarray) -> np.ndarray:
-        """(N, 3) the standing shape with its feet at ``targets`` (4, 3) and its centre of mass at ``com`` (3,)."""
-        moved = targets - self._soles
-        body = (com - self._start_com - self._leg_mass @ moved) / (1.0 - self._leg_mass.sum())
-        return self._standing + body + self._legs.T @ (moved - body)
-
     def _turn(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """(3,) rotation vector that best carries ``before`` (N, 3) to ``after`` (N, 3)."""
         arms, aims = (x - self.body.centre_of_mass(x) for x in (before, after))
         return Rotation.from_matrix(best_turn(self.body.node_mass, arms, aims)).as_rotvec()
+
+
+def _flat(angle: float) -> np.ndarray:
+    """(2, 2) turn by ``angle`` radians."""
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def _drawn_in(points: np.ndarray, margin: float) -> np.ndarray:
+    """``points`` (k, 2) drawn in towards their mean to ``margin`` of their size."""
+    middle = points.mean(axis=0)
+    return middle + margin * (points - middle)

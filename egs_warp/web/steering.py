@@ -16,12 +16,12 @@ from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
+from egs_warp.motions.carriage import carried_on
 from egs_warp.motions.repertoire import REPERTOIRE
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.script import Script, motion
 from egs_warp.motions.sequence import BodyMotion, Done, Part, Place
 from egs_warp.motions.stance import sole_shares
-from egs_warp.motions.walk import Walk
 from egs_warp.web.standing import Lie, Stand, tilt_degrees
 
 ARRIVED = 0.12
@@ -32,7 +32,8 @@ _NEAR = 0.25
 """Body heights: for so short a way it does not turn."""
 _LONGEST_JUMP, _JUMP_HEIGHT = 0.5, 0.2
 """Body heights."""
-_STEP_LENGTH, _MOST_STEPS = 0.1, 8
+_LONGEST_WALK = 0.8
+"""Body heights, after which it looks where it has come to."""
 _FRUITLESS = 3
 """Legs that bring it no nearer, after which it gives up."""
 FALLEN = 60.0
@@ -59,7 +60,7 @@ def tasks_of(script: Script, height: float) -> list[Task]:
 
 
 class Journey:
-    """The way to a point: turn towards it, then walk or jump there; each leg is planned from where the last one
+    """The way to a point: walk there, or turn towards it and jump; each leg is planned from where the last one
     ended."""
 
     def __init__(self, goal: np.ndarray, *, walks: bool) -> None:
@@ -85,15 +86,13 @@ class Journey:
             self._fruitless += 1
         if self._fruitless > _FRUITLESS:
             raise UserError(f"go: it comes no nearer than {self._nearest:.2f} body heights; choose another point")
-        walks = self._walks and distance >= _STEP_LENGTH
-        ahead = Walk(place, 1, _STEP_LENGTH * height).ground if walks else place.ground
-        x, y = ahead.axes[:2] @ way
+        x, y = place.ground.axes[:2] @ way
+        if self._walks:
+            ahead, left = min(1.0, _LONGEST_WALK / distance) / height * np.array([x, y])
+            return self._task(f"walk to {ahead:.3f},{left:.3f}", height)
         aside = float(np.degrees(np.arctan2(y, x)))
         if abs(aside) > ASIDE and distance > _NEAR:
             return self._task(f"twist {aside:.1f} 0 {_JUMP_HEIGHT}", height)
-        if walks:
-            steps = min(max(round(distance / _STEP_LENGTH), 1), _MOST_STEPS)
-            return self._task(f"walk {steps} {_STEP_LENGTH}", height)
         leap = distance / np.ceil(distance / _LONGEST_JUMP)
         task = self._task(f"jump {leap:.3f} {_JUMP_HEIGHT}", height)
         begin = task.part.begin
@@ -215,8 +214,4 @@ class Steering:
 
 
 def _walks(place: Place) -> bool:
-    try:
-        Walk(place, 1, _STEP_LENGTH * place.body.height)
-    except UserError:
-        return False
-    return True
+    return len(carried_on(place)[0]) > 0

@@ -27,7 +27,7 @@ SMALL = ("--up", "z", "--size", "32")
 COMMANDS = {
     "jump": ("pawn.ply", "--frames", "28"),
     "hops": ("pawn.ply", "--motion", "hop 0.3 0.2 x2, jump", "--frames", "110"),
-    "walk": ("stool.ply", "--motion", "walk 2", "--frames", "20"),
+    "walk": ("stool.ply", "--motion", "walk 0.2", "--frames", "20"),
     "keys": ("pawn.ply", "--motion", "trajectory keys.json", "--camera", "follow", "--background", "transparent"),
     "scene": ("room.ply", "--object", "0,0,0.5", "--frames", "20"),
 }

@@ -57,7 +57,7 @@ def uninterrupted() -> Simulation:
     return run(block())
 
 
-BODIES = {"jump": block, "walk 1": walker}
+BODIES = {"jump": block, "walk 0.1": walker}
 
 
 def cut_off(parts: Path) -> None:
@@ -76,7 +76,7 @@ def same_steps(one: tuple[StepReport, ...], other: tuple[StepReport, ...]) -> bo
     return len(one) == len(other) and all(bits(asdict(a)) == bits(asdict(b)) for a, b in zip(one, other, strict=True))
 
 
-@pytest.mark.parametrize("script", ["jump", pytest.param("walk 1", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("script", ["jump", pytest.param("walk 0.1", marks=pytest.mark.slow)])
 def test_a_run_goes_on_to_the_same_bits(script: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Only what had not been written down is solved, by a body that is made anew."""
     body = BODIES[script]

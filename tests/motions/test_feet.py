@@ -8,10 +8,9 @@ from typing import cast
 import numpy as np
 import pytest
 
-from egs_warp.errors import UserError
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.feet import feet_around, find_feet, foot_of_node
+from egs_warp.motions.feet import around, find_feet, foot_of_node, halves
 from egs_warp.motions.footfalls import footfalls
 from tests.support.meshes import block_mesh, figure, stool
 
@@ -35,7 +34,7 @@ def test_a_stool_has_four_feet_with_their_legs() -> None:
 
 def test_feet_are_named_around_the_body() -> None:
     """Anticlockwise from above, so that every other one is opposite."""
-    order = feet_around(FEET, STOOL.nodes, np.array([0.0, 0.0, 1.0]))
+    order = around(np.array([STOOL.nodes[foot.sole, :2].mean(axis=0) for foot in FEET]))
     centres = [STOOL.nodes[FEET[index].sole, :2].mean(axis=0) for index in order]
     turns = [np.cross([*a, 0.0], [*b, 0.0])[2] for a, b in zip(centres, [*centres[1:], centres[0]], strict=True)]
     assert min(turns) > 0.0
@@ -43,11 +42,21 @@ def test_feet_are_named_around_the_body() -> None:
 
 
 @pytest.mark.parametrize(("mesh", "height", "count"), [(block_mesh(), 1.0, 1), (figure(), 1.4, 2)])
-def test_other_bodies_have_other_numbers_of_feet_and_do_not_walk(mesh: TetMesh, height: float, count: int) -> None:
-    feet = find_feet(mesh, mesh.nodes[:, 2], height)
-    assert len(feet) == count
-    with pytest.raises(UserError, match=f"walk: a walk needs four separate feet, the body has {count}"):
-        feet_around(feet, mesh.nodes, np.array([0.0, 0.0, 1.0]))
+def test_other_bodies_have_other_numbers_of_feet(mesh: TetMesh, height: float, count: int) -> None:
+    assert len(find_feet(mesh, mesh.nodes[:, 2], height)) == count
+
+
+def test_a_base_has_a_left_and_a_right_side() -> None:
+    """Apart from each other by what is near the middle; what goes with them falls off sideways and up."""
+    mesh = block_mesh(5, 5, 5)
+    heights, sole = mesh.nodes[:, 2], np.flatnonzero(mesh.nodes[:, 2] == 0.0)
+    left, right = halves(mesh.nodes[:, :2], heights, sole, 1.0)
+    assert mesh.nodes[left.sole, 1].min() > 0.02 and mesh.nodes[right.sole, 1].max() < -0.02
+    assert len(left.sole) == len(right.sole) and set(left.sole) | set(right.sole) <= set(sole)
+    assert np.all(left.leg[left.sole] > 0.5) and np.all(left.leg[right.sole] < 0.5)
+    assert np.all(left.leg[heights >= 0.3] == 0.0)
+    low = heights == 0.0
+    assert np.allclose((left.leg + right.leg)[low], 1.0)
 
 
 def made_trajectory() -> Trajectory:

@@ -1,4 +1,4 @@
-"""Gait: footprints, the way of the centre of mass and the swing of a foot."""
+"""Gait: which feet swing when, how far the body is by then, and the swing of a foot."""
 
 from __future__ import annotations
 
@@ -6,35 +6,48 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.optimize import minimize
 
-from egs_warp.motions.gait import Gait, Passage, nearest_in_hull
+from egs_warp.motions.gait import Gait, feet_in_turn
 
-GAIT = Gait.of(4, 0.1, height=1.0, gravity=9.81)
+GAIT = Gait.of(4, 4, 0.03, time_unit=0.32)
 
 
-@given(st.integers(1, 12), st.floats(0.02, 0.3))
-def test_footprints_alternate_and_close(steps: int, length: float) -> None:
-    """Each step sets a pair one step length ahead of the other,
-    the last swing closes the feet at the whole distance.
-    """
-    gait = Gait.of(steps, length, height=0.7, gravity=9.81)
-    pairs = [0.0, 0.0]
+@given(st.integers(2, 9))
+def test_every_foot_swings_once_in_a_round_and_none_beside_its_neighbour(count: int) -> None:
+    """Of more than three feet; of four the diagonals swing together. Some foot always stands."""
+    groups = feet_in_turn(count)
+    assert sorted(foot for group in groups for foot in group) == list(range(count))
+    assert all(0 < len(group) < count for group in groups)
+    for group in groups:
+        apart = np.diff([*group, group[0] + count])
+        assert len(group) == 1 or apart.min() > 1
+    assert feet_in_turn(4) == ((0, 2), (1, 3)) and feet_in_turn(3) == ((0,), (1,), (2,))
+
+
+@given(st.integers(2, 7), st.integers(1, 12))
+def test_footprints_follow_each_other_and_close(feet: int, paces: int) -> None:
+    """Each swing comes one pace ahead of the last, and at the end all feet are at the last place."""
+    gait = Gait.of(feet, paces, 0.03, time_unit=0.3)
+    at = np.zeros(feet)
     for swing in range(gait.swings):
-        pairs[swing % 2] = gait.landing(swing)
-        ahead = pairs[swing % 2] - pairs[1 - swing % 2]
-        assert ahead == pytest.approx(0.0 if swing == steps else length)
-    assert pairs == pytest.approx([gait.distance] * 2) and gait.distance == pytest.approx(steps * length)
+        for foot in gait.group(swing):
+            at[foot] = gait.landing(swing)
+        assert at.max() == min(swing + 1, paces)
+    assert np.all(at == paces)
 
 
-def test_the_centre_of_mass_moves_evenly_and_is_over_the_standing_pair_in_mid_swing() -> None:
-    """One line through all swings; in the middle of swing k the other pair stands at landing(k - 1)."""
-    period = GAIT.swing_time + GAIT.double_time
-    for swing in range(GAIT.swings):
-        standing = GAIT.landing(swing - 1) if swing else 0.0
-        assert GAIT.place(swing, 0.5 * GAIT.swing_time) == pytest.approx(standing)
-        assert GAIT.place(swing, period) == pytest.approx(GAIT.place(swing + 1, 0.0))
-    assert (GAIT.place(1, 0.1) - GAIT.place(1, 0.0)) / 0.1 == pytest.approx(GAIT.speed)
+@given(st.integers(2, 7))
+def test_the_body_is_as_far_as_its_feet(feet: int) -> None:
+    """Far from both ends: in the middle of a swing as far as the groups of feet are in the mean of before and after;
+    and evenly."""
+    gait = Gait.of(feet, 40, 0.03, time_unit=0.3)
+    swing, rounds = 20, len(gait.groups)
+    before = np.mean([gait.landing(swing - 1 - k) for k in range(rounds)])
+    after = np.mean([gait.landing(swing - k) for k in range(rounds)])
+    assert gait.progress(swing, 0.5 * gait.swing_time) == pytest.approx(0.5 * (before + after))
+    period = gait.swing_time + gait.double_time
+    assert gait.progress(swing, period) == pytest.approx(gait.progress(swing + 1, 0.0))
+    assert gait.progress(swing, period) - gait.progress(swing, 0.0) == pytest.approx(1.0)
 
 
 def test_a_swinging_foot_leaves_and_lands_at_rest() -> None:
@@ -63,32 +76,3 @@ def test_a_foot_is_steered_bit_by_bit_and_goes_ahead_only_when_it_is_up() -> Non
     assert GAIT.carried(GAIT.carried_from / GAIT.swing_time) == 0.0
     assert GAIT.carried(GAIT.carried_until / GAIT.swing_time) == pytest.approx(1.0)
     assert 0.0 < GAIT.carried(0.5 * (GAIT.carried_from + GAIT.carried_until) / GAIT.swing_time) < 1.0
-
-
-def test_a_passage_meets_its_ends() -> None:
-    """Places and velocities at both ends; the velocity is the rate of the place; outside it stays at the ends."""
-    rng = np.random.default_rng(0)
-    start, start_velocity, end, end_velocity = rng.standard_normal((4, 2))
-    passage = Passage(start, start_velocity, end, end_velocity, 0.7)
-    for elapsed, place, velocity in ((0.0, start, start_velocity), (0.7, end, end_velocity), (9.0, end, end_velocity)):
-        got = passage.at(elapsed)
-        assert np.allclose(got[0], place) and np.allclose(got[1], velocity)
-    rate = (passage.at(0.3 + 1e-6)[0] - passage.at(0.3 - 1e-6)[0]) / 2e-6
-    assert np.allclose(rate, passage.at(0.3)[1], atol=1e-6)
-
-
-@given(st.integers(0, 1000))
-def test_nearest_point_of_a_hull_is_the_best_convex_combination(seed: int) -> None:
-    """Against a slow twin: the closest weighted mean of the points."""
-    rng = np.random.default_rng(seed)
-    points, place = rng.standard_normal((8, 2)), 2.0 * rng.standard_normal(2)
-    found = nearest_in_hull(points, place)
-    best = minimize(
-        lambda w: ((w @ points - place) ** 2).sum(),
-        np.full(8, 1 / 8),
-        jac=lambda w: 2.0 * points @ (w @ points - place),
-        bounds=[(0, 1)] * 8,
-        constraints={"type": "eq", "fun": lambda w: w.sum() - 1.0, "jac": lambda w: np.ones(8)},
-        options={"ftol": 1e-14, "maxiter": 300},
-    )
-    assert np.linalg.norm(found - place) == pytest.approx(np.sqrt(best.fun), abs=1e-4)

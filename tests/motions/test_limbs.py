@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from egs_warp.errors import UserError
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.meshing.occupancy import LatticeSolid
-from egs_warp.motions.feet import Base, around, base_of, feet_around, find_feet
+from egs_warp.motions.feet import Base, around, base_of, find_feet
 from egs_warp.motions.limbs import Sections, find_limbs
-from tests.support.meshes import UP, carved, coarse_stool, column, figure, stool
+from tests.support.meshes import carved, coarse_stool, column, figure, stool
 
 Shape = Callable[[np.ndarray], np.ndarray]
 """Which of the points (n, 3) it holds."""
@@ -108,7 +107,7 @@ def melted(thickness: float) -> TetMesh:
 
 
 def test_legs_that_melt_together_at_the_base_are_told_apart() -> None:
-    """Each sole is a quarter of the slab, and a walk is told what keeps it."""
+    """Each sole is a quarter of the slab, and each foot knows that it is joined."""
     mesh = melted(0.05)
     feet = find_feet(mesh, mesh.nodes[:, 2], 1.0)
     assert len(feet) == 4 and all(foot.joined for foot in feet)
@@ -118,8 +117,6 @@ def test_legs_that_melt_together_at_the_base_are_told_apart() -> None:
         assert foot.length == pytest.approx(0.7, abs=0.03)
         assert np.all(foot.leg[foot.sole] == 1.0)
     assert len(np.unique(np.concatenate([foot.sole for foot in feet]))) == sum(len(foot.sole) for foot in feet)
-    with pytest.raises(UserError, match="of the body's four 4 are joined to another"):
-        feet_around(feet, mesh.nodes, UP)
 
 
 def test_legs_on_a_thick_slab_stand_on_one_base() -> None:

@@ -9,12 +9,14 @@ import pytest
 from egs_warp.errors import UserError
 from egs_warp.motions.script import motion
 
+KNOWN = "jump, hop, twist, walk, walk to, walk along, turn, trajectory"
+
 
 def test_a_line_of_motions() -> None:
     hop, twist, walk, jump = motion("hop x3, twist -90 height=0.3,walk 2, JUMP 1 0.25").requests
     assert (hop.name, hop.repeat, hop.asked) == ("hop", 3, {"distance": 0.7, "height": 0.3})
     assert twist.asked == {"heading_degrees": -90.0, "distance": 0.0, "height": 0.3}
-    assert (walk.name, walk.asked["steps"], walk.repeat) == ("walk", 2.0, 1)
+    assert (walk.name, walk.asked["distance"], walk.repeat) == ("walk", 2.0, 1)
     assert (jump.name, jump.asked) == ("jump", {"distance": 1.0, "height": 0.25})
 
 
@@ -37,18 +39,34 @@ def test_a_json_script_is_the_same_as_its_line(tmp_path: Path) -> None:
     assert motion(str(path)) == motion(f"hop 0.5 x2, twist 90, trajectory {tmp_path / 'keys.csv'}")
 
 
+def test_ways_are_asked_for_in_words(tmp_path: Path) -> None:
+    """A comma between two numbers does not end a motion; a path is a file; backwards is a negative distance."""
+    to, back, turned, along = motion("walk to 1.5,-0.5, walk -1 speed=1.2,turn -90, walk along a.csv 0.05").requests
+    assert (to.name, to.asked["ahead"], to.asked["left"], to.asked["speed"]) == ("walk to", 1.5, -0.5, 1.0)
+    assert motion("walk to 1 2").requests[0].asked["left"] == motion("walk to 1, 2").requests[0].asked["left"] == 2.0
+    assert (back.asked["distance"], back.asked["speed"]) == (-1.0, 1.2)
+    assert (turned.name, turned.asked["heading_degrees"]) == ("turn", -90.0)
+    assert (along.name, along.file, along.asked["step_length"]) == ("walk along", Path("a.csv"), 0.05)
+    (part,) = motion("walk to 3,4").parts(1.0)
+    assert part.asked["distance"] == 5.0
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("fly", "motion 1: unknown motion 'fly'; known motions are: jump, hop, twist, walk, trajectory"),
-        ("jump,", "motion 2: nothing between two commas; name a motion: jump, hop, twist, walk, trajectory"),
+        ("fly", f"motion 1: unknown motion 'fly'; known motions are: {KNOWN}"),
+        ("jump,", "motion 2: nothing between two commas; name a motion: jump, hop, twist, walk, walk to"),
         ("hop x0", "motion 1 ('hop x0'): repeat 0; give a whole number from 1 to 100"),
         ("jump 1 2 3", "motion 1 ('jump 1 2 3'): '3' is one value too many; jump takes distance, height"),
         ("hop, jump far", "motion 2 ('jump far'): distance far: give a number of body heights from 0 to 10"),
         ("jump nan", "motion 1 ('jump nan'): distance nan: give a number of body heights from 0 to 10"),
         ("twist 9999", "('twist 9999'): heading_degrees 9999: give a number of degrees from -720 to 720"),
         ("jump height=0", "('jump height=0'): height 0: give a number of body heights above 0 up to 10"),
-        ("walk 1.5", "('walk 1.5'): steps 1.5: give a whole number of steps from 1 to 50"),
+        ("walk 99", "('walk 99'): distance 99: give a number of body heights from -10 to 10"),
+        ("walk to 1,2,3,4,5", "'5' is one value too many; walk to takes ahead, left, step_length, speed"),
+        ("walk to there", "('walk to there'): ahead there: give a number of body heights"),
+        ("walk along", "('walk along'): walk along needs a file of points, as walk along way.csv"),
+        ("turn 45 9", "('turn 45 9'): speed 9: give a number of times the usual from 0.3 to 1.6"),
         ("jump speed=2", "('jump speed=2'): 'speed' is unknown; jump takes distance, height"),
         ("trajectory", "('trajectory'): trajectory needs a file of key frames, as trajectory keys.json"),
         ("hop x60, hop x60", "motion: 120 motions are asked for; at most 100 are done in a row"),
@@ -72,7 +90,7 @@ def test_mistakes_of_a_line(line: str, message: str) -> None:
         ("[", "not JSON at line 1"),
         ("[" * 100_000, "lists in lists in lists, too deep to read"),
         ("{}", 'give a list of motions, as [{"motion": "jump"}]'),
-        ("[3]", ', motion 1: give an object with a "motion", one of jump, hop, twist, walk, trajectory'),
+        ("[3]", f', motion 1: give an object with a "motion", one of {KNOWN}'),
         ('[{"motion": "jump", "repeat": 1.5}]', ', motion 1: "repeat" is 1.5; give a whole number'),
         ('[{"motion": "jump", "distance": true}]', "distance True: give a number of body heights from 0 to 10"),
         ('[{"motion": "trajectory", "file": 3}]', '"file" is 3; give the name of a file'),

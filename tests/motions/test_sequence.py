@@ -93,8 +93,8 @@ def test_what_the_last_frame_cut_off_is_told(place: Place) -> None:
 
 
 def test_a_motion_that_cannot_be_is_refused_before_the_first(place: Place) -> None:
-    with pytest.raises(UserError, match="walk: a walk needs four separate feet"):
-        motion("hop x2, jump, walk").check(place)
+    with pytest.raises(UserError, match="walk: the way takes more than 400 paces"):
+        motion("hop x2, jump, walk to 9,9 0.01").check(place)
     motion("hop x2, jump").check(place)
 
 

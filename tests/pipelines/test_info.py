@@ -52,9 +52,7 @@ def test_all_motions_are_told_with_what_is_in_their_way(chair: BodyInfo) -> None
     assert chair.motions() == dict.fromkeys(REPERTOIRE)
     round_one = seen(pawn(gaussian_count=3000))
     assert len(round_one.feet) == 1 and "stands   on one base" in round_one.lines()
-    why = {name: reason for name, reason in round_one.motions().items() if reason is not None}
-    assert why == {"walk": "a walk needs four separate feet, the body has 1"}
-    assert "walk       no: a walk needs four separate feet, the body has 1" in round_one.lines()
+    assert round_one.motions() == dict.fromkeys(REPERTOIRE), "it waddles"
     assert "jump       yes" in round_one.lines()
 
 

@@ -357,7 +357,7 @@ READERS: tuple[Reader, ...] = (
     Reader("terrain", "terrain.json", lambda: _json([[[0, 0, 1, -0.1], [-1, 0, 0, 0.5]]]), _terrain, json=True),
     Reader("muscles", "muscles.json", lambda: _json(_MUSCLES), _muscles, json=True),
     Reader("script", "script.json", lambda: _json(_SCRIPT), _script, json=True),
-    Reader("motion line", "line.txt", lambda: b"hop x3, twist 180, walk 2, jump 0.5 height=0.3", _line),
+    Reader("motion line", "line.txt", lambda: b"hop x3, twist 180, walk to 1,0.5, walk 2, jump 0.5 height=0.3", _line),
     Reader("key frames", "keys.json", lambda: _json(_KEYS), _keys, json=True),
     Reader("key frames csv", "keys.csv", lambda: _CSV, _keys),
     Reader("camera path", "path.json", lambda: _json(_PATH), _camera_path, json=True),

@@ -6,13 +6,13 @@ import type { Stage } from "./stage";
 
 export type Action = "forward" | "back" | "left" | "right" | "jump" | "leap" | "hop";
 
-/** What each action asks for; forward walks where the body has feet for it. */
+/** What each action asks for; it walks where it can. */
 export function motionOf(action: Action, walks: boolean): string {
   return {
-    forward: walks ? "walk 2" : "hop 0.4 0.2",
-    back: "twist 180 0 0.25",
-    left: "twist 45 0 0.2",
-    right: "twist -45 0 0.2",
+    forward: walks ? "walk 0.2" : "hop 0.4 0.2",
+    back: walks ? "walk -0.2" : "twist 180 0 0.25",
+    left: walks ? "turn 30" : "twist 45 0 0.2",
+    right: walks ? "turn -30" : "twist -45 0 0.2",
     jump: "jump 0 0.25",
     leap: "jump 0.6 0.3",
     hop: "hop 0.4 0.2",

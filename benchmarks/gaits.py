@@ -1,0 +1,171 @@
+"""Any body, any way: bodies x what they are told (walk ahead, walk to a point, turn, twist, jump), with one setting for
+all.
+
+python benchmarks/gaits.py [--quick] [--workers 2] [--bodies NAME ...] [--cells NAME ...] [--json PATH] [--join PATH]
+
+A walk succeeds if it ends within 0.1 body heights and 10 degrees of where it was told to, within 60 sqrt(H/g), upright;
+a twist within 10 degrees in at most two jumps, a standard jump within 15 %. Slip is that of a foot while it stands over
+the stride; the cost of transport the muscles' work over m g times the way. Bodies without feet or a flat base refuse
+to walk in one line: that counts as a failure here. Captures take part where they are found.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from bodies import NAMES, body
+from egs_warp.errors import UserError
+from egs_warp.locomotion.audit import audit
+from egs_warp.locomotion.ledger import ledger
+from egs_warp.locomotion.trajectory import measure
+from egs_warp.motions.feet import Base, base_of
+from egs_warp.motions.script import motion
+from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.performance import Performance, simulate
+from harness import Row, Table, flags, record, report, timed
+from modelled import MODELLED, modelled
+from sweep import bounds_broken, judge
+
+CELLS = {
+    "walk": "walk 2",
+    "walk to": "walk to 0.75,1.299",
+    "turn": "turn 90",
+    "twist": "twist 90",
+    "jump": "jump",
+}
+QUICK = {"walk": "walk 0.3", "turn": "turn 30"}
+CAPTURED = ("plush dog", "monkey", "robot", "koala", "fox", "armchair", "cat", "spot")
+NEAR, ASIDE, LONGEST = 0.1, 10.0, 60.0
+"""Body heights, degrees, sqrt(H / g)."""
+
+
+def names() -> list[str]:
+    """Bodies that can be had here."""
+    return ["pawn", "figurine", "stool", *(name for name in CAPTURED if name in NAMES), *MODELLED]
+
+
+def run(name: str, cell: str, text: str) -> Row:
+    """Simulate one cell and judge it."""
+    wp.config.log_level = wp.LOG_WARNING
+    judged, milliseconds = timed(_run, name, cell, text)
+    return {"body": name, "cell": cell, "told": text, **judged, "seconds": 1e-3 * milliseconds}
+
+
+def _run(name: str, cell: str, text: str) -> Row:
+    try:
+        one = modelled(name) if name in MODELLED else body(name)
+        creature = make_creature(one.cloud, plane=one.plane)
+        performance = simulate(creature, motion(text))
+    except (UserError, FileNotFoundError, ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
+        return {"success": False, "reason": f"stopped: {error}"}
+    trajectory, place = performance.trajectory, performance.place
+    feet = place.feet()
+    local = place.ground.local(place.standing)
+    stands = base_of(creature.body.mesh, local[:, 2], len(feet))
+    height, gravity = creature.body.height, float(np.linalg.norm(creature.body.gravity))
+    books = ledger(trajectory)
+    work = float(books.muscle_work.sum() / books.unit)
+    moved = _moved(performance)
+    way = float(np.linalg.norm(moved[:2]))
+    (done,) = performance.sequence.done[:1]
+    own = done.motion.reached(trajectory, 0, len(trajectory.time) - 1)
+    reached: dict[str, Any] = asdict(measure(trajectory)) | (asdict(own) if own is not None else {})
+    checked = asdict(audit(trajectory, newton_unconverged=sum(not r.converged for r in performance.simulation.reports)))
+    time = float(trajectory.time[-1]) * float(np.sqrt(gravity / height))
+    reason = f"fell: {performance.fallen}" if performance.fallen else bounds_broken(checked)
+    if cell in ("twist", "jump"):
+        reason = reason or judge(cell, {"distance": 0.0, "height": 0.2, **done.asked}, reached)
+    else:
+        reason = reason or _missed(dict(done.asked), moved, reached, time)
+    return {
+        "success": reason is None,
+        "reason": reason,
+        "stands_on": f"{len(feet)} feet" if stands is Base.FEET else stands.value,
+        "moved": moved.tolist(),
+        "time": time,
+        "tilt_degrees": reached["tilt_degrees"],
+        "slip": reached.get("slip") if stands is Base.FEET else None,
+        "work": work,
+        "cost_of_transport": work / way if cell in ("walk", "walk to") and way > NEAR else None,
+        "fallen": performance.fallen,
+    }
+
+
+def _moved(performance: Performance) -> np.ndarray:
+    """(3,) body heights ahead and to the left that the centre of mass has gone, and degrees turned."""
+    trajectory, place, body_ = performance.trajectory, performance.place, performance.creature.body
+    first, last = (body_.centre_of_mass(place.ground.local(trajectory.positions[k])) for k in (0, -1))
+    return np.array([*((last - first)[:2] / body_.height), measure(trajectory).heading_degrees])
+
+
+def _missed(asked: dict[str, float], moved: np.ndarray, reached: dict[str, Any], time: float) -> str | None:
+    goal = np.array([asked.get("ahead", asked["distance"]), asked.get("left", 0.0)])
+    miss = float(np.linalg.norm(moved[:2] - goal))
+    if reached["tilt_degrees"] >= ASIDE:
+        return f"leans: tilt {reached['tilt_degrees']:.0f} degrees"
+    if miss > NEAR:
+        return f"{miss:.2f} body heights from where it was told to go"
+    heading = asked.get("heading_degrees", 0.0 if "ahead" not in asked else None)
+    if heading is not None and abs((moved[2] - heading + 180.0) % 360.0 - 180.0) > ASIDE:
+        return f"turned {moved[2]:.0f} degrees"
+    return f"took {time:.0f} sqrt(H/g)" if time > LONGEST else None
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the cells."""
+    parser = flags(__doc__, quick="three bodies, short ways", device="cpu")
+    parser.add_argument("--workers", type=int, default=os.cpu_count())
+    parser.add_argument("--bodies", nargs="*", help="only these")
+    parser.add_argument("--cells", nargs="*", help=f"only these of {', '.join(CELLS)}")
+    parser.add_argument("--join", type=Path, help="JSON of an earlier run of the same code: its rows are not run again")
+    options = parser.parse_args(arguments)
+    rows: list[Row] = json.loads(options.join.read_text())["rows"] if options.join else []
+    told = QUICK if options.quick else CELLS
+    chosen = options.bodies or (["pawn", "stool", "biped"] if options.quick else names())
+    cells = [(name, cell, text) for cell, text in told.items() for name in chosen if cell in (options.cells or told)]
+    known = {(row["body"], row["cell"], row["told"]) for row in rows}
+    os.environ["OMP_NUM_THREADS"] = "1"
+    table = Table(body="<10", cell="<8", seconds=".0f", time=".0f", slip=".1%", cost=".1f", outcome="<7")
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(options.workers, mp_context=context) as pool:
+        for future in as_completed([pool.submit(run, *cell) for cell in cells if cell not in known]):
+            rows.append(row := future.result())
+            figures = [row.get(key) for key in ("time", "slip", "cost_of_transport")]
+            table.row(row["body"], row["cell"], row["seconds"], *figures, row["reason"] or "success")
+            record(options, rows, **summary(rows, whole=not options.quick))
+    good = sum(row["success"] for row in rows)
+    print(f"{good} of {len(rows)} cells succeed")
+    report(options, rows, **summary(rows, whole=not options.quick))
+
+
+def summary(rows: list[Row], *, whole: bool) -> dict[str, Any]:
+    """The aims."""
+    rate = float(np.mean([row["success"] for row in rows]))
+    slips = [row["slip"] for row in rows if row.get("slip") is not None and row["cell"] in ("walk", "walk to", "turn")]
+    costs = [row["cost_of_transport"] for row in rows if row.get("cost_of_transport") is not None]
+    fell = [row for row in rows if row.get("tilt_degrees", 0.0) > 60.0]
+    enough = whole and len({row["body"] for row in rows}) >= 14
+    why = "" if enough else "not all cells of 14 bodies were run"
+    aims = {
+        "succeed_90": rate >= 0.9 if enough else None,
+        "slip": (max(slips) <= 0.03 if slips else None) if enough else None,
+        "cost_of_transport": (max(costs) <= 3.0 if costs else None) if enough else None,
+        "falls_reported": all(row["fallen"] for row in fell),
+        "pushes": None,
+    }
+    nulls = {name: why for name, value in aims.items() if value is None} | {"pushes": "pushes are not built yet"}
+    return {"success_rate": rate, "aims": aims, "why_null": nulls}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""How a walking body is carried: the pose that follows from where its feet and its centre of mass are.
+
+Places of feet are (x, y, z, heading): metres in the frame of the start, radians about up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from egs_warp.fem.body import SoftBody
+from egs_warp.motions.feet import Base, Foot, base_of, halves
+from egs_warp.motions.route import Pace
+from egs_warp.motions.sequence import Place
+from egs_warp.motions.stance import SHEAR
+
+REACH = 0.5
+"""Longest pace over the shortest leg's length."""
+LARGEST_TURN = float(np.radians(15.0))
+"""Of one pace on legs."""
+LIFT = 0.03
+"""Body heights that a foot is lifted at most."""
+PIVOT, ROLL = 0.3, 0.05
+"""Radians by which a body on one base turns about one side, and tips to lift the other, at most: faster, it would throw
+itself off the side on which it stands."""
+LEGS = 0.2
+"""Body heights: on shorter legs a body goes as on one base."""
+_SOLE = 0.02
+"""Body heights: nodes at most this high are the sole of a base."""
+_FURTHEST_LEAN = 0.5
+"""Sideways for one up."""
+
+
+class Carriage(Protocol):
+    """Gives poses, and how far one pace may go."""
+
+    pace: Pace
+    """The most that a pace may be."""
+    lift: float
+    """Metres that a foot is lifted."""
+    catch: float
+    """Metres by which a foot may come down off its place to catch the body."""
+
+    def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
+        """(N, 3) nodes of the body with its centre of mass at ``com`` (3,), turned by ``heading`` radians, its feet at
+        ``feet`` (F, 4)."""
+        ...
+
+
+class OnLegs:
+    """Each leg goes with its foot, the rest of the body with the centre of mass."""
+
+    def __init__(self, body: SoftBody, standing: np.ndarray, feet: Sequence[Foot]) -> None:
+        """``standing`` (N, 3): nodes at rest, in the frame of the start."""
+        self._start_com = body.centre_of_mass(standing)
+        self._arms = standing - self._start_com
+        self._legs = np.array([foot.leg for foot in feet])
+        self._leg_mass = self._legs @ body.node_mass / body.mass
+        self._soles = np.array([self._arms[foot.sole].mean(axis=0) for foot in feet])
+        self.pace = Pace(REACH * min(foot.length for foot in feet), LARGEST_TURN)
+        self.lift = LIFT * body.height
+        self.catch = REACH * min(foot.length for foot in feet)
+
+    def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
+        """See ``Carriage``."""
+        turn = Rotation.from_rotvec([0.0, 0.0, heading]).as_matrix()
+        stretched = feet[:, :3] - self._soles @ turn.T
+        trunk = (com - self._leg_mass @ stretched) / (1.0 - self._leg_mass.sum())
+        return self._arms @ turn.T + trunk + self._legs.T @ (stretched - trunk)
+
+
+class OnBase:
+    """The two sides of the base turn and tip the body as a whole, as one walks a wardrobe; it leans over them."""
+
+    def __init__(self, body: SoftBody, standing: np.ndarray, feet: Sequence[Foot]) -> None:
+        """``standing`` (N, 3): nodes at rest, in the frame of the start; the two ``feet``."""
+        soles = np.array([standing[foot.sole].mean(axis=0) for foot in feet])
+        self._arms = standing - soles.mean(axis=0)
+        self._com = body.centre_of_mass(self._arms)
+        self._between = soles[0] - soles[1]
+        self._width = float(np.hypot(*self._between[:2]))
+        self.pace = Pace(0.5 * PIVOT * self._width, 0.5 * PIVOT)
+        self.lift = min(ROLL * self._width, LIFT * body.height)
+        self.catch = 0.0
+
+    def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
+        """See ``Carriage``; the places of the feet turn it, not ``heading``."""
+        middle, between, rest = feet[:, :3].mean(axis=0), feet[0, :3] - feet[1, :3], self._between
+        yaw = np.arctan2(between[1], between[0]) - np.arctan2(rest[1], rest[0])
+        across = np.array([between[1], -between[0], 0.0]) / np.hypot(*between[:2])
+        roll = (between[2] - rest[2]) / self._width
+        turn = (Rotation.from_rotvec(roll * across) * Rotation.from_rotvec([0.0, 0.0, yaw])).as_matrix()
+        upright = middle + turn @ self._com
+        moved = np.stack([(turn @ lean @ self._com)[:2] for lean in SHEAR], axis=1)
+        lean = np.linalg.solve(moved, (com - upright)[:2])
+        lean *= min(1.0, _FURTHEST_LEAN / max(float(np.linalg.norm(lean)), 1e-12))
+        strain = np.eye(3) + np.einsum("k,kij->ij", lean, SHEAR)
+        strain[:, 2] *= 1.0 + (com[2] - upright[2]) / self._com[2]
+        return middle + self._arms @ (turn @ strain).T
+
+
+def carried_on(place: Place) -> tuple[tuple[Foot, ...], type[OnLegs] | type[OnBase]]:
+    """The feet on which the body that stands at ``place`` walks, and how these carry it: its own, or the sides of its
+    base. No feet at all where it lies or rolls."""
+    feet, standing, height = place.feet(), place.ground.local(place.standing), place.body.height
+    heights = standing[:, 2] - standing[:, 2].min()
+    base = base_of(place.body.mesh, standing @ (place.ground.axes @ place.ground.surface_normal), len(feet))
+    if base is Base.FEET and min(foot.length for foot in feet) >= LEGS * height:
+        return feet, OnLegs
+    if base is Base.FEET and len(feet) == 2:
+        return feet, OnBase
+    if base in (Base.LONG, Base.ROUND):
+        return (), OnBase
+    return halves(standing[:, :2], heights, np.flatnonzero(heights < _SOLE * height), height), OnBase

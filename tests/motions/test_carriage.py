@@ -1,0 +1,79 @@
+"""Poses of walking bodies: the centre of mass and the feet come where they are asked to be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from egs_warp.motions.carriage import PIVOT, REACH, Carriage, OnBase, OnLegs, carried_on
+from egs_warp.motions.feet import Foot
+from egs_warp.motions.sequence import Place
+from tests.support.meshes import coarse_stool, figure
+from tests.support.places import block_place
+
+
+def carried(place: Place) -> tuple[np.ndarray, tuple[Foot, ...], Carriage, np.ndarray]:
+    """Standing nodes, feet, carriage and the places of the feet."""
+    feet, kind = carried_on(place)
+    standing = place.ground.local(place.standing)
+    soles = np.array([standing[foot.sole].mean(axis=0) for foot in feet])
+    return standing, feet, kind(place.body, standing, feet), np.column_stack([soles, np.zeros(len(feet))])
+
+
+@pytest.mark.parametrize("place", [block_place(), block_place(coarse_stool()), block_place(figure())])
+def test_a_body_stands_as_it_stood(place: Place) -> None:
+    standing, _, carriage, soles = carried(place)
+    assert carriage.pose(place.body.centre_of_mass(standing), 0.0, soles) == pytest.approx(standing, abs=1e-12)
+
+
+def test_legs_go_with_their_feet() -> None:
+    """The soles are where they are asked to be, each moved as one, and so is the centre of mass; the body turns."""
+    place = block_place(coarse_stool())
+    standing, feet, carriage, soles = carried(place)
+    assert isinstance(carriage, OnLegs) and len(feet) == 4
+    assert carriage.pace.length == pytest.approx(REACH * min(foot.length for foot in feet))
+    com = place.body.centre_of_mass(standing) + [0.02, -0.01, 0.005]
+    soles[0, :3] += [0.06, 0.0, 0.03]
+    heading = 0.1
+    pose = carriage.pose(com, heading, soles)
+    assert place.body.centre_of_mass(pose) == pytest.approx(com, abs=1e-12)
+    for foot, sole in zip(feet, soles, strict=True):
+        assert pose[foot.sole].mean(axis=0) == pytest.approx(sole[:3], abs=1e-12)
+    top = standing[:, 2] > 0.9 * standing[:, 2].max()
+    arms, turned = (x[top] - x[top].mean(axis=0) for x in (standing, pose))
+    angle = np.arctan2((arms[:, 0] * turned[:, 1] - arms[:, 1] * turned[:, 0]).sum(), (arms * turned)[:, :2].sum())
+    assert angle == pytest.approx(heading, abs=0.02)
+
+
+def test_a_base_turns_and_tips_with_its_sides() -> None:
+    """One side ahead turns it about the other, one side up tips it; the middles of the sides come near their places,
+    the centre of mass where it is asked to be."""
+    place = block_place()
+    standing, feet, carriage, soles = carried(place)
+    assert isinstance(carriage, OnBase) and len(feet) == 2
+    width = float(soles[0, 1] - soles[1, 1])
+    assert width > 0.2, "the left side comes first"
+    assert carriage.pace.length == pytest.approx(0.5 * PIVOT * width) and carriage.catch == 0.0
+    com = place.body.centre_of_mass(standing) + [0.01, 0.03, 0.0]
+    soles[0, 0] += 0.04
+    soles[1, 2] += 0.01
+    pose = carriage.pose(com, 0.0, soles)
+    assert place.body.centre_of_mass(pose) == pytest.approx(com, abs=1e-3)
+    for foot, sole in zip(feet, soles, strict=True):
+        assert pose[foot.sole].mean(axis=0) == pytest.approx(sole[:3], abs=0.005)
+    across = pose[feet[0].sole].mean(axis=0) - pose[feet[1].sole].mean(axis=0)
+    assert np.arctan2(across[1], across[0]) - np.pi / 2 == pytest.approx(-0.04 / width, rel=0.1)
+    assert across[2] / width == pytest.approx(-0.01 / width, rel=0.1)
+
+
+def test_what_lies_or_rolls_has_no_feet_to_walk_on() -> None:
+    """A long bar on the ground; a body of short joined feet takes these for the sides of a base."""
+    place = block_place()
+    lying = replace(place, standing=place.standing[:, [2, 1, 0]] * [4.0, 0.3, 0.3])
+    feet, _ = carried_on(replace(place, standing=place.standing))
+    assert len(feet) == 2
+    mesh = replace(place.body.mesh, nodes=lying.standing)
+    bar = block_place(mesh)
+    assert carried_on(bar)[0] == ()

@@ -1,0 +1,70 @@
+"""The inverted pendulum: its plan against the equation of motion, solved by a library."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+from scipy.optimize import minimize
+
+from egs_warp.motions.pendulum import PendulumPlan, drift, nearest_in_hull
+
+RATE = 4.4
+
+
+def test_a_plan_is_a_motion_of_the_pendulum_that_ends_over_its_pressure() -> None:
+    """c'' = w^2 (c - p), begun with the planned divergent part, keeps to the plan and does not run away; p jumps."""
+    step = 0.05
+    pressure = np.array([[0.1, 0.0]] * 8 + [[0.0, 0.2]] * 6 + [[0.3, 0.1]] * 30)
+    plan = PendulumPlan.over(pressure, step, RATE)
+    place = np.array([0.08, 0.01])
+    state = np.concatenate([place, RATE * (plan.divergent[0] - place)])
+    for k, p in enumerate(pressure):
+        solved = solve_ivp(
+            lambda _, s, p=p: [*s[2:], *(RATE**2 * (s[:2] - p))], (0.0, step), state, rtol=1e-11, atol=1e-13
+        )
+        state = solved.y[:, -1]
+        assert state[:2] + state[2:] / RATE == pytest.approx(plan.divergent[k + 1], abs=1e-6)
+    assert state[:2] == pytest.approx([0.3, 0.1], abs=2e-3)
+
+
+def test_a_plan_is_told_between_its_steps_and_stays_at_its_end() -> None:
+    plan = PendulumPlan.over(np.array([[0.0, 0.0], [1.0, 0.0]]), 0.1, RATE)
+    pressure, divergent = plan.at(0.05)
+    assert pressure == pytest.approx([0.0, 0.0])
+    assert divergent == pytest.approx(0.5 * (plan.divergent[0] + plan.divergent[1]))
+    assert plan.at(9.0)[0] == pytest.approx([1.0, 0.0]) and plan.at(9.0)[1] == pytest.approx([1.0, 0.0])
+
+
+def test_what_is_off_grows_unless_it_is_pushed_against() -> None:
+    """Against x' = w (x - p): off by x, pressed off by p for a time t."""
+    off, push, time = np.array([0.01, -0.02]), np.array([0.03, 0.01]), 0.4
+    solved = solve_ivp(lambda _, x: RATE * (x - push), (0.0, time), off, rtol=1e-11, atol=1e-13).y[:, -1]
+    assert drift(off, push, float(np.exp(RATE * time))) == pytest.approx(solved, abs=1e-8)
+
+
+@given(st.integers(0, 1000))
+def test_nearest_point_of_a_hull_is_the_best_convex_combination(seed: int) -> None:
+    """Against a slow twin: the closest weighted mean of the points."""
+    rng = np.random.default_rng(seed)
+    points, place = rng.standard_normal((8, 2)), 2.0 * rng.standard_normal(2)
+    found = nearest_in_hull(points, place)
+    best = minimize(
+        lambda w: ((w @ points - place) ** 2).sum(),
+        np.full(8, 1 / 8),
+        jac=lambda w: 2.0 * points @ (w @ points - place),
+        bounds=[(0, 1)] * 8,
+        constraints={"type": "eq", "fun": lambda w: w.sum() - 1.0, "jac": lambda w: np.ones(8)},
+        options={"ftol": 1e-14, "maxiter": 300},
+    )
+    assert np.linalg.norm(found - place) == pytest.approx(np.sqrt(best.fun), abs=1e-4)
+
+
+def test_nearest_point_of_a_line() -> None:
+    """Between its ends, or one of them."""
+    points = np.array([[0.0, 0.0], [1.0, 1.0], [0.5, 0.5]])
+    for place, nearest in (([1.0, 0.0], [0.5, 0.5]), ([3.0, 1.0], [1.0, 1.0]), ([-1.0, 0.0], [0.0, 0.0])):
+        assert nearest_in_hull(points, np.array(place)) == pytest.approx(nearest)
+    assert nearest_in_hull(points[1:2], np.zeros(2)) == pytest.approx([1.0, 1.0])
