@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 
 from egs_warp.assets import BuiltInObject, figurine, pawn, stool
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.meshing.cage import build_cage
+from egs_warp.meshing.cage import Cage, build_cage
 from tests.support.captures import digest
 
 _OBJECTS = (pawn, stool, figurine)
@@ -48,11 +49,16 @@ def test_object_stands_on_its_plane(make: Callable[..., BuiltInObject], device: 
     assert np.sum((heights > 0) & (heights < reach)) > 100
 
 
+@cache
+def _cage(make: Callable[..., BuiltInObject]) -> Cage:
+    thing: BuiltInObject = make()
+    return build_cage(thing.cloud, thing.plane)
+
+
 @pytest.mark.parametrize("make", _OBJECTS)
 def test_object_has_a_cage(make: Callable[..., BuiltInObject]) -> None:
     """Every built-in object gets a cage that keeps all promises."""
-    thing: BuiltInObject = make()
-    cage = build_cage(thing.cloud, thing.plane)
+    cage = _cage(make)
     assert cage.enclosed_opacity_mass >= 0.999
     assert cage.min_dihedral_degrees >= 8.0
     assert 300 <= len(cage.mesh.nodes) <= 1500
@@ -60,8 +66,7 @@ def test_object_has_a_cage(make: Callable[..., BuiltInObject]) -> None:
 
 def test_stool_stands_on_four_feet() -> None:
     """The cage of the stool touches the floor in the four quadrants and nowhere between."""
-    thing = stool()
-    feet = build_cage(thing.cloud, thing.plane).mesh.nodes
+    feet = _cage(stool).mesh.nodes
     feet = feet[np.abs(feet[:, 2]) < 1e-9]
     for x in (-1, 1):
         for y in (-1, 1):
