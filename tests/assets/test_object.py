@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 
 from egs_warp.assets import BuiltInObject, figurine, pawn, stool
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -26,10 +27,15 @@ def _third_axes(cloud: GaussianCloud) -> np.ndarray:
     return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
 
 
+@cache
+def _thing(make: Callable[..., BuiltInObject], device: str) -> BuiltInObject:
+    return make(device=device)
+
+
 @pytest.mark.parametrize("make", _OBJECTS)
 def test_object_stands_on_its_plane(make: Callable[..., BuiltInObject], device: str) -> None:
     """One unit tall, SH with a view-dependent part, flat splats, a base that straddles the plane by a little."""
-    thing: BuiltInObject = make(device=device)
+    thing = _thing(make, device)
     cloud = thing.cloud
     heights, opacities = thing.plane.heights(cloud.means.numpy()), cloud.opacities()
     assert 15_000 <= cloud.count <= 30_000
@@ -51,7 +57,7 @@ def test_object_stands_on_its_plane(make: Callable[..., BuiltInObject], device: 
 
 @cache
 def _cage(make: Callable[..., BuiltInObject]) -> Cage:
-    thing: BuiltInObject = make()
+    thing = _thing(make, str(wp.get_device()))
     return build_cage(thing.cloud, thing.plane)
 
 
