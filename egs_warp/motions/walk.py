@@ -155,6 +155,9 @@ class Walk:
             float(gait.steps), gait.step_length, gait.swing_time, gait.double_time, gait.lift, stride=gait.stride
         )
 
+    def planned_com(self, elapsed: float) -> None:
+        """Nothing: it goes on from the measured feet."""
+
     def notes(self) -> list[str]:
         """What kept the walk from its target, for the user."""
         found = []
