@@ -81,9 +81,9 @@ def _few_cells(places: np.ndarray, heights: np.ndarray, sole: np.ndarray, spacin
     seeds, apart = _spread(places, int(np.argmin(heights)), spacing)
     while True:
         first = seeds[: np.count_nonzero(apart >= spacing)]
-        _, nearest = KDTree(places[first]).query(places)
+        nearest = np.asarray(KDTree(places[first]).query(places)[1], dtype=int)
         if len(np.unique(nearest[sole])) <= most:
-            return np.asarray(nearest, dtype=int)
+            return nearest
         spacing *= _WIDER
 
 
