@@ -150,7 +150,7 @@ def _run(case: Case, *, device: str, seed: int, frames: int | None) -> Row:
         if (also := done.motion.reached(trajectory, first, last)) is not None:
             reached |= asdict(also)
         parts.append({name: float(value) for name, value in reached.items()})
-        reason = reason or judge(done.name, {"distance": 0.0, "height": 0.2, **done.asked}, reached)
+        reason = reason or judge(done.name, {"distance": 0.0, "height": 0.2, **done.asked}, reached, metres=case.height)
     reason = reason or (f"{left[0]}" if (left := sequence.cut_short()) and frames is None else None)
     if reason and friction_spent(trajectory) > 0.5:
         reason += "; friction was spent for over half of the time on the ground"
@@ -173,8 +173,8 @@ def bounds_broken(checked: dict[str, float]) -> str | None:
     return None
 
 
-def judge(motion: str, asked: dict[str, float], reached: dict[str, float]) -> str | None:
-    """Why a motion failed; None for a success."""
+def judge(motion: str, asked: dict[str, float], reached: dict[str, float], *, metres: float = 1.0) -> str | None:
+    """Why a motion of a body of so many ``metres`` failed; None for a success."""
     if reached["tilt_degrees"] >= 10.0:
         return f"fell or leans: tilt {reached['tilt_degrees']:.0f} degrees"
     if motion == "walk":
@@ -182,7 +182,8 @@ def judge(motion: str, asked: dict[str, float], reached: dict[str, float]) -> st
             return f"a foot slipped {reached['slip']:.1%} of the stride"
         wrong = abs(reached["distance"] - asked["distance"]) > 0.1 * asked["distance"]
         return f"walked {reached['distance']:.3f}, asked {asked['distance']:.3f}" if wrong else None
-    if reached["airborne_frames"] < 8:
+    free_flight = 60.0 * 2.0 * np.sqrt(2.0 * asked["height"] * metres / 9.81)
+    if reached["airborne_frames"] < free_flight / 3.0:
         return f"hardly left the ground: {reached['airborne_frames']:.0f} frames"
     if abs(reached["height"] - asked["height"]) > 0.15 * asked["height"]:
         return f"rose {reached['height']:.3f}, asked {asked['height']:.3f}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -36,14 +37,25 @@ def device(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
+@pytest.fixture
+def coarse() -> Iterator[None]:
+    """``animate`` gives bodies some 200 nodes: as soon made as 500, and stepped twice as fast."""
+    from tests.support.coarse import coarse_cages
+
+    with coarse_cages(120):
+        yield
+
+
 @pytest.fixture(scope="session")
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What ``egs-warp animate`` writes: twelve frames of a small pawn that crouches."""
+    """What ``egs-warp animate`` writes: twelve frames of a small, coarse pawn that crouches."""
     from egs_warp.assets.pawn import pawn
     from egs_warp.pipelines.animate import AnimateOptions, animate
+    from tests.support.coarse import coarse_cages
 
     folder = tmp_path_factory.mktemp("run")
     made = pawn(gaussian_count=6000)
     options = AnimateOptions(frames=12, size=64)
-    animate(made.cloud, folder, plane=made.plane, options=options, source="pawn", quiet=True)
+    with coarse_cages(120):
+        animate(made.cloud, folder, plane=made.plane, options=options, source="pawn", quiet=True)
     return folder

@@ -5,10 +5,12 @@ from __future__ import annotations
 import ast
 import re
 import runpy
+from functools import cache
 from pathlib import Path
 
 import pytest
 
+import egs_warp
 from egs_warp.assets import BUILT_IN_SCENES, scene
 from egs_warp.io import read_capture
 from egs_warp.motions.keyframes import read_keyframes
@@ -60,10 +62,12 @@ def test_every_page_of_concepts_says_where_its_code_is() -> None:
             assert (ROOT / room).exists() or (ROOT / f"{room}.py").exists(), f"{page.name}: no {room}"
 
 
-def test_pages_start_from_captures_and_keys_that_can_be_read(tmp_path: Path) -> None:
+def test_pages_start_from_captures_and_keys_that_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made_once = cache(scene)
+    monkeypatch.setattr(egs_warp, "scene", made_once)
     runpy.run_path(str(ROOT / "examples" / "captures.py"))["main"](["--out", str(tmp_path)])
     for name in BUILT_IN_SCENES:
-        made = scene(name)
+        made = made_once(name)
         assert read_capture(tmp_path / f"{name}.ply").cloud.count == made.object.count
         assert read_capture(tmp_path / f"{name}_in_room.ply").cloud.count == made.whole()[0].count
     assert {key.part for key in read_keyframes(ROOT / "examples" / "bow.csv")} == {"head"}

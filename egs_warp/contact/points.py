@@ -75,25 +75,30 @@ class ContactPoints:
 
 
 def _few_cells(places: np.ndarray, heights: np.ndarray, sole: np.ndarray, spacing: float, most: int) -> np.ndarray:
-    """(P,) cell of each of ``places`` (P, 3), of which at most ``most`` hold points of the ``sole``."""
+    """(P,) nearest seed of each of ``places`` (P, 3); as many seeds as are ``spacing`` metres apart, or fewer, until at
+    most ``most`` of them are nearest to points of the ``sole``.
+    """
+    seeds, apart = _spread(places, int(np.argmin(heights)), spacing)
     while True:
-        cells = _cells(places, heights, spacing)
-        if len(np.unique(cells[sole])) <= most:
-            return cells
+        first = seeds[: np.count_nonzero(apart >= spacing)]
+        nearest = np.asarray(KDTree(places[first]).query(places)[1], dtype=int)
+        if len(np.unique(nearest[sole])) <= most:
+            return nearest
         spacing *= _WIDER
 
 
-def _cells(places: np.ndarray, heights: np.ndarray, spacing: float) -> np.ndarray:
-    """(P,) nearest of the seeds, ``spacing`` metres apart, the lowest point first and then always the one furthest from
-    all before.
+def _spread(places: np.ndarray, start: int, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """(k,) points from ``start`` on, always the one furthest from all before, and how far it was (k,), at least
+    ``spacing`` metres: fewer points, further apart, are the first of these.
     """
-    seeds = [int(np.argmin(heights))]
-    distance = np.linalg.norm(places - places[seeds[0]], axis=1)
+    columns = np.ascontiguousarray(places.T)
+    seeds, apart = [start], [np.inf]
+    distance = np.full(len(places), np.inf)
     while True:
+        x, y, z = columns - columns[:, seeds[-1], None]
+        np.minimum(distance, np.sqrt(x * x + y * y + z * z), out=distance)
         furthest = int(np.argmax(distance))
         if distance[furthest] < spacing:
-            break
+            return np.array(seeds), np.array(apart)
         seeds.append(furthest)
-        distance = np.minimum(distance, np.linalg.norm(places - places[furthest], axis=1))
-    _, nearest = KDTree(places[seeds]).query(places)
-    return np.asarray(nearest, dtype=int)
+        apart.append(float(distance[furthest]))

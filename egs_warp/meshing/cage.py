@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.rows import distinct_rows
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.kernels.meshing.occupancy import inside_mesh_kernel
 from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame
@@ -223,6 +224,8 @@ class _Distance:
         """Signed distance, in lattice spacings."""
         self.smooth = np.asarray(ndimage.gaussian_filter(self.sharp, 0.9))
         """The same without the lattice's steps."""
+        self.medial = (self.smooth < -0.2) & (self.smooth <= ndimage.minimum_filter(self.smooth, 3))
+        """Where it has a crest, as it has in the middle of a thin part (there is none at corners)."""
         self.longest_side = solid.longest_side / solid.spacing
         """In lattice spacings."""
         self.middle = -solid.corner[:2]
@@ -237,8 +240,7 @@ class _Field:
         smooth = distance.smooth
         value = np.minimum(smooth, distance.sharp + 0.3) - dilation * distance.longest_side
         if thin_radius > 0.0:
-            # Medial points of thin parts: the distance to the surface has a crest there (it has none at corners).
-            crest = (smooth < -0.2) & (smooth <= ndimage.minimum_filter(smooth, 3)) & (-value < thin_radius)
+            crest = distance.medial & (-value < thin_radius)
             if crest.any():
                 value = np.minimum(value, _edt(~crest) - thin_radius)
         self._value = value[:, :, value.shape[2] // 2 - 1 :]
@@ -268,7 +270,7 @@ def _edt(mask: np.ndarray) -> np.ndarray:
 def _main_piece(nodes: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The largest part (by volume) that hangs together through faces; loose crumbs are dropped."""
     faces = np.sort(tets[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
-    _, face = np.unique(faces, axis=0, return_inverse=True)
+    _, face = distinct_rows(faces)
     order = np.argsort(face, kind="stable")
     shared = face[order][1:] == face[order][:-1]
     a, b = order[:-1][shared] // 4, order[1:][shared] // 4

@@ -12,6 +12,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from egs_warp.geometry.rows import distinct_rows
+
 Field = Callable[[np.ndarray], np.ndarray]
 """Signed distance (m,) at points (m, 3): negative inside."""
 
@@ -106,7 +108,7 @@ def _crossed_or_inside(value: np.ndarray, tets: np.ndarray, long_edges: np.ndarr
 def _unique_edges(tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Edges (E, 2), lower point first, and for each tetrahedron the numbers (T, 6) of its edges."""
     ends = np.sort(tets[:, _CORNER_PAIRS].reshape(-1, 2), axis=1)
-    edges, edge_of = np.unique(ends, axis=0, return_inverse=True)
+    edges, edge_of = distinct_rows(ends)
     return edges, edge_of.reshape(-1, 6)
 
 

@@ -98,6 +98,9 @@ class Follow:
         misses = [float(np.linalg.norm(self._miss(index))) for index in self._reached]
         return FollowPlan(float(len(self.keys)), self._end, max(misses, default=0.0))
 
+    def planned_com(self, elapsed: float) -> None:
+        """Nothing: keys are of parts of the body."""
+
     def reached(self, trajectory: Trajectory, first: int, last: int) -> FollowReached:
         """The worst miss of all keys."""
         return FollowReached(self.planned().worst_miss)

@@ -54,6 +54,10 @@ class Hop:
         """What the jump aims at."""
         return self.jump.plan
 
+    def planned_com(self, elapsed: float) -> np.ndarray:
+        """That of the jump."""
+        return self.jump.planned_com(elapsed)
+
     def reached(self, trajectory: Trajectory, first: int, last: int) -> HopReached:
         """How near the feet came to the square."""
         return HopReached(self.miss(trajectory.positions[last]) / self.jump.target.distance)

@@ -47,6 +47,8 @@ FLAT = 0.7
 """Of the lean of the landing: what the body is not to be turned by at touch-down. It shears by so much less than its
 feet are ahead, and on its heels it would be thrown over them.
 """
+SETTLING = 0.3
+"""Of sqrt(H / g): when it begins to crouch."""
 BLEND = 0.3
 """Of sqrt(H / g): the time in which a phase's pose takes over from the last one's."""
 
@@ -128,6 +130,25 @@ class Jump:
         """What the jump aims at."""
         return self.plan
 
+    def planned_com(self, elapsed: float) -> np.ndarray:
+        """(3,) metres from where the centre of mass stood, ``elapsed`` seconds after the motion began; NaN after
+        touch-down."""
+        plan, ground = self.plan, self.ground
+        axes = ground.axes @ ground.turn(self.facing.turn) if self.left_ground else ground.axes
+        elapsed = max(elapsed - SETTLING * self._time_unit, 0.0)
+        nothing = np.zeros(3)
+        if elapsed <= plan.crouch_time:
+            return plan.crouch(nothing, elapsed)[0] @ axes
+        elapsed -= plan.crouch_time
+        if elapsed <= plan.thrust_time:
+            return plan.thrust(nothing, elapsed)[0] @ axes
+        position, _ = plan.thrust(nothing, plan.thrust_time)
+        elapsed -= plan.thrust_time
+        if elapsed > plan.flight_time:
+            return np.full(3, np.nan)
+        speed = np.array([plan.speed_forward, 0.0, plan.speed_up])
+        return (position + elapsed * speed - 0.5 * self.gravity * elapsed**2 * np.array([0.0, 0.0, 1.0])) @ axes
+
     def reached(self, trajectory: Trajectory, first: int, last: int) -> None:
         """Nothing beside what is measured of all motions."""
 
@@ -158,7 +179,7 @@ class Jump:
         seen = replace(seen, touching=seen.touching and seen.velocity[2] < 0.0)
         elapsed, plan = time - self._entered + 1e-9, self.plan
         following = {
-            JumpPhase.SETTLE: elapsed >= 0.3 * self._time_unit,
+            JumpPhase.SETTLE: elapsed >= SETTLING * self._time_unit,
             JumpPhase.CROUCH: elapsed >= plan.crouch_time,
             JumpPhase.THRUST: self._risen(seen, dt),
             JumpPhase.FLIGHT: self._flew and self._landed(seen),

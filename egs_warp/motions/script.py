@@ -36,9 +36,11 @@ class Script:
         names = {request.name for request in self.requests}
         return names.pop() if len(names) == 1 else "motions"
 
-    def frames(self) -> int:
-        """At 60 Hz, after which the script is cut off. Raises ``UserError`` for a bad file of key frames."""
-        return sum(request.repeat * REPERTOIRE[request.name].frames(request) for request in self.requests)
+    def frames(self, height: float = 1.0) -> int:
+        """At 60 Hz, after which the script is cut off, for a body of ``height`` metres: motions take longer as the root
+        of it. Raises ``UserError`` for a bad file."""
+        frames = sum(request.repeat * REPERTOIRE[request.name].frames(request) for request in self.requests)
+        return round(frames * max(1.0, height**0.5))
 
     def parts(self, height: float) -> list[Part]:
         """The motions in their order, for a body of ``height`` metres."""

@@ -89,6 +89,11 @@ class BodyMotion(Protocol):
         """What it aims at."""
         ...
 
+    def planned_com(self, elapsed: float) -> np.ndarray | None:
+        """(3,) metres from where the centre of mass stood to where it was planned to be ``elapsed`` seconds after the
+        motion began, before its first step; NaN where nothing was planned, None if nothing ever is."""
+        ...
+
     def reached(self, trajectory: Trajectory, first: int, last: int) -> DataclassInstance | None:
         """What it did beside what is measured of all motions; ``first`` and ``last`` are indices into ``time``."""
         ...

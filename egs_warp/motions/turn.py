@@ -52,6 +52,10 @@ class Turn:
         """What the first jump aims at, and how many there were."""
         return TurnPlan(**asdict(self.jumps[0].plan), jumps=float(len(self.jumps)))
 
+    def planned_com(self, elapsed: float) -> np.ndarray:
+        """That of the first jump; what the next ones make up is not known before."""
+        return self.jumps[0].planned_com(elapsed)
+
     def reached(self, trajectory: Trajectory, first: int, last: int) -> None:
         """Nothing beside what is measured of all motions."""
 

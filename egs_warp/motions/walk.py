@@ -206,6 +206,9 @@ class Walk:
         apart = prints[:, min(rounds, self.gait.paces) :] - prints[:, : -min(rounds, self.gait.paces)]
         return float(np.linalg.norm(apart, axis=2).max())
 
+    def planned_com(self, elapsed: float) -> None:
+        """Nothing: it goes on from the measured feet."""
+
     def notes(self) -> list[str]:
         """What kept the walk from its target, for the user."""
         found = []

@@ -143,7 +143,7 @@ def animate(
     options, shot = options or AnimateOptions(), shot or Shot()
     shot.check()
     asked = script(motion, **options.targets())
-    cut_off = asked.frames()
+    asked.frames()  # reads the files that it names
     ffmpeg_program()
     with run_folder(out, overwrite=overwrite, resume=resume) as run:
         with tqdm(desc="prepare", bar_format="{desc}, {elapsed}", disable=quiet) as bar:
@@ -166,7 +166,9 @@ def animate(
         if front is None:
             notes = (*notes, creature.front.told(creature.frame))
         notes = (*notes, *oddities(creature.cloud, creature.cage.mesh, creature.body.height))
-        with tqdm(total=options.frames or cut_off, desc="simulate", unit="frame", disable=quiet) as bar:
+        with tqdm(
+            total=options.frames or asked.frames(creature.body.height), desc="simulate", unit="frame", disable=quiet
+        ) as bar:
             performance = simulate(
                 creature,
                 asked,

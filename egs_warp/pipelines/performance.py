@@ -140,7 +140,7 @@ def simulate(
         creature.geometry,
         creature.start,
         watch,
-        frames=frames or round(share * motion.frames()),
+        frames=frames or round(share * motion.frames(creature.body.height)),
         step=step,
         place=creature.frame,
         parts=parts,

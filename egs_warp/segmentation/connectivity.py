@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.rows import distinct_rows
 
 _ARM = 1.5
 """Standard deviations: how far a Gaussian reaches to touch another."""
@@ -36,7 +37,7 @@ def connected_parts(
     owner = np.broadcast_to(np.arange(len(points))[:, None], (len(points), 7))
     counts = plane.heights(reached) > above
     voxel = np.floor((reached[counts] - points.min(axis=0)) / cell).astype(np.int64)
-    cells = np.unique(voxel, axis=0, return_inverse=True)[1].ravel()
+    _, cells = distinct_rows(voxel)
     count = len(points) + int(cells.max(initial=-1)) + 1
     links = coo_array((np.ones(len(cells), np.int8), (owner[counts], len(points) + cells)), shape=(count, count))
     return connected_components(links, directed=False)[1][: len(points)]

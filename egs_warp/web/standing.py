@@ -32,6 +32,10 @@ class Stand:
         """Whether it stands calmly."""
         return self._resting
 
+    def notes(self) -> list[str]:
+        """None: it has no target."""
+        return []
+
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
         seen = self.pose.measure(state, report)
@@ -61,7 +65,14 @@ class Stand:
 class Lie:
     """Relaxes its muscles."""
 
-    resting = True
+    @property
+    def resting(self) -> bool:
+        """Always."""
+        return True
+
+    def notes(self) -> list[str]:
+        """None: it has no target."""
+        return []
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         """None."""

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Protocol
 
 import numpy as np
 
@@ -20,7 +22,7 @@ from egs_warp.motions.carriage import carried_on
 from egs_warp.motions.repertoire import REPERTOIRE
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.script import Script, motion
-from egs_warp.motions.sequence import BodyMotion, Done, Part, Place
+from egs_warp.motions.sequence import Done, Part, Place
 from egs_warp.motions.stance import sole_shares
 from egs_warp.web.standing import Lie, Stand, tilt_degrees
 
@@ -48,6 +50,35 @@ class Task:
 
     part: Part
     request: MotionRequest
+
+
+class Posture(Enum):
+    """What a body is about."""
+
+    STANDING = "standing"
+    MOVING = "moving"
+    LYING = "lying"
+
+
+class _Steered(Protocol):
+    """A motion, as far as it is steered."""
+
+    @property
+    def resting(self) -> bool: ...
+
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]: ...
+
+    def notes(self) -> list[str]: ...
+
+
+@dataclass(frozen=True)
+class _Act:
+    """What it does now."""
+
+    name: str
+    """As the user reads it."""
+    motion: _Steered
+    posture: Posture
 
 
 def tasks_of(script: Script, height: float) -> list[Task]:
@@ -121,7 +152,7 @@ class Steering:
         """Stand at ``place``, and drop all else."""
         self.cancel()
         self.place = place
-        self._motion: BodyMotion | Stand | Lie = Stand(place)
+        self._act: _Act = _Act("stand", Stand(place), Posture.STANDING)
         self._tilted_since: float | None = None
 
     def perform(self, script: Script) -> None:
@@ -142,9 +173,7 @@ class Steering:
     @property
     def doing(self) -> str:
         """Name of the motion."""
-        if isinstance(self._motion, Stand):
-            return "stand"
-        return "fallen" if isinstance(self._motion, Lie) else self.begun[-1].name
+        return self._act.name
 
     @property
     def queued(self) -> str | None:
@@ -154,7 +183,7 @@ class Steering:
     @property
     def idle(self) -> bool:
         """Whether it stands or lies, and nothing is to come."""
-        return isinstance(self._motion, Stand | Lie) and self._motion.resting and self.queued is None
+        return self._act.posture is not Posture.MOVING and self._act.motion.resting and self.queued is None
 
     @property
     def goal(self) -> np.ndarray | None:
@@ -169,13 +198,13 @@ class Steering:
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``, from the motion whose turn it is."""
         if self._has_fallen(state):
-            if not isinstance(self._motion, Lie):
-                self._motion = Lie()
+            if self._act.posture is not Posture.LYING:
+                self._act = _Act("fallen", Lie(), Posture.LYING)
                 self._tell("it has fallen; Backspace stands it up again")
             self.cancel()
-        elif self._motion.resting:
+        elif self._act.motion.resting:
             self._begin_next(state)
-        return self._motion.objectives(state, report, dt)
+        return self._act.motion.objectives(state, report, dt)
 
     def _begin_next(self, state: BodyState) -> None:
         place = self.place.now(state.positions)
@@ -188,19 +217,18 @@ class Steering:
             task = begun = None
         if task is None or begun is None:
             self._journey = None
-            if not isinstance(self._motion, Stand):
+            if self._act.posture is not Posture.STANDING:
                 self._say_notes()
-                self._motion = Stand(place)
+                self._act = _Act("stand", Stand(place), Posture.STANDING)
             return
         self._say_notes()
-        self._motion = begun
+        self._act = _Act(task.part.name, begun, Posture.MOVING)
         self.begun.append(Done(task.part.name, task.part.asked, begun, state.time))
         self.requests.append(task.request)
 
     def _say_notes(self) -> None:
-        if not isinstance(self._motion, Stand | Lie):
-            for note in self._motion.notes():
-                self._tell(f"{self.doing}: {note}")
+        for note in self._act.motion.notes():
+            self._tell(f"{self.doing}: {note}")
 
     def _has_fallen(self, state: BodyState) -> bool:
         if tilt_degrees(self.place, state.positions) <= FALLEN:

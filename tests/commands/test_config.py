@@ -18,6 +18,7 @@ from egs_warp.errors import UserError
 from egs_warp.io import write_ply
 
 
+@pytest.mark.usefixtures("coarse")
 def test_a_run_from_its_file_has_the_same_bits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=4000).cloud)
     flags = ["--up", "z", "--frames", "4", "--size", "48x32", "--camera", "follow", "--background", "#204060"]
@@ -34,6 +35,7 @@ def test_a_run_from_its_file_has_the_same_bits(tmp_path: Path, capsys: pytest.Ca
     assert yaml.safe_load((tmp_path / "c" / "run.yaml").read_text())["frames"] == 2
 
 
+@pytest.mark.usefixtures("coarse")
 def test_a_run_that_is_interrupted_has_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is there as soon as a step of the simulation is; bad input that shows before leaves nothing."""
     write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=4000).cloud)

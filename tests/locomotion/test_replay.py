@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
@@ -60,9 +61,19 @@ def uninterrupted() -> Simulation:
 BODIES = {"jump": block, "walk 0.1": walker}
 
 
-def cut_off(parts: Path) -> None:
+@pytest.fixture(scope="module")
+def cut_off_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What is left of a jump that was cut off."""
+    parts = tmp_path_factory.mktemp("cut") / "parts"
     with pytest.raises(KilledError):
         run(block(), killed_at=CUT, parts=lambda: parts)
+    return parts
+
+
+@pytest.fixture
+def cut_off(cut_off_once: Path, tmp_path: Path) -> Path:
+    """The same, for one test alone."""
+    return shutil.copytree(cut_off_once, tmp_path / "parts")
 
 
 def same_steps(one: tuple[StepReport, ...], other: tuple[StepReport, ...]) -> bool:
@@ -77,13 +88,17 @@ def same_steps(one: tuple[StepReport, ...], other: tuple[StepReport, ...]) -> bo
 
 
 @pytest.mark.parametrize("script", ["jump", pytest.param("walk 0.1", marks=pytest.mark.slow)])
-def test_a_run_goes_on_to_the_same_bits(script: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_goes_on_to_the_same_bits(
+    script: str, cut_off: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Only what had not been written down is solved, by a body that is made anew."""
-    body = BODIES[script]
+    body, folder = BODIES[script], cut_off
     whole = uninterrupted() if script == "jump" else run(body(), script)
-    with pytest.raises(KilledError):
-        run(body(), script, killed_at=CUT, parts=lambda: tmp_path)
-    parts = sorted(os.listdir(tmp_path))
+    if script != "jump":
+        folder = tmp_path / script
+        with pytest.raises(KilledError):
+            run(body(), script, killed_at=CUT, parts=lambda: folder)
+    parts = sorted(os.listdir(folder))
     assert parts[:3] == ["start.npz", "steps-000000.npz", "steps-000001.npz"]
     solved: list[float] = []
     advance = LocomotionStepper.advance
@@ -93,7 +108,7 @@ def test_a_run_goes_on_to_the_same_bits(script: str, tmp_path: Path, monkeypatch
         return advance(stepper, state, *rest)
 
     monkeypatch.setattr(LocomotionStepper, "advance", counted)
-    resumed = run(body(), script, parts=lambda: tmp_path, resume=tmp_path)
+    resumed = run(body(), script, parts=lambda: folder, resume=folder)
     assert len(solved) == len(whole.reports) - 10 * (len(parts) - 1)
     assert same_steps(resumed.reports, whole.reports)
     assert (resumed.frames == whole.frames).all()
@@ -101,7 +116,7 @@ def test_a_run_goes_on_to_the_same_bits(script: str, tmp_path: Path, monkeypatch
         assert np.array_equal(getattr(resumed.trajectory, name), getattr(whole.trajectory, name)), name
     # One that was cut off after its last step, too.
     solved.clear()
-    again = run(body(), script, parts=lambda: tmp_path, resume=tmp_path)
+    again = run(body(), script, parts=lambda: folder, resume=folder)
     assert same_steps(again.reports, whole.reports) and solved == []
 
 
@@ -120,30 +135,28 @@ def test_parts_of_divided_steps_are_put_together_again(tmp_path: Path) -> None:
     assert found[1][0].milliseconds == reports[1].milliseconds
 
 
-def test_another_run_is_refused(tmp_path: Path) -> None:
-    cut_off(tmp_path)
+def test_another_run_is_refused(cut_off: Path) -> None:
     other = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.01)), forward=FORWARD)
     for made, script in ((other, "jump"), (block(), "jump 0.6")):
         with pytest.raises(UserError, match="does not fit the run that is to go on: capture, flags, program or"):
-            run(made, script, parts=lambda: tmp_path, resume=tmp_path)
+            run(made, script, parts=lambda: cut_off, resume=cut_off)
 
 
-def test_a_damaged_part_is_told_and_can_be_left_out(tmp_path: Path) -> None:
-    cut_off(tmp_path)
-    second = tmp_path / "steps-000001.npz"
+def test_a_damaged_part_is_told_and_can_be_left_out(cut_off: Path) -> None:
+    second = cut_off / "steps-000001.npz"
     good = second.read_bytes()
     for bad in (good[:-40], good[: len(good) // 2] + b"\x55" + good[len(good) // 2 + 1 :], b"", b"text"):
         second.write_bytes(bad)
         with pytest.raises(UserError, match=r"steps-000001\.npz: is damaged \(.*\); remove it and the parts after it"):
-            run(block(), parts=lambda: tmp_path, resume=tmp_path)
+            run(block(), parts=lambda: cut_off, resume=cut_off)
     second.unlink()
-    assert same_steps(run(block(), parts=lambda: tmp_path, resume=tmp_path).reports, uninterrupted().reports)
-    (tmp_path / "steps-000000.npz").unlink()
+    assert same_steps(run(block(), parts=lambda: cut_off, resume=cut_off).reports, uninterrupted().reports)
+    (cut_off / "steps-000000.npz").unlink()
     with pytest.raises(UserError, match=r"steps-000000\.npz: is missing; remove the parts after it to go on"):
-        run(block(), parts=lambda: tmp_path, resume=tmp_path)
-    (tmp_path / "start.npz").unlink()
+        run(block(), parts=lambda: cut_off, resume=cut_off)
+    (cut_off / "start.npz").unlink()
     with pytest.raises(UserError, match=r"start\.npz: is missing; begin the run again"):
-        run(block(), parts=lambda: tmp_path, resume=tmp_path)
+        run(block(), parts=lambda: cut_off, resume=cut_off)
 
 
 def test_a_disk_that_is_full_at_a_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

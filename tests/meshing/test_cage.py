@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import warp as wp
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from egs_warp.assets import pawn
+from egs_warp.assets import BuiltInObject, pawn
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
@@ -71,10 +72,20 @@ def _digest(mesh: TetMesh) -> str:
     return hashlib.sha256(mesh.nodes.tobytes() + mesh.tets.tobytes()).hexdigest()
 
 
+@cache
+def _made(gaussian_count: int, device: str) -> tuple[BuiltInObject, Cage]:
+    thing = pawn(gaussian_count=gaussian_count, device=device)
+    return thing, build_cage(thing.cloud, thing.plane)
+
+
+def _pawn_cage(gaussian_count: int, device: str | None = None) -> tuple[BuiltInObject, Cage]:
+    """A pawn and its cage, made once for all tests that look at it."""
+    return _made(gaussian_count, device or str(wp.get_device()))
+
+
 def test_pawn_cage(device: str) -> None:
     """The built-in pawn: all promises, on every device."""
-    thing = pawn(device=device)
-    cage = build_cage(thing.cloud, thing.plane)
+    thing, cage = _pawn_cage(22000, device)
     _check(cage, thing.plane)
     assert cage.method is CageMethod.VOXEL
     assert cage.height(thing.plane) == pytest.approx(1.0, abs=0.04)
@@ -94,8 +105,7 @@ def test_same_bits_in_another_process() -> None:
         "print('digest', hashlib.sha256(m.nodes.tobytes() + m.tets.tobytes()).hexdigest())"
     )
     other = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    thing = pawn()
-    assert f"digest {_digest(build_cage(thing.cloud, thing.plane).mesh)}" in other.stdout
+    assert f"digest {_digest(_pawn_cage(22000)[1].mesh)}" in other.stdout
 
 
 @pytest.mark.data
@@ -115,8 +125,7 @@ def test_real_captures(data_dir: Path, name: str, up: tuple[int, int, int]) -> N
 @pytest.mark.parametrize("scale", [0.1, 3.0])
 def test_scale_free(scale: float) -> None:
     """The cage of the scaled object is the scaled cage."""
-    thing = pawn(gaussian_count=6000)
-    cage = build_cage(thing.cloud, thing.plane)
+    thing, cage = _pawn_cage(6000)
     scaled = build_cage(thing.cloud.scaled(scale), thing.plane.scaled(scale))
     assert abs(len(scaled.mesh.nodes) - len(cage.mesh.nodes)) < 0.05 * len(cage.mesh.nodes)
     assert scaled.mesh.volumes().sum() == pytest.approx(scale**3 * cage.mesh.volumes().sum(), rel=0.01)
@@ -184,7 +193,7 @@ def test_degenerate_objects(points: np.ndarray, message: str) -> None:
 
 def test_target_nodes() -> None:
     """More nodes are given when asked; nonsense is refused."""
-    thing = pawn(gaussian_count=6000)
+    thing, _ = _pawn_cage(6000)
     cage = build_cage(thing.cloud, thing.plane, target_nodes=1200)
     assert len(cage.mesh.nodes) == pytest.approx(1200, rel=0.15)
     with pytest.raises(UserError, match="cage: 3 nodes asked; give a number from 50 to 20000"):
@@ -196,11 +205,10 @@ def test_tetwild(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file behind.
     """
     monkeypatch.chdir(tmp_path)
-    thing = pawn(gaussian_count=6000)
+    thing, lattice = _pawn_cage(6000)
     cage = build_cage(thing.cloud, thing.plane, method=CageMethod.TETWILD)
     _check(cage, thing.plane)
     assert cage.method is CageMethod.TETWILD
-    lattice = build_cage(thing.cloud, thing.plane)
     assert cage.mesh.volumes().sum() == pytest.approx(lattice.mesh.volumes().sum(), rel=0.1)
     assert not np.array_equal(cage.mesh.tets, lattice.mesh.tets)
     assert not list(tmp_path.iterdir())
@@ -209,10 +217,10 @@ def test_tetwild(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_where_tetwild_fails_the_lattice_stands_in(monkeypatch: pytest.MonkeyPatch) -> None:
     """The cage says who made it."""
     monkeypatch.setattr("egs_warp.meshing.cage.tetwild", lambda *_: None)
-    thing = pawn(gaussian_count=6000)
+    thing, lattice = _pawn_cage(6000)
     cage = build_cage(thing.cloud, thing.plane, method=CageMethod.TETWILD)
     assert cage.method is CageMethod.VOXEL
-    assert np.array_equal(cage.mesh.tets, build_cage(thing.cloud, thing.plane).mesh.tets)
+    assert np.array_equal(cage.mesh.tets, lattice.mesh.tets)
 
 
 @settings(max_examples=25, deadline=None)

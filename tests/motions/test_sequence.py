@@ -58,6 +58,9 @@ class Waits:
     def reached(self, trajectory: Trajectory, first: int, last: int) -> None:
         return None
 
+    def planned_com(self, elapsed: float) -> None:
+        return None
+
     def notes(self) -> list[str]:
         return []
 
@@ -108,3 +111,4 @@ def test_a_script_becomes_parts(place: Place) -> None:
     jump = parts[4].begin(place)
     assert isinstance(jump, Jump) and jump.target.distance == pytest.approx(0.5 * place.body.height)
     assert script.frames() == 3 * motion("hop").frames() + motion("twist, jump x2").frames()
+    assert script.frames(4.0) == 2 * script.frames() and script.frames(0.1) == script.frames()

@@ -7,13 +7,15 @@ import json
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace as replaced
+from functools import cache
 from itertools import count
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
-from egs_warp.assets import pawn
+from egs_warp.assets import BuiltInObject, pawn
 from egs_warp.errors import UserError
 from egs_warp.io.run_folder import MANIFEST
 from egs_warp.locomotion.trajectory import Trajectory
@@ -29,10 +31,16 @@ FILES = ["cage.vtu", "creature.npz", "jump.mp4", MANIFEST, "plots.png", "report.
 OPTIONS = AnimateOptions(frames=1, size=32, friction=0.6)
 
 
+@cache
+def thing() -> BuiltInObject:
+    """A pawn of few Gaussians."""
+    return pawn(gaussian_count=2000, device="cpu")
+
+
 @pytest.fixture(scope="module")
 def performance() -> Performance:
-    thing = pawn(device="cpu")
-    creature = make_creature(thing.cloud, plane=thing.plane, friction=0.6)
+    """One frame of a coarse pawn."""
+    creature = make_creature(thing().cloud, plane=thing().plane, friction=0.6, nodes=120)
     return simulate(creature, motion("jump"), frames=1)
 
 
@@ -41,10 +49,9 @@ def run(performance: Performance, monkeypatch: pytest.MonkeyPatch) -> Callable[.
     """``animate`` without the seconds before its first file."""
     monkeypatch.setattr("egs_warp.pipelines.animate.make_creature", lambda *_, **__: performance.creature)
     monkeypatch.setattr("egs_warp.pipelines.animate.simulate", lambda *_, **__: performance)
-    thing = pawn(device="cpu")
 
     def animated(out: Path, *, overwrite: bool = False) -> Report:
-        return animate(thing.cloud, out, plane=thing.plane, options=OPTIONS, quiet=True, overwrite=overwrite)
+        return animate(thing().cloud, out, plane=thing().plane, options=OPTIONS, quiet=True, overwrite=overwrite)
 
     return animated
 
@@ -58,7 +65,7 @@ def test_a_run_holds_what_was_asked_and_its_manifest(run: Callable[..., Report],
     assert sorted(os.listdir(tmp_path)) == FILES and finished(tmp_path)
     asked = json.loads((tmp_path / "report.json").read_text())["asked"]
     assert asked["friction"] == 0.6 and asked["size"] == 32 and asked["frames"] == 1 and asked["up"] is None
-    assert asked["plane"] == pytest.approx([*pawn(device="cpu").plane.normal, pawn(device="cpu").plane.offset])
+    assert asked["plane"] == pytest.approx([*thing().plane.normal, thing().plane.offset])
     assert verdict(report.audit).startswith("audit: passed (momentum_residual ")
     energy = json.loads((tmp_path / "report.json").read_text())["energy"]
     assert energy["gained"] == pytest.approx(sum(energy["flows"].values()), abs=1e-9)
@@ -118,8 +125,9 @@ def test_a_disk_that_is_full_at_any_file(
 ) -> None:
     """Each renaming fails once in turn: one line, no temporary file, and what is there is not called finished.
 
-    The next run moves it aside.
+    The next run moves it aside. Thirty plots would take half a minute to draw.
     """
+    monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"plots"))
     replace, failures = os.replace, 0
     for number in range(100):
         folder, calls = tmp_path / str(number), count()

@@ -12,7 +12,7 @@ from egs_warp.errors import ArgumentError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
-from egs_warp.pipelines.creature import face, make_creature, stand
+from egs_warp.pipelines.creature import Standing, face, make_creature, stand
 from egs_warp.pipelines.front import Front, mean_view
 from tests.support.frames import Lying
 
@@ -21,10 +21,9 @@ DOWN = np.array([0.0, -1.0, 0.0])
 
 
 def front_of(
-    lying: Lying, front: np.ndarray | None = None, seen_from: np.ndarray | None = None
+    standing: Standing, front: np.ndarray | None = None, seen_from: np.ndarray | None = None
 ) -> tuple[Front, np.ndarray]:
     """The front, and its direction in the capture."""
-    standing = stand(lying.cloud, plane=lying.plane, nodes=200)
     found = face(standing, front, seen_from=seen_from)
     return found, standing.frame.axes.T @ found.direction
 
@@ -38,16 +37,22 @@ def thing(request: pytest.FixtureRequest) -> BuiltInObject:
     return request.param(gaussian_count=6000)
 
 
+@pytest.fixture(scope="module")
+def standing(thing: BuiltInObject) -> Standing:
+    """As its file lies."""
+    return stand(thing.cloud, plane=thing.plane, nodes=200)
+
+
 @pytest.mark.parametrize("turn", [None, [0.7, -1.1, 0.4]])
 def test_a_bear_looks_where_its_face_is_and_a_stool_away_from_its_back(
-    thing: BuiltInObject, turn: list[float] | None
+    thing: BuiltInObject, standing: Standing, turn: list[float] | None
 ) -> None:
     """However the file lies; the line tells the direction in the file, and why."""
-    lying, way = Lying(thing.cloud, thing.plane), DOWN
+    way = DOWN
     if turn is not None:
         axes = Rotation.from_rotvec(turn).as_matrix()
-        lying, way = lying.turned(axes), axes @ DOWN
-    standing = stand(lying.cloud, plane=lying.plane, nodes=200)
+        lying, way = Lying(thing.cloud, thing.plane).turned(axes), axes @ DOWN
+        standing = stand(lying.cloud, plane=lying.plane, nodes=200)
     found = face(standing)
     assert degrees(standing.frame.axes.T @ found.direction, way) < 8.0
     told = found.told(standing.frame)
@@ -78,13 +83,14 @@ def plain_box(width: float, depth: float) -> Lying:
 def test_what_was_photographed_from_one_side_shows_its_front_there() -> None:
     """A box that says nothing itself."""
     box = plain_box(0.9, 0.5)
+    standing = stand(box.cloud, plane=box.plane, nodes=200)
     for side in (1.0, -1.0):
         way = side * np.array([0.0, 1.0, 0.0])
         cameras = [
             Camera.look_at(5.0 * (way + [x, 0.0, 0.3]), np.zeros(3), np.array([0.0, 0.0, 1.0]), width=8, height=8)
             for x in (-0.6, 0.0, 0.6)
         ]
-        found, front = front_of(box, seen_from=mean_view(cameras, np.zeros(3)))
+        found, front = front_of(standing, seen_from=mean_view(cameras, np.zeros(3)))
         assert degrees(front, way) < 15.0
         assert "was photographed from there" in str(found.reason)
 
@@ -98,8 +104,8 @@ def test_cameras_all_around_say_nothing() -> None:
     assert mean_view([], np.zeros(3)) is None
 
 
-def test_front_is_as_given_along_the_ground(thing: BuiltInObject) -> None:
-    found, front = front_of(Lying(thing.cloud, thing.plane), np.array([1.0, 1.0, 3.0]))
+def test_front_is_as_given_along_the_ground(standing: Standing) -> None:
+    found, front = front_of(standing, np.array([1.0, 1.0, 3.0]))
     np.testing.assert_allclose(front, np.array([1.0, 1.0, 0.0]) / np.sqrt(2.0), atol=1e-12)
     assert found.reason is None
 

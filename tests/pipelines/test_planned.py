@@ -49,9 +49,17 @@ def test_a_jump_s_plan_crouches_rises_as_asked_and_ends_at_touch_down() -> None:
     assert path[known][-1] @ jump.ground.axes[0] > 0.5 * jump.target.distance
 
 
+@pytest.mark.parametrize("name", ["hop", "twist 90"])
+def test_hops_and_twists_have_the_plan_of_their_jump(name: str) -> None:
+    sequence, t, start = standing(name, 2.5)
+    path = planned_com(sequence, block_place().body, t) - start
+    height = sequence.done[0].asked["height"] * block_place().body.height
+    assert np.nanmax(path[:, 2]) == pytest.approx(height, rel=0.15) and np.isnan(path[-1]).all()
+
+
 def test_motions_without_a_plan_of_the_centre_of_mass_tell_none() -> None:
     place = block_place()
     sequence = MotionSequence(place, [])
-    sequence.done.append(Done("stand", {}, cast(BodyMotion, SimpleNamespace()), 0.0))
+    sequence.done.append(Done("stand", {}, cast(BodyMotion, SimpleNamespace(planned_com=lambda elapsed: None)), 0.0))
     _, t, _ = standing("jump", 0.1)
     assert planned_com(sequence, place.body, t).shape == (0, 3)

@@ -147,13 +147,15 @@ def test_ground_that_is_not_flat_goes_along_with_the_parts(tmp_path: Path, monke
         else:
             nodes = ground.nodes().reshape(-1, 3)
             assert np.abs(told["ground"].heights(nodes)).max() < 1e-3
-    creature = make_creature(prepared.object, ground=ground, nodes=120)
+    # Stiff: its own sag, 0.033 of its height on a coarse cage where 0.05 are asked, would hide a fall of 0.017.
+    creature = make_creature(prepared.object, ground=ground, sag=0.01, nodes=120)
     body, start = creature.body, creature.start.positions
     assert creature.geometry.field is not None
-    # It touches the ground where it was captured, and sinks no more than it sags. A ball on the slope of a fold rolls:
-    # on the folds themselves its middle goes 0.075 aside.
+    # It touches the ground where it was captured, and sinks by 0.015; where the ground is not raised to it, it hangs
+    # 0.017 above and sinks by 0.027. A ball on the slope of a fold rolls: on the folds themselves its middle goes 0.075
+    # aside.
     assert abs(creature.stepper.detector.gaps(body.mesh.nodes)[0].min()) < 0.005 * body.height
-    assert abs((body.centre_of_mass(start) - body.centre_of_mass(body.mesh.nodes))[2]) < 0.03 * body.height
+    assert abs((body.centre_of_mass(start) - body.centre_of_mass(body.mesh.nodes))[2]) < 0.02 * body.height
     assert creature.stepper.detector.gaps(start)[0].min() > -0.01 * body.height
 
 

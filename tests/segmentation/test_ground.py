@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -70,19 +71,41 @@ def test_the_object_goes_down_to_the_ground(located: LocatedPlane, folds: tuple[
     assert (found & ~truth).sum() <= 0.03 * truth.sum()
 
 
-def test_flat_ground_stays_a_plane() -> None:
-    cloud, truth = on_folds(0.002)
+@pytest.fixture(scope="module")
+def flat() -> tuple[GaussianCloud, np.ndarray]:
+    """The ball on a cloth that is all but flat."""
+    return on_folds(0.002)
+
+
+@pytest.fixture(scope="module")
+def on_flat(flat: tuple[GaussianCloud, np.ndarray]) -> tuple[LocatedPlane, LocatedPlane, MeasuredGround]:
+    """The plane, what becomes of it on its ground, and what was measured for that."""
+    cloud, _ = flat
     located = LocatedPlane(LEVEL, None, np.array([0.0, 0.0, 0.5]), 1.7, segment(cloud, LEVEL, BALL), ())
-    same = on_its_ground(cloud, located, BALL)
+    seen: list[MeasuredGround] = []
+
+    def noted(*given: Any, **named: Any) -> MeasuredGround:
+        seen.append(measure_ground(*given, **named))
+        return seen[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("egs_warp.pipelines.locate_plane.measure_ground", noted)
+        same = on_its_ground(cloud, located, BALL)
+    (measured,) = seen
+    return located, same, measured
+
+
+def test_flat_ground_stays_a_plane(on_flat: tuple[LocatedPlane, LocatedPlane, MeasuredGround]) -> None:
+    located, same, measured = on_flat
     assert same is located
-    measured = measure_ground(cloud, truth, LEVEL, centre=located.centre, size=located.size)
     assert measured.roughness < 4e-3 and measured.known.sum() > 500
 
 
-def test_roughness_that_views_do_not_agree_on_is_no_ground() -> None:
+def test_roughness_that_views_do_not_agree_on_is_no_ground(
+    flat: tuple[GaussianCloud, np.ndarray], on_flat: tuple[LocatedPlane, LocatedPlane, MeasuredGround]
+) -> None:
     """A tenth of the height, seen by views that differ by a twentieth; and what no view shows."""
-    cloud, truth = on_folds(0.002)
-    measured = measure_ground(cloud, truth, LEVEL, centre=np.array([0.0, 0.0, 0.5]), size=1.7)
+    (cloud, truth), (_, _, measured) = flat, on_flat
     assert measured.is_flat(1.0)
     assert replace(measured, roughness=0.1, noise=0.05).is_flat(1.0)
     assert not replace(measured, roughness=0.1, noise=0.01).is_flat(1.0)

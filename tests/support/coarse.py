@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from unittest.mock import patch
 
@@ -13,7 +15,19 @@ from egs_warp.pipelines.creature import make_creature
 NODES = 60
 """Where ``EGS_WARP_TEST_NODES`` does not say otherwise."""
 
-if __name__ == "__main__":
-    nodes = int(os.environ.get("EGS_WARP_TEST_NODES", NODES))
+
+@contextmanager
+def coarse_cages(nodes: int) -> Iterator[None]:
+    """``animate`` gives bodies about ``nodes`` nodes."""
     with patch("egs_warp.pipelines.animate.make_creature", partial(make_creature, nodes=nodes)):
-        sys.exit(main())
+        yield
+
+
+def coarse_main(arguments: Sequence[str] | None = None) -> int:
+    """``egs-warp`` with these arguments, the process's own if there are none; its exit status."""
+    with coarse_cages(int(os.environ.get("EGS_WARP_TEST_NODES", NODES))):
+        return main(arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(coarse_main())

@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -76,7 +77,8 @@ def test_other_hosts_and_origins_are_refused(server: PageServer):
 def _socket(server: PageServer, origin: str | None = "own"):
     own = f"http://127.0.0.1:{server.port}"
     address = f"ws://127.0.0.1:{server.port}/{server.token}/live"
-    return connect(address, origin=own if origin == "own" else origin, max_size=None, compression=None)  # pyright: ignore[reportArgumentType]
+    sender: Any = own if origin == "own" else origin
+    return connect(address, origin=sender, max_size=None, compression=None)
 
 
 def _taken_up_again(server: PageServer) -> bool:

@@ -33,11 +33,12 @@ def test_a_pushed_body_comes_back_over_its_feet(tmp_path: Path):
     pushed = body.centre_of_mass(played.session.state.positions)
     assert pushed[0] - start[0] > 0.01 * body.height
     played.ask("release")
-    played.step(90)
+    played.step(36)
     feet_moved = played.session.steering.place.now(played.session.state.positions).ground.origin
     over = body.centre_of_mass(played.session.state.positions)[:2] - feet_moved[:2]
-    assert np.linalg.norm(over) < 0.02 * body.height
-    assert tilt_degrees(first_place(played.session.creature), played.session.state.positions) < 3.0
+    # Measured: 0.011 and 1.5 degrees; 0.024 and 3.3 a sixth of a second after it is let go.
+    assert np.linalg.norm(over) < 0.015 * body.height
+    assert tilt_degrees(first_place(played.session.creature), played.session.state.positions) < 2.0
 
 
 def test_one_that_is_thrown_over_lies_relaxed_and_stands_up_when_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

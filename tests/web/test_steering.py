@@ -27,14 +27,16 @@ def test_what_is_asked_meanwhile_takes_the_place_of_what_was_to_come(tmp_path: P
     played.until(lambda: played.session.steering.doing == "twist")
     assert [entry.name for entry in played.session.steering.begun] == ["jump", "twist"]
     played.ask("motion", text="hop")
+    assert played.session.steering.queued == "hop"
     played.ask("cancel")
-    played.until_idle()
+    played.step()
+    assert (played.session.steering.doing, played.session.steering.queued) == ("twist", None)
     assert [entry.name for entry in played.session.steering.begun] == ["jump", "twist"]
 
 
 def test_a_motion_that_the_body_cannot_do_is_told(tmp_path: Path):
     played = Played(coarse_pawn(), tmp_path)
-    played.ask("motion", text="walk to 9,9, jump")
+    played.ask("motion", text="walk to 9,9 0.01, jump")
     played.step()
     assert played.told == ["walk: the way takes more than 400 paces; choose a shorter one"]
     assert played.session.steering.idle or played.session.steering.doing == "stand"

@@ -67,6 +67,16 @@ def test_its_script_repeats_its_motions_alone(take: tuple[Played, Path]):
     assert motion(str(take[1] / "script.json")) == motion("jump 0.2 0.15")
 
 
+def test_a_script_of_all_that_it_did_is_told(take: tuple[Played, Path], tmp_path: Path):
+    played = Played(coarse_pawn(), tmp_path)
+    played.ask("script")
+    assert played.news[-1] == {"type": "script", "text": "[\n\n]\n", "motions": 0}
+    take[0].ask("script")
+    told, path = take[0].news[-1], tmp_path / "script.json"
+    path.write_text(str(told["text"]))
+    assert told["motions"] == 2 and motion(str(path)) == motion("twist 20 0 0.1, jump 0.2 0.15")
+
+
 def test_a_pull_is_noted_and_a_second_take_is_another_folder(tmp_path: Path):
     played = Played(coarse_pawn(), tmp_path)
     for _ in range(2):

@@ -33,7 +33,11 @@ export class Cage {
       const [a, b, c, d, e, f, g, h, i] = m;
       const [A, B, C] = [e * i - f * h, f * g - d * i, d * h - e * g];
       const determinant = a * A + b * B + c * C;
-      const inverse = [A, c * h - b * i, b * f - c * e, B, a * i - c * g, c * d - a * f, C, b * g - a * h, a * e - b * d];
+      const inverse = [
+        ...[A, c * h - b * i, b * f - c * e],
+        ...[B, a * i - c * g, c * d - a * f],
+        ...[C, b * g - a * h, a * e - b * d],
+      ];
       for (let k = 0; k < 9; k++) this.inverses[9 * t + k] = (inverse[k] as number) / determinant;
       const start = 3 * (tets[4 * t] as number);
       for (let k = 0; k < 3; k++) this.maps[16 * t + 12 + k] = rest[start + k] as number;

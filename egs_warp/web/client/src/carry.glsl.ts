@@ -66,7 +66,8 @@ vec3 egsColour(sampler2D bands, sampler2D scales, int index, int degree, vec3 d)
   return c;
 }
 
-/* Light that the creature leaves to a splat of the ground at p; place: middle of the shadow, half its side, body height. */
+/* Light that the creature leaves to a splat of the ground at p; place: middle of the shadow, half its side,
+   body height. */
 float egsLight(sampler2D shade, vec4 place, vec3 p) {
   vec2 uv = 0.5 + 0.5 * (p.xy - place.xy) / place.z;
   float near = 1.0 - smoothstep(0.02, 0.08, abs(p.z) / place.w);
@@ -79,7 +80,9 @@ float egsLight(sampler2D shade, vec4 place, vec3 p) {
   return 1.0 - 0.05 * dark * near;
 }
 
-CovSplat egsCarried(int index, sampler2D splats, sampler2D arms, sampler2D bands, sampler2D scales, sampler2D cage, sampler2D shade, vec4 shadePlace, vec3 eye, int degree) {
+CovSplat egsCarried(
+    int index, sampler2D splats, sampler2D arms, sampler2D bands, sampler2D scales, sampler2D cage, sampler2D shade,
+    vec4 shadePlace, vec3 eye, int degree) {
   vec4 a = egsTexel(splats, 4 * index), q = egsTexel(splats, 4 * index + 1);
   vec4 s = egsTexel(splats, 4 * index + 2), colour = egsTexel(splats, 4 * index + 3);
   vec3 mean = a.xyz;

@@ -37,14 +37,17 @@ export class LiveClock {
     const { frames } = this;
     const newest = frames.at(-1) as Frame;
     const before = frames.at(-2);
-    if (before === undefined || this.time > newest.time || this.time < (frames[0] as Frame).time) this.time = newest.time;
+    const outside = this.time > newest.time || this.time < (frames[0] as Frame).time;
+    if (before === undefined || outside) this.time = newest.time;
     if (before !== undefined && leaps(before, newest)) this.time = newest.time;
     const last = this.arrivals.at(-1);
     if (last !== undefined && wall - last.wall > 2) this.hold();
     this.arrivals.push({ wall, time: newest.time });
     while (this.arrivals.length > 2 && wall - this.arrivals[0]!.wall > MEMORY) this.arrivals.shift();
     const first = this.arrivals[0]!;
-    if (wall - first.wall > 0.2) this.speed = Math.min(Math.max((newest.time - first.time) / (wall - first.wall), SLOWEST), 1.05);
+    if (wall - first.wall > 0.2) {
+      this.speed = Math.min(Math.max((newest.time - first.time) / (wall - first.wall), SLOWEST), 1.05);
+    }
     else if (this.speed === 0 && before !== undefined) this.speed = 0.2;
     if (frames.length > KEPT + 60) frames.splice(0, frames.length - KEPT);
     this.find();
@@ -61,8 +64,8 @@ export class LiveClock {
     if (newest === undefined || this.time >= newest.time) return false;
     const ahead = newest.time - this.time;
     const wanted = this.speed * this.delay();
-    // Slower with little ahead; with much hardly faster: in the air steps are quick, and what they gain bridges the slow
-    // ones on the ground.
+    // Slower with little ahead; with much hardly faster: in the air steps are quick, and what they gain bridges the
+    // slow ones on the ground.
     const speed =
       ahead < wanted
         ? this.speed * Math.max(ahead / wanted, 0.15)

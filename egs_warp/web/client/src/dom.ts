@@ -25,17 +25,22 @@ const ICONS = {
   right: '<path d="M15 4l4.5 4.5L15 13M19 8.5h-8a6 6 0 0 0 0 12h4" stroke-linejoin="round"/>',
   jump: '<path d="M5 20h14M12 16V4M7.5 8.5L12 4l4.5 4.5" stroke-linejoin="round"/>',
   leap: '<path d="M4 19c2-14 13-16 16-3M16.5 13.5L20 16.5l1.5-4.5" stroke-linejoin="round"/>',
-  sliders: '<path d="M4 7h9M18 7h2M4 17h2M11 17h9"/><circle cx="15.5" cy="7" r="2.3"/><circle cx="8.5" cy="17" r="2.3"/>',
+  sliders:
+    '<path d="M4 7h9M18 7h2M4 17h2M11 17h9"/><circle cx="15.5" cy="7" r="2.3"/><circle cx="8.5" cy="17" r="2.3"/>',
   script: '<path d="M6 3.5h9l4 4V20.5H6zM9.5 11h6M9.5 14.5h6" stroke-linejoin="round"/>',
-  stand: '<path d="M12 21V9M8 21h8"/><circle cx="12" cy="5.5" r="2.5"/><path d="M7 13l5-3 5 3" stroke-linejoin="round"/>',
-  help: '<circle cx="12" cy="12" r="8.5"/><path d="M9.5 9.5a2.5 2.5 0 1 1 3.5 2.3c-.7.3-1 .8-1 1.7M12 16.5v.01" stroke-linecap="round"/>',
+  stand:
+    '<path d="M12 21V9M8 21h8"/><circle cx="12" cy="5.5" r="2.5"/><path d="M7 13l5-3 5 3" stroke-linejoin="round"/>',
+  help:
+    '<circle cx="12" cy="12" r="8.5"/>' +
+    '<path d="M9.5 9.5a2.5 2.5 0 1 1 3.5 2.3c-.7.3-1 .8-1 1.7M12 16.5v.01" stroke-linecap="round"/>',
   curves: '<path d="M3 20V4M3 20h18M6 15c3 0 3-8 6-8s3 6 9 4"/>',
 } as const;
 
 export type Icon = keyof typeof ICONS;
 
 export function icon(name: Icon): string {
-  return `<svg viewBox="0 0 24 24" width="20" height="20" fill="none" stroke="currentColor" stroke-width="1.6" aria-hidden="true">${ICONS[name]}</svg>`;
+  const drawn = 'fill="none" stroke="currentColor" stroke-width="1.6" aria-hidden="true"';
+  return `<svg viewBox="0 0 24 24" width="20" height="20" ${drawn}>${ICONS[name]}</svg>`;
 }
 
 export function button(name: Icon, title: string, pressed: () => void): HTMLButtonElement {

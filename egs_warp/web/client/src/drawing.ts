@@ -62,12 +62,14 @@ void main() {
   vec3 up = vec3(0.0, focal.y, focal.y * slope.y) / -p.z;
   right = right * renderToViewBasis;
   up = up * renderToViewBasis;
-  mat3 covariance = mat3(squares.x, products.x, products.y, products.x, squares.y, products.z, products.y, products.z, squares.z);
+  mat3 covariance = mat3(
+    squares.x, products.x, products.y, products.x, squares.y, products.z, products.y, products.z, squares.z);
   vec3 spread = covariance * right;
   float a = dot(right, spread) + 0.3, b = dot(up, spread), d = dot(up, covariance * up) + 0.3;
   float half_ = 0.5 * (a - d), root = sqrt(half_ * half_ + b * b), mid = 0.5 * (a + d);
   float large = mid + root, small = max(mid - root, 0.3);
-  vec2 axis = root < 1e-6 * mid ? vec2(1.0, 0.0) : normalize(half_ > 0.0 ? vec2(half_ + root, b) : vec2(b, root - half_));
+  vec2 along = half_ > 0.0 ? vec2(half_ + root, b) : vec2(b, root - half_);
+  vec2 axis = root < 1e-6 * mid ? vec2(1.0, 0.0) : normalize(along);
   float reach = sqrt(2.0 * cut);
   vec2 offset = reach * (position.x * sqrt(large) * axis + position.y * sqrt(small) * vec2(-axis.y, axis.x));
   vec2 seen = abs(middle.xy) / middle.w * renderSize - renderSize;

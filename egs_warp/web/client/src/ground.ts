@@ -32,9 +32,12 @@ export class Ground {
       geometry,
       new THREE.ShaderMaterial({
         uniforms: { height: { value: height } },
-        vertexShader: `varying float z; void main() { z = position.z; gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); }`,
+        vertexShader: `varying float z;
+          void main() { z = position.z; gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); }`,
         fragmentShader: `uniform float height; varying float z;
-          void main() { float dark = 1.0 / (1.0 + 6.0 * max(z, 0.0) / height); gl_FragColor = vec4(dark, 0.0, 0.0, 1.0); }`,
+          void main() {
+            float dark = 1.0 / (1.0 + 6.0 * max(z, 0.0) / height); gl_FragColor = vec4(dark, 0.0, 0.0, 1.0);
+          }`,
         side: THREE.DoubleSide,
         depthTest: false,
         blending: THREE.CustomBlending,
@@ -55,9 +58,14 @@ export class Ground {
         cell: { value: 0.25 * height },
         softness: { value: 0.04 },
       },
-      vertexShader: `varying vec3 place; void main() { vec4 p = modelMatrix * vec4(position, 1.0); place = p.xyz; gl_Position = projectionMatrix * viewMatrix * p; }`,
+      vertexShader: `varying vec3 place;
+        void main() {
+          vec4 p = modelMatrix * vec4(position, 1.0); place = p.xyz;
+          gl_Position = projectionMatrix * viewMatrix * p;
+        }`,
       fragmentShader: `
-        varying vec3 place; uniform sampler2D shade; uniform vec2 centre, shadeCentre; uniform float shadeHalf, reach, cell, softness;
+        varying vec3 place; uniform sampler2D shade; uniform vec2 centre, shadeCentre;
+        uniform float shadeHalf, reach, cell, softness;
         float line(vec2 p, float width) {
           vec2 d = abs(fract(p / cell + 0.5) - 0.5) * cell, w = fwidth(p) * width;
           vec2 l = clamp(1.0 - d / w, 0.0, 1.0) * clamp(0.35 * cell / w, 0.0, 1.0);
@@ -100,7 +108,11 @@ export class Ground {
     this.camera.position.set(middle.x, middle.y, 0);
     this.shadow.place.x = middle.x;
     this.shadow.place.y = middle.y;
-    const before = { target: renderer.getRenderTarget(), colour: renderer.getClearColor(new THREE.Color()), alpha: renderer.getClearAlpha() };
+    const before = {
+      target: renderer.getRenderTarget(),
+      colour: renderer.getClearColor(new THREE.Color()),
+      alpha: renderer.getClearAlpha(),
+    };
     renderer.setRenderTarget(this.target);
     renderer.setClearColor(0x000000, 1);
     renderer.clear();

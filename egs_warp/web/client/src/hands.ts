@@ -147,7 +147,10 @@ export class Pointer {
   }
 
   private move(event: PointerEvent): void {
-    if (this.stage.controls.enabled) this.stage.canvas.classList.toggle("over", event.buttons === 0 && this.stage.pick(event.clientX, event.clientY) !== undefined);
+    if (this.stage.controls.enabled) {
+      const over = event.buttons === 0 && this.stage.pick(event.clientX, event.clientY) !== undefined;
+      this.stage.canvas.classList.toggle("over", over);
+    }
     if (this.pulled === undefined || this.began === undefined) return;
     if (Math.hypot(event.clientX - this.began.x, event.clientY - this.began.y) < 4) return;
     const hand = this.stage.ray(event.clientX, event.clientY).intersectPlane(this.plane, new THREE.Vector3());

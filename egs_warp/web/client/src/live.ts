@@ -58,7 +58,8 @@ export class Live {
     this.marks = new Marks(source.header.facts.height);
     stage.add(this.marks.group);
     this.pauseButton = button("pause", "Pause (p)", () => this.togglePause());
-    this.takeButton = button("record", "Record a take: a run folder, as animate writes one (r)", () => this.toggleTake());
+    const recording = "Record a take: a run folder, as animate writes one (r)";
+    this.takeButton = button("record", recording, () => this.toggleTake());
     const { limits } = source.header.facts;
     const [least, most] = limits?.sag ?? [0.01, 0.1];
     this.sliders = {
@@ -66,11 +67,16 @@ export class Live {
         source.send({ type: "set", friction }),
       ),
       // To the right it is stiffer, each way by the same factor.
-      sag: slide("Stiffness", [-Math.log(most), -Math.log(least)], "any", (value) => `${(ORDINARY_SAG * Math.exp(value)).toFixed(1)}\u00d7`, (value) =>
-        source.send({ type: "set", sag: Math.min(Math.max(Math.exp(-value), least), most) }),
+      sag: slide(
+        "Stiffness",
+        [-Math.log(most), -Math.log(least)],
+        "any",
+        (value) => `${(ORDINARY_SAG * Math.exp(value)).toFixed(1)}\u00d7`,
+        (value) => source.send({ type: "set", sag: Math.min(Math.max(Math.exp(-value), least), most) }),
       ),
     };
-    this.body = element("section", { class: "sheet", "aria-label": "Body and ground", hidden: "" }, this.sliders.friction.part, this.sliders.sag.part);
+    const sheet = { class: "sheet", "aria-label": "Body and ground", hidden: "" };
+    this.body = element("section", sheet, this.sliders.friction.part, this.sliders.sag.part);
     this.help = helpSheet();
     source.onFrame = () => this.clock.arrived(performance.now() / 1000);
     source.listen((news) => this.hear(news));
@@ -88,7 +94,9 @@ export class Live {
       const name = action === "back" || action === "hop" ? "forward" : action;
       const made = button(name, title, () => {});
       made.addEventListener("pointerdown", () => this.hands.press(action, title));
-      for (const end of ["pointerup", "pointerleave", "pointercancel"]) made.addEventListener(end, () => this.hands.release(title));
+      for (const end of ["pointerup", "pointerleave", "pointercancel"]) {
+        made.addEventListener(end, () => this.hands.release(title));
+      }
       // A keyboard's press of the button itself.
       made.addEventListener("click", (event) => {
         if (event.detail !== 0) return;
@@ -102,7 +110,15 @@ export class Live {
       sheet.hidden = !sheet.hidden;
       other.hidden = true;
     };
-    const pad = element("div", { class: "pad" }, act("left", "Turn left (\u2190)"), act("forward", "Forward (\u2191)"), act("right", "Turn right (\u2192)"), act("jump", "Jump (space)"), act("leap", "Leap ahead (j)"));
+    const pad = element(
+      "div",
+      { class: "pad" },
+      act("left", "Turn left (\u2190)"),
+      act("forward", "Forward (\u2191)"),
+      act("right", "Turn right (\u2192)"),
+      act("jump", "Jump (space)"),
+      act("leap", "Leap ahead (j)"),
+    );
     const keep = element(
       "div",
       {},
@@ -188,7 +204,9 @@ export class Live {
     else if (state?.paused) said = "paused";
     else if (state?.doing === "fallen") said = "fallen";
     else if (!this.moving || clock.speed === 0) said = "at rest";
-    else if (clock.speed < SLOWER) said = `${clock.speed.toFixed(clock.speed < 0.1 ? 2 : 1)}\u00d7 \u00b7 ${state?.doing ?? ""}`;
+    else if (clock.speed < SLOWER) {
+      said = `${clock.speed.toFixed(clock.speed < 0.1 ? 2 : 1)}\u00d7 \u00b7 ${state?.doing ?? ""}`;
+    }
     else said = `1\u00d7 \u00b7 ${state?.doing ?? ""}`;
     if (this.pace.textContent !== said) this.pace.textContent = said;
   }
@@ -220,8 +238,15 @@ interface Slide {
   show(value: number): void;
 }
 
-function slide(title: string, [least, most]: [number, number], step: number | "any", said: (value: number) => string, set: (value: number) => void): Slide {
-  const input = element("input", { type: "range", class: "line", min: String(least), max: String(most), step: String(step), "aria-label": title });
+function slide(
+  title: string,
+  [least, most]: [number, number],
+  step: number | "any",
+  said: (value: number) => string,
+  set: (value: number) => void,
+): Slide {
+  const range = { min: String(least), max: String(most), step: String(step) };
+  const input = element("input", { type: "range", class: "line", ...range, "aria-label": title });
   const value = element("output", { class: "value" });
   const label = (): void => {
     value.textContent = said(Number(input.value));

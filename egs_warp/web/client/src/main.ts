@@ -66,7 +66,9 @@ class Page {
   private readonly curves: Curves;
   private readonly film = new FilmRecorder();
   private readonly playButton: HTMLButtonElement;
-  private readonly slider = element("input", { type: "range", min: "0", step: "any", class: "line", "aria-label": "Time" });
+  private readonly slider = element("input", {
+    ...{ type: "range", min: "0", step: "any", class: "line", "aria-label": "Time" },
+  });
   private readonly clock = element("output", { class: "clock" });
   private readonly boxes = new Map<Tick, HTMLInputElement>();
   private before = 0;
@@ -235,7 +237,9 @@ class Page {
   }
 
   private pressed(event: KeyboardEvent): void {
-    if (event.target instanceof HTMLSelectElement || (this.live && event.target instanceof HTMLInputElement) || event.ctrlKey || event.metaKey || event.altKey) return;
+    const held = event.ctrlKey || event.metaKey || event.altKey;
+    const typed = event.target instanceof HTMLSelectElement || (this.live && event.target instanceof HTMLInputElement);
+    if (typed || held) return;
     if (this.live?.keyDown(event)) {
       event.preventDefault();
       return;
@@ -280,7 +284,8 @@ class Page {
     this.playButton.innerHTML = icon(player.playing ? "pause" : "play");
   }
 
-  /** A slow machine waits for its splats to be sorted: as they lay some pictures ago, the ground would hide the body. */
+  /** A slow machine waits for its splats to be sorted: as they lay some pictures ago, the ground would hide the
+   * body. */
   private get waits(): boolean {
     return this.player.playing && this.pace > SLOW && this.stages.some((stage) => stage.sorting);
   }
@@ -311,7 +316,10 @@ declare global {
 async function begin(): Promise<void> {
   const root = document.getElementById("page") as HTMLElement;
   if (!webgl2()) {
-    tell("This browser has no WebGL2, which draws the splats. Another browser, or hardware acceleration in its settings, will do.");
+    tell(
+      "This browser has no WebGL2, which draws the splats. " +
+        "Another browser, or hardware acceleration in its settings, will do.",
+    );
     return;
   }
   tell("Loading\u2026");

@@ -14,7 +14,8 @@ export class Marks {
   private readonly spring = new Strokes(2.5, 0.95, 16);
 
   constructor(private readonly height: number) {
-    this.goal = new THREE.Mesh(new THREE.PlaneGeometry(0.32 * height, 0.32 * height), drawn("abs(length(p) - 0.72) - 0.16", 0.85));
+    const square = new THREE.PlaneGeometry(0.32 * height, 0.32 * height);
+    this.goal = new THREE.Mesh(square, drawn("abs(length(p) - 0.72) - 0.16", 0.85));
     // An arrow head: within a triangle, outside of the notch behind.
     const head = "max(0.45 * (p.x - 0.8) + 0.89 * abs(p.y), 0.85 * (-0.2 - 0.625 * abs(p.y) - p.x))";
     this.facing = new THREE.Mesh(new THREE.PlaneGeometry(0.26 * height, 0.26 * height), drawn(head, 0.75));
@@ -58,14 +59,18 @@ export class Marks {
   }
 }
 
-/** Flat on the ground, smooth at its edge however few pixels there are: `distance` of p, each side of the square at 1, is
- * negative inside. */
+/** Flat on the ground, smooth at its edge however few pixels there are: `distance` of p, each side of the square at 1,
+ * is negative inside. */
 function drawn(distance: string, opacity: number): THREE.ShaderMaterial {
   return new THREE.ShaderMaterial({
     uniforms: { colour: { value: ACCENT } },
-    vertexShader: `varying vec2 p; void main() { p = 2.0 * uv - 1.0; gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); }`,
+    vertexShader: `varying vec2 p;
+      void main() { p = 2.0 * uv - 1.0; gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0); }`,
     fragmentShader: `varying vec2 p; uniform vec3 colour;
-      void main() { float d = ${distance}; gl_FragColor = vec4(colour, ${opacity} * clamp(0.5 - d / fwidth(d), 0.0, 1.0)); }`,
+      void main() {
+        float d = ${distance};
+        gl_FragColor = vec4(colour, ${opacity} * clamp(0.5 - d / fwidth(d), 0.0, 1.0));
+      }`,
     transparent: true,
     depthWrite: false,
     side: THREE.DoubleSide,

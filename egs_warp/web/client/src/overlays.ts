@@ -84,7 +84,9 @@ export class Overlays {
   }
 
   private apply(): void {
-    for (const [layer, strokes] of Object.entries(this.strokes)) strokes.object.visible = this.visible.has(layer as Layer);
+    for (const [layer, strokes] of Object.entries(this.strokes)) {
+      strokes.object.visible = this.visible.has(layer as Layer);
+    }
     this.middle.visible = this.visible.has("path");
     this.feet.visible = this.cones.object.visible = this.visible.has("contacts");
   }
@@ -103,7 +105,9 @@ export class Overlays {
     this.ends.fill(0);
     for (let end = 0; end + 1 < starts.length; end++) {
       for (let k = starts[end]!; k < starts[end + 1]!; k++) {
-        for (let axis = 0; axis < 3; axis++) this.ends[3 * end + axis]! += weights[k]! * positions[3 * nodes[k]! + axis]!;
+        for (let axis = 0; axis < 3; axis++) {
+          this.ends[3 * end + axis]! += weights[k]! * positions[3 * nodes[k]! + axis]!;
+        }
       }
     }
     const segments = indicesOf(this.header, "muscle_segments");
@@ -114,7 +118,9 @@ export class Overlays {
       const level = (frame.activations[k >> 1] ?? 0) / 127;
       const towards = level > 0 ? COLOURS.contracts : COLOURS.extends;
       const share = Math.sqrt(Math.abs(level));
-      for (let c = 0; c < 3; c++) colours[3 * k + c] = COLOURS.relaxed[c]! + share * (towards[c]! - COLOURS.relaxed[c]!);
+      for (let c = 0; c < 3; c++) {
+        colours[3 * k + c] = COLOURS.relaxed[c]! + share * (towards[c]! - COLOURS.relaxed[c]!);
+      }
     }
     this.strokes.muscles.set(lines, colours);
   }

@@ -85,7 +85,8 @@ function view(type: string, bytes: ArrayBuffer, start: number, count: number): N
 /** One frame; it starts at a multiple of four bytes. */
 export function readFrame(bytes: ArrayBuffer, start: number): Frame {
   const words = new Uint32Array(bytes, start, 8);
-  const [nodes, segments, contacts, curves] = [words[2], words[3], words[4], words[5]] as [number, number, number, number];
+  const counts = [words[2], words[3], words[4], words[5]] as [number, number, number, number];
+  const [nodes, segments, contacts, curves] = counts;
   let at = start + 32;
   const floats = (count: number): Float32Array => {
     const values = new Float32Array(bytes, at, count);

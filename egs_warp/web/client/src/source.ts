@@ -36,7 +36,22 @@ export async function fromElement(element: HTMLElement): Promise<FrameSource> {
 
 /** What a session says beside its frames. */
 export type News =
-  | { type: "state"; doing: string; queued: string | null; walks: boolean; goal: [number, number] | null; facing: [number, number]; paused: boolean; resting: boolean; recording: boolean; pulled: boolean; friction: number; sag: number; motions: number; step: number }
+  | {
+      type: "state";
+      doing: string;
+      queued: string | null;
+      walks: boolean;
+      goal: [number, number] | null;
+      facing: [number, number];
+      paused: boolean;
+      resting: boolean;
+      recording: boolean;
+      pulled: boolean;
+      friction: number;
+      sag: number;
+      motions: number;
+      step: number;
+    }
   | { type: "told"; text: string }
   | { type: "script"; text: string; motions: number }
   | { type: "busy"; on: boolean }

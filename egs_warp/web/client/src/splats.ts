@@ -1,4 +1,5 @@
-// Splats that the cage carries in a shader: means, F Sigma F^T and the turned colour bands (Eq. 14, 15), drawn by Spark.
+// Splats that the cage carries in a shader: means, F Sigma F^T and the turned colour bands (Eq. 14, 15), drawn by
+// Spark.
 
 import { dyno, SplatGenerator } from "@sparkjsdev/spark";
 import * as THREE from "three";
@@ -76,7 +77,8 @@ export function carriedSplats(
       inputs: { index, ...uniforms },
       globals: () => [dyno.defineGsplat, dyno.defineCovSplat, CARRY_GLSL],
       statements: ({ inputs: i, outputs }) => [
-        `${outputs.covsplat} = egsCarried(${i.index}, ${i.splats}, ${i.arms}, ${i.bands}, ${i.bandScales}, ${i.cage}, ${i.shade}, ${i.shadePlace}, ${i.eye}, ${i.degree});`,
+        `${outputs.covsplat} = egsCarried(${i.index}, ${i.splats}, ${i.arms}, ${i.bands}, ${i.bandScales}, ` +
+          `${i.cage}, ${i.shade}, ${i.shadePlace}, ${i.eye}, ${i.degree});`,
       ],
     });
     return { covsplat: carry.outputs.covsplat };

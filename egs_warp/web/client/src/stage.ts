@@ -57,7 +57,8 @@ export class Stage {
     this.scene.add(this.overlays.group);
     this.bounds = this.reach();
     const { height } = header.facts;
-    this.ground = new Ground(indicesOf(header, "surface"), rest.length / 3, height, 3.5 * height + 1.5 * this.bounds.size);
+    const reach = 3.5 * height + 1.5 * this.bounds.size;
+    this.ground = new Ground(indicesOf(header, "surface"), rest.length / 3, height, reach);
     this.ground.centreOn(this.bounds.middle.x, this.bounds.middle.y);
     if (header.arrays.has("scene_means")) {
       const { shadow } = this.ground;
@@ -223,7 +224,8 @@ export class Stage {
   /** From the eye through a place of the window. */
   ray(clientX: number, clientY: number): THREE.Ray {
     const box = this.canvas.getBoundingClientRect();
-    const place = new THREE.Vector2((2 * (clientX - box.left)) / box.width - 1, 1 - (2 * (clientY - box.top)) / box.height);
+    const [x, y] = [(clientX - box.left) / box.width, (clientY - box.top) / box.height];
+    const place = new THREE.Vector2(2 * x - 1, 1 - 2 * y);
     const caster = new THREE.Raycaster();
     this.camera.updateMatrixWorld();
     caster.setFromCamera(place, this.camera);

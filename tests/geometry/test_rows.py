@@ -1,0 +1,19 @@
+"""Rows that are alike."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.geometry.rows import distinct_rows
+
+
+@pytest.mark.parametrize("count", [0, 1, 500])
+@pytest.mark.parametrize("width", [2, 3])
+def test_distinct_rows_are_those_of_numpy(count: int, width: int) -> None:
+    """In the same order, with the same numbers; far and negative ones, too."""
+    rows = np.random.default_rng(count).integers(-4, 4, (count, width)) * [10**18, *[1] * (width - 1)]
+    distinct, number = distinct_rows(rows)
+    wanted, which = np.unique(rows, axis=0, return_inverse=True)
+    assert np.array_equal(distinct, wanted) and np.array_equal(number, which.ravel())
+    assert np.array_equal(distinct[number], rows)
