@@ -43,6 +43,8 @@ class Carriage(Protocol):
     """Metres that a foot is lifted."""
     catch: float
     """Metres by which a foot may come down off its place to catch the body."""
+    hold: float
+    """Weight of contact points that stand and would slide, each by its share of the weight."""
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
         """(N, 3) nodes of the body with its centre of mass at ``com`` (3,), turned by ``heading`` radians, its feet at
@@ -63,6 +65,7 @@ class OnLegs:
         self.pace = Pace(REACH * min(foot.length for foot in feet), LARGEST_TURN)
         self.lift = LIFT * body.height
         self.catch = REACH * min(foot.length for foot in feet)
+        self.hold = 1000.0
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
         """See ``Carriage``."""
@@ -85,6 +88,7 @@ class OnBase:
         self.pace = Pace(0.5 * PIVOT * self._width, 0.5 * PIVOT)
         self.lift = min(ROLL * self._width, LIFT * body.height)
         self.catch = 0.0
+        self.hold = 50.0  # what turns about a patch slides at its edges
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
         """See ``Carriage``; the places of the feet turn it, not ``heading``."""

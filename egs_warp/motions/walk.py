@@ -85,8 +85,6 @@ class WalkControl:
     spin: float = 600.0
     pose: float = 1.0
     swing: float = 40.0
-    support: float = 1000.0
-    """Of contact points that stand and would slide, each by its share of the weight."""
     unload: float = 100.0
     """Of what contact points of a foot carry that is lifted."""
     balance: float = 3.0
@@ -444,7 +442,7 @@ class Walk:
         ahead = self.swinging if elapsed > self.gait.carried_from else ()
         stands = ~np.isin(foot_of_contact(self.feet, contacts), ahead)
         return held_contacts(
-            contacts, np.where(stands, report.forces[:, 0], 0.0) / self.body.weight, self.control.support
+            contacts, np.where(stands, report.forces[:, 0], 0.0) / self.body.weight, self._carriage.hold
         )
 
     def _turn(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
