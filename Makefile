@@ -5,12 +5,14 @@ VENV := .venv
 FRAMES ?=
 # Threads cost the small matrices of a step more than they bring.
 export OPENBLAS_NUM_THREADS ?= 1
-# Of make fuzz, for all readers together.
+# Of make fuzz, for all readers together; make mutation has no end of its own.
 MINUTES ?= 10
+# Of make mutation, each with its own copy of the tree.
+PROCESSES ?= 2
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-rest test-all fuzz setup lint types docs pictures build web examples clean
+.PHONY: demo test test-rest test-all fuzz mutation setup lint types docs pictures build web examples clean
 
 demo: $(VENV)/demo.stamp
 	$(BIN)/python examples/jump.py --out out/jump $(FRAMES:%=--frames %)
@@ -37,6 +39,10 @@ test-all: test test-rest
 fuzz: setup
 	-$(PIP) -e ".[fuzz]"
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz --minutes $(MINUTES)
+
+# Small changes of the code that a room's fast tests must notice; goes on where it stopped. ROOMS and COUNT say how many.
+mutation: setup
+	$(BIN)/python -m tests.mutation --processes $(PROCESSES) $(ROOMS:%=--rooms %) $(COUNT:%=--count %)
 
 # The page is built anew when its sources have changed; where npm is missing, egs-warp view says what to do.
 setup: $(VENV)/setup.stamp $(if $(shell command -v npm),web)
