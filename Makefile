@@ -12,7 +12,7 @@ PROCESSES ?= 2
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-rest test-all fuzz mutation setup lint types docs pictures build web examples clean
+.PHONY: demo test test-rest test-all fuzz mutation coverage release setup lint types docs pictures build web examples clean
 
 demo: $(VENV)/demo.stamp
 	$(BIN)/python examples/jump.py --out out/jump $(FRAMES:%=--frames %)
@@ -73,6 +73,10 @@ egs_warp/web/page.html: $(PAGE)/package-lock.json $(PAGE)/build.mjs $(PAGE)/tsco
 # Wheel and sdist into out/dist, both tried in an empty environment outside of the tree.
 build: setup web
 	VENV=$(VENV) .ci/package
+
+# Beside them a bill of materials and requirements with hashes; ALSO="win_amd64:3.12 ..." adds those of other platforms.
+release: build
+	$(BIN)/python .ci/release.py $(ALSO:%=--also %)
 
 $(VENV)/demo.stamp: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

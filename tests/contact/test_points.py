@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -64,3 +66,10 @@ def test_forces_go_with_their_points_and_the_deep_join(geometry: ContactGeometry
     gaps = gaps_of(geometry) - 0.006
     deep = points.deeper(np.array([int(np.argmin(gaps))]), gaps, 0.005)
     assert len(deep) and (gaps[deep] < -0.005).all() and int(np.argmin(gaps)) not in deep
+
+
+def test_cells_are_the_same_wherever_the_ground_is(geometry: ContactGeometry) -> None:
+    """A body that begins above the ground has as many cells under it as one that stands on it."""
+    lower = replace(geometry, planes=(Plane(np.array([0.0, 0.0, 1.0]), 0.3),))
+    standing, hovering = (ContactPoints(one, near=NEAR, lower=1e-3) for one in (geometry, lower))
+    assert np.array_equal(standing.cell_from_point, hovering.cell_from_point)
