@@ -35,6 +35,12 @@ test-rest: setup
 
 test-all: test test-rest
 
+# Branch coverage of these rooms by their own fast tests, with a floor (docs/reliability.md).
+COVERED := contact deformation fem geometry io locomotion meshing muscles render segmentation
+FLOOR := 90
+coverage: setup
+	$(PYTEST) -m "not (slow or data or example)" $(COVERED:%=tests/%) $(COVERED:%=--cov=egs_warp/%) --cov-branch --cov-report=term:skip-covered --cov-fail-under=$(FLOOR)
+
 # Damaged files for every reader; Atheris drives them where it installs. What breaks a reader is kept in tests/corpus.
 fuzz: setup
 	-$(PIP) -e ".[fuzz]"

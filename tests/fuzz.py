@@ -28,7 +28,7 @@ _MEMORY = 256
 """MiB that the readers of a process may take beyond what it began with: its inputs hold some kilobytes."""
 _LARGEST_BUFFER = 4096
 """Bytes from which Hypothesis draws one input."""
-_COUNTS = ("inputs", "valid", "refused", "broken")
+_COUNTS: tuple[str, ...] = ("inputs", "valid", "refused", "broken")
 _PIECE = 20_000
 """Inputs of one process, where there is a number to reach."""
 _SEED = 20_261_122
@@ -131,7 +131,7 @@ def _fuzz(name: str, seed: int, seconds: float, inputs: int) -> None:
 
     wp.config.log_level = wp.LOG_ERROR
     reader = next(reader for reader in readers.READERS if reader.name == name)
-    counts = dict.fromkeys(_COUNTS, 0)
+    counts: dict[str, int] = dict.fromkeys(_COUNTS, 0)
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         readers.prepare(reader, folder)

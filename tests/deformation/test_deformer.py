@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import warp as wp
@@ -14,6 +16,7 @@ from egs_warp.deformation.embedding import CageLocator, embed_gaussians
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.kernels.deformation.decomposition import column, rotation_part, signed_as
 from egs_warp.kernels.deformation.spherical_harmonics import rotate_sh_kernel
 from egs_warp.launching import launch_rows
 from egs_warp.render import render_gaussians
@@ -313,3 +316,54 @@ def test_one_pass_on_cuda_equals_two_on_the_cpu(count: int) -> None:
     np.testing.assert_allclose(result.cloud.means.numpy(), expected.cloud.means.numpy(), atol=2e-6)
     np.testing.assert_allclose(covariances(result.cloud), covariances(expected.cloud), atol=1e-6)
     np.testing.assert_allclose(result.cloud.sh.numpy(), expected.cloud.sh.numpy(), atol=1e-4)
+
+
+@wp.kernel
+def rotation_parts_kernel(maps: wp.array[wp.mat33], rotations_out: wp.array[wp.mat33]):
+    m = maps[wp.tid()]
+    rotations_out[wp.tid()] = rotation_part(column(m, 0), column(m, 1), column(m, 2))
+
+
+def test_the_rotation_of_a_map_that_flattens_is_that_of_its_plane(device: str) -> None:
+    """Eq. (15): of F with a singular value that is zero, or nearly, the polar decomposition by SciPy's SVD with
+    det = +1, in any order of the other two.
+    """
+    stretches = [(1.0, 0.4, 0.0), (1.0, 0.0, 0.4), (0.4, 1.0, 0.0), (0.0, 0.4, 1.0), (0.4, 0.0, 1.0), (0.0, 1.0, 0.4)]
+    stretches += [(1.0, 1e-9, 0.3), (0.3, 1.0, -0.05), (-0.05, 0.3, 1.0), (0.9, -0.02, 0.4)]
+    for turned in (False, True):
+        sides = Rotation.random(len(stretches), random_state=1).as_matrix() if turned else np.eye(3)
+        turns = Rotation.random(len(stretches), random_state=2).as_matrix()
+        maps = turns @ sides @ (np.array(stretches)[:, :, None] * np.swapaxes(sides * np.ones((10, 1, 1)), 1, 2))
+        given = wp.array(maps.astype(np.float32), dtype=wp.mat33, device=device)
+        found = wp.zeros(len(maps), dtype=wp.mat33, device=device)
+        wp.launch(rotation_parts_kernel, len(maps), inputs=[given], outputs=[found], device=device)
+        left, _, right = np.linalg.svd(maps)
+        left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
+        np.testing.assert_allclose(found.numpy(), left @ right, atol=2e-5)
+
+
+@wp.kernel
+def signed_kernel(
+    frames: wp.array[wp.mat33], orders: wp.array[wp.vec3i], carried: wp.array[wp.mat33], out: wp.array[wp.mat33]
+):
+    i = wp.tid()
+    out[i] = signed_as(frames[i], orders[i], carried[i])
+
+
+def test_axes_keep_the_side_that_they_were_carried_to(device: str) -> None:
+    """Of the four choices of signs with det = +1 the one whose columns lie nearest to the carried ones, by trying."""
+    count, random = 200, np.random.default_rng(9)
+    frames = Rotation.random(count, random_state=3).as_matrix()
+    orders = np.array([random.permutation(3) for _ in range(count)])
+    carried = random.normal(size=(count, 3, 3))
+    out = wp.zeros(count, dtype=wp.mat33, device=device)
+    given = (
+        wp.array(frames.astype(np.float32), dtype=wp.mat33, device=device),
+        wp.array(orders, dtype=wp.vec3i, device=device),
+        wp.array(carried.astype(np.float32), dtype=wp.mat33, device=device),
+    )
+    wp.launch(signed_kernel, count, inputs=[*given], outputs=[out], device=device)
+    for frame, order, target, got in zip(frames, orders, carried, out.numpy(), strict=True):
+        choices = [frame[:, order] * signs for signs in itertools.product((1.0, -1.0), repeat=3)]
+        proper = [choice for choice in choices if np.linalg.det(choice) > 0.0]
+        np.testing.assert_allclose(got, max(proper, key=lambda choice: float((choice * target).sum())), atol=1e-6)

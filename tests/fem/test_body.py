@@ -11,10 +11,10 @@ import scipy.sparse as sparse
 from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import UserError
-from egs_warp.fem.body import GRAVITY, SoftBody, make_body
+from egs_warp.fem.body import GRAVITY, LARGEST_SINK, SoftBody, make_body
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
-from tests.support.meshes import block_mesh, box_mesh
+from tests.support.meshes import block_mesh, box_mesh, coarse_stool
 
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 
@@ -97,3 +97,21 @@ def test_a_body_that_hangs_on_an_edge_is_refused() -> None:
     tets = merged.ravel()[np.concatenate([box.tets, box.tets + len(box.nodes)])].astype(np.int32)
     with pytest.raises(UserError, match="nodes: the cage has parts that hang on a corner or an edge alone; give it"):
         make_body(TetMesh(nodes, tets), FLOOR, device="cpu")
+
+
+def test_a_body_on_thin_legs_is_stiffened_until_it_sinks_by_two_percent() -> None:
+    """docs/concepts/cage.md: its centre of mass, linearly and by a dense solve, with the nodes of its base held; a
+    column, which sinks less, stays as soft as it is.
+    """
+    for mesh, stiffened in ((coarse_stool(), True), (block_mesh(), False)):
+        made = make_body(mesh, FLOOR, sag=0.05, device="cpu")
+        upper = made.assembly.matrix(made.assembly.hessian_entries(mesh.nodes))
+        free = np.repeat(mesh.nodes[:, 2] > 0.05 * made.height, 3)
+        stiffness = (upper + sparse.triu(upper, 1).T).toarray()[free][:, free]
+        moved = np.zeros(3 * len(mesh.nodes))
+        moved[free] = np.linalg.solve(stiffness, (made.node_mass[:, None] * made.gravity).ravel()[free])
+        sink = -made.centre_of_mass(moved.reshape(-1, 3))[2]
+        if stiffened:
+            assert made.stiffening > 1.5 and sink == pytest.approx(LARGEST_SINK * made.height, rel=1e-6)
+        else:
+            assert made.stiffening == pytest.approx(1.0) and sink < LARGEST_SINK * made.height

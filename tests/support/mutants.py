@@ -75,9 +75,14 @@ class Mutant:
 
 
 def files_of(room: str) -> list[Path]:
-    """Of the room and of its kernels."""
+    """Of the room and of its kernels; fast tests see nothing of what runs on a GPU alone."""
     folders = (ROOT / "egs_warp" / room, ROOT / "egs_warp" / "kernels" / room)
-    return sorted(path for folder in folders for path in folder.glob("*.py") if path.name != "__init__.py")
+    return sorted(
+        path
+        for folder in folders
+        for path in folder.glob("*.py")
+        if path.name != "__init__.py" and not path.stem.endswith("_cuda")
+    )
 
 
 def sample(room: str, count: int, seed: int) -> list[Mutant]:

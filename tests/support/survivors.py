@@ -26,6 +26,18 @@ SURVIVORS: list[Survivor] = [
         "halving 39 times ends an arm 2e-12 of its length from the ground, 40 times 1e-12",
     ),
     Survivor(
+        "kernels/deformation/embedding.py",
+        "if vb <= real(0.0) and d2 >= real(0.0) and d6 <= real(0.0):",
+        "if vb < real(0.0) and d2 >= real(0.0) and d6 <= real(0.0):",
+        "on the boundary of two cases both give the same point of the triangle",
+    ),
+    Survivor(
+        "kernels/deformation/embedding.py",
+        "if weights[3] < real(0.0):",
+        "if weights[3] <= real(0.0):",
+        "one more face is looked at, to which the distance is never less than that to the nearest",
+    ),
+    Survivor(
         "locomotion/strategies.py",
         "def within(self, factor: float, share: float = 0.0) -> bool:",
         "def within(self, factor: float, share: float = -1.0) -> bool:",
