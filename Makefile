@@ -35,11 +35,12 @@ test-rest: setup
 
 test-all: test test-rest
 
-# Branch coverage of these rooms by their own fast tests, with a floor (docs/reliability.md).
+# Branch coverage of these rooms by their own fast tests and those of odd numbers and faults, with a floor.
 COVERED := contact deformation fem geometry io locomotion meshing muscles render segmentation
-FLOOR := 90
+FLOOR := 95
 coverage: setup
-	$(PYTEST) -m "not (slow or data or example)" $(COVERED:%=tests/%) $(COVERED:%=--cov=egs_warp/%) --cov-branch --cov-report=term:skip-covered --cov-fail-under=$(FLOOR)
+	$(PYTEST) -m "not (slow or data or example)" $(COVERED:%=tests/%) tests/test_extremes.py tests/test_faults.py \
+		$(COVERED:%=--cov=egs_warp/%) --cov-branch --cov-report=term:skip-covered --cov-fail-under=$(FLOOR)
 
 # Damaged files for every reader; Atheris drives them where it installs. What breaks a reader is kept in tests/corpus.
 fuzz: setup

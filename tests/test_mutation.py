@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests import mutation
-from tests.support import mutants
+from tests.support import mutants, mutation
 from tests.support.survivors import SURVIVORS, Survivor
 
 pytest.importorskip("cosmic_ray", reason="cosmic-ray is part of the dev extra")
@@ -57,6 +56,13 @@ def test_a_sample_stays_where_another_line_changes(room: Path) -> None:
     room.write_text(SOURCE + "\n\ndef another(a: float) -> float:\n    return a * 2.0\n")
     more = [mutant for mutant in mutants.sample("contact", 100, 1) if "2.0" not in mutant.before]
     assert [(m.before, m.after) for m in more[:4]] == [(m.before, m.after) for m in few]
+
+
+def test_an_edited_file_has_no_mutants_of_its_old_text(room: Path) -> None:
+    (mutant,) = mutants.sample("contact", 1, 1)
+    assert not mutant.is_stale
+    room.write_text(SOURCE + "\n# edited\n")
+    assert mutant.is_stale
 
 
 def test_the_nearest_test_comes_first() -> None:

@@ -67,6 +67,11 @@ class Mutant:
         """Names the change as long as the file stays as it is."""
         return f"{self.file}:{self.digest}:{self.operator}:{self.occurrence}"
 
+    @property
+    def is_stale(self) -> bool:
+        """Whether the file has been edited since."""
+        return _digest((ROOT / self.file).read_text()) != self.digest
+
     def text(self) -> str:
         """The whole file, changed."""
         changed = _changed((ROOT / self.file).read_text(), self.operator, self.occurrence)
@@ -128,9 +133,10 @@ def _first_that_compiles(room: str, path: Path, source: str, changes: list[Chang
         else:
             pairs = enumerate(zip(lines, changed.splitlines(), strict=True), start=1)
             number, before, after = next((n, a, b) for n, (a, b) in pairs if a != b)
-        digest = hashlib.sha256(source.encode()).hexdigest()[:12]
         place = path.relative_to(ROOT).as_posix()
-        return Mutant(room, place, digest, change.operator, change.occurrence, number, before.strip(), after.strip())
+        return Mutant(
+            room, place, _digest(source), change.operator, change.occurrence, number, before.strip(), after.strip()
+        )
     return None
 
 
@@ -200,6 +206,10 @@ def _stays(name: str) -> bool:
 def _changed(source: str, operator: str, occurrence: int) -> str | None:
     mutating = importlib.import_module("cosmic_ray.mutating")
     return mutating.mutate_code(source, dict(_operators())[operator], occurrence)
+
+
+def _digest(source: str) -> str:
+    return hashlib.sha256(source.encode()).hexdigest()[:12]
 
 
 def _rank(*parts: object) -> str:

@@ -1,4 +1,4 @@
-"""Mutants that no test can kill, or none need kill, each with its reason: ``tests/mutation.py`` counts them apart."""
+"""Mutants that no test can kill, or none need kill, each with its reason: ``make mutation`` counts them apart."""
 
 from __future__ import annotations
 
