@@ -16,7 +16,7 @@ from egs_warp.deformation.embedding import CageLocator, embed_gaussians
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.kernels.deformation.decomposition import column, rotation_part, signed_as
+from egs_warp.kernels.deformation.decomposition import column, matched_order, rotation_part, signed_as
 from egs_warp.kernels.deformation.spherical_harmonics import rotate_sh_kernel
 from egs_warp.launching import launch_rows
 from egs_warp.render import render_gaussians
@@ -340,6 +340,26 @@ def test_the_rotation_of_a_map_that_flattens_is_that_of_its_plane(device: str) -
         left, _, right = np.linalg.svd(maps)
         left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
         np.testing.assert_allclose(found.numpy(), left @ right, atol=2e-5)
+
+
+@wp.kernel
+def orders_kernel(frames: wp.array[wp.mat33], carried: wp.array[wp.mat33], out: wp.array[wp.vec3i]):
+    out[wp.tid()] = matched_order(frames[wp.tid()], carried[wp.tid()])
+
+
+def test_axes_keep_their_order(device: str) -> None:
+    """Of the six orders of a frame's columns the one whose columns are best aligned with the carried, by trying."""
+    count = 200
+    frames = Rotation.random(count, random_state=4).as_matrix()
+    carried = np.random.default_rng(10).normal(size=(count, 3, 3))
+    given = [wp.array(maps.astype(np.float32), dtype=wp.mat33, device=device) for maps in (frames, carried)]
+    out = wp.zeros(count, dtype=wp.vec3i, device=device)
+    wp.launch(orders_kernel, count, inputs=given, outputs=[out], device=device)
+    found = [tuple(order) for order in out.numpy()]
+    for frame, target, order in zip(frames, carried, found, strict=True):
+        aligned = {p: np.abs((frame[:, p] * target).sum(axis=0)).sum() for p in itertools.permutations(range(3))}
+        assert order == max(aligned, key=lambda p: float(aligned[p]))
+    assert set(found) == set(itertools.permutations(range(3)))
 
 
 @wp.kernel

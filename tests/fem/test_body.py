@@ -11,7 +11,7 @@ import scipy.sparse as sparse
 from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import UserError
-from egs_warp.fem.body import GRAVITY, LARGEST_SINK, SoftBody, make_body
+from egs_warp.fem.body import GRAVITY, LARGEST_HEIGHT, LARGEST_SINK, SMALLEST_HEIGHT, SoftBody, make_body
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
 from tests.support.meshes import block_mesh, box_mesh, coarse_stool
@@ -85,6 +85,12 @@ def test_a_height_that_no_body_has_is_refused(scale: float) -> None:
         UserError, match=r"metres_per_unit: the body is .* m high; choose it so that this is from 0.001"
     ):
         make_body(TetMesh(mesh.nodes * scale, mesh.tets), FLOOR, device="cpu")
+
+
+def test_the_smallest_and_the_largest_body_are_bodies() -> None:
+    for height in (SMALLEST_HEIGHT, LARGEST_HEIGHT):
+        mesh = block_mesh(size=(0.4 * height, 0.4 * height, height))
+        assert make_body(mesh, FLOOR, device="cpu").height == height
 
 
 def test_a_body_that_hangs_on_an_edge_is_refused() -> None:
