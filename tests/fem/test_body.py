@@ -89,7 +89,7 @@ def test_a_height_that_no_body_has_is_refused(scale: float) -> None:
 
 def test_the_smallest_and_the_largest_body_are_bodies() -> None:
     for height in (SMALLEST_HEIGHT, LARGEST_HEIGHT):
-        mesh = block_mesh(size=(0.4 * height, 0.4 * height, height))
+        mesh = box_mesh((2, 2, 2), (0.4 * height, 0.4 * height, height))
         assert make_body(mesh, FLOOR, device="cpu").height == height
 
 
