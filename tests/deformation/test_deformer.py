@@ -16,11 +16,11 @@ from egs_warp.deformation.embedding import CageLocator, embed_gaussians
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.kernels.deformation.decomposition import column, matched_order, rotation_part, signed_as
 from egs_warp.kernels.deformation.spherical_harmonics import rotate_sh_kernel
 from egs_warp.launching import launch_rows
 from egs_warp.render import render_gaussians
 from tests.support.carrying_scenes import bent, box, covariances, matrices, random_cloud
+from tests.support.kernels import orders_kernel, rotation_parts_kernel, signed_kernel
 
 
 def colours(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -318,10 +318,9 @@ def test_one_pass_on_cuda_equals_two_on_the_cpu(count: int) -> None:
     np.testing.assert_allclose(result.cloud.sh.numpy(), expected.cloud.sh.numpy(), atol=1e-4)
 
 
-@wp.kernel
-def rotation_parts_kernel(maps: wp.array[wp.mat33], rotations_out: wp.array[wp.mat33]):
-    m = maps[wp.tid()]
-    rotations_out[wp.tid()] = rotation_part(column(m, 0), column(m, 1), column(m, 2))
+def turns_of(count: int, seed: int) -> np.ndarray:
+    """(count, 3, 3) random rotations."""
+    return Rotation.from_quat(np.random.default_rng(seed).normal(size=(count, 4))).as_matrix()
 
 
 def test_the_rotation_of_a_map_that_flattens_is_that_of_its_plane(device: str) -> None:
@@ -331,8 +330,8 @@ def test_the_rotation_of_a_map_that_flattens_is_that_of_its_plane(device: str) -
     stretches = [(1.0, 0.4, 0.0), (1.0, 0.0, 0.4), (0.4, 1.0, 0.0), (0.0, 0.4, 1.0), (0.4, 0.0, 1.0), (0.0, 1.0, 0.4)]
     stretches += [(1.0, 1e-9, 0.3), (0.3, 1.0, -0.05), (-0.05, 0.3, 1.0), (0.9, -0.02, 0.4)]
     for turned in (False, True):
-        sides = Rotation.random(len(stretches), random_state=1).as_matrix() if turned else np.eye(3)
-        turns = Rotation.random(len(stretches), random_state=2).as_matrix()
+        sides = turns_of(len(stretches), 1) if turned else np.eye(3)
+        turns = turns_of(len(stretches), 2)
         maps = turns @ sides @ (np.array(stretches)[:, :, None] * np.swapaxes(sides * np.ones((10, 1, 1)), 1, 2))
         given = wp.array(maps.astype(np.float32), dtype=wp.mat33, device=device)
         found = wp.zeros(len(maps), dtype=wp.mat33, device=device)
@@ -342,15 +341,10 @@ def test_the_rotation_of_a_map_that_flattens_is_that_of_its_plane(device: str) -
         np.testing.assert_allclose(found.numpy(), left @ right, atol=2e-5)
 
 
-@wp.kernel
-def orders_kernel(frames: wp.array[wp.mat33], carried: wp.array[wp.mat33], out: wp.array[wp.vec3i]):
-    out[wp.tid()] = matched_order(frames[wp.tid()], carried[wp.tid()])
-
-
 def test_axes_keep_their_order(device: str) -> None:
     """Of the six orders of a frame's columns the one whose columns are best aligned with the carried, by trying."""
     count = 200
-    frames = Rotation.random(count, random_state=4).as_matrix()
+    frames = turns_of(count, 4)
     carried = np.random.default_rng(10).normal(size=(count, 3, 3))
     given = [wp.array(maps.astype(np.float32), dtype=wp.mat33, device=device) for maps in (frames, carried)]
     out = wp.zeros(count, dtype=wp.vec3i, device=device)
@@ -362,18 +356,10 @@ def test_axes_keep_their_order(device: str) -> None:
     assert set(found) == set(itertools.permutations(range(3)))
 
 
-@wp.kernel
-def signed_kernel(
-    frames: wp.array[wp.mat33], orders: wp.array[wp.vec3i], carried: wp.array[wp.mat33], out: wp.array[wp.mat33]
-):
-    i = wp.tid()
-    out[i] = signed_as(frames[i], orders[i], carried[i])
-
-
 def test_axes_keep_the_side_that_they_were_carried_to(device: str) -> None:
     """Of the four choices of signs with det = +1 the one whose columns lie nearest to the carried ones, by trying."""
     count, random = 200, np.random.default_rng(9)
-    frames = Rotation.random(count, random_state=3).as_matrix()
+    frames = turns_of(count, 3)
     orders = np.array([random.permutation(3) for _ in range(count)])
     carried = random.normal(size=(count, 3, 3))
     out = wp.zeros(count, dtype=wp.mat33, device=device)
