@@ -20,7 +20,7 @@ class Pair:
     first: int | None = 1
 
 
-def larger(pair: Pair | None, floor: float = 0.5) -> float | None:
+def larger(pair: Pair | None, *, floor: float = 0.5) -> float | None:
     if pair is None or pair.first is None:
         return -floor
     return max((a + b for a, b in zip([pair.first], [floor], strict=True)), default=0.0)
@@ -47,7 +47,12 @@ def test_changes_are_other_programs_within_a_family(room: Path) -> None:
         assert mutant.before in SOURCE.splitlines()[mutant.line - 1]
         assert not {"<<", ">>", "~"} & set(mutant.after.split()), mutant.after
     after = " ".join(mutant.after for mutant in found)
-    assert "Pair | None" in after and "frozen=False" not in after and "strict=False" not in after
+    assert (
+        "Pair | None, *, floor" in after
+        and ", /, floor" not in after
+        and "frozen=False" not in after
+        and "strict=False" not in after
+    )
 
 
 def test_a_sample_stays_where_another_line_changes(room: Path) -> None:

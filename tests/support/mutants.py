@@ -155,9 +155,11 @@ def _places(path: Path, source: str) -> dict[tuple[int, int], list[Change]]:
     found: dict[tuple[int, int], list[Change]] = defaultdict(list)
 
     def walk(node: Any) -> None:
+        # The star and the slash between parameters are no operators.
+        separator = node.parent is not None and node.parent.type in ("parameters", "lambdef")
         for name, operator in operators.items():
             for start, _ in operator.mutation_positions(node):
-                if not any(first <= start < last for first, last in untouched):
+                if not separator and not any(first <= start < last for first, last in untouched):
                     found[start].append(Change(name, counts[name], start[0]))
                 counts[name] += 1
         for child in getattr(node, "children", ()):
