@@ -5,12 +5,14 @@ VENV := .venv
 FRAMES ?=
 # Threads cost the small matrices of a step more than they bring.
 export OPENBLAS_NUM_THREADS ?= 1
-# Of make fuzz, for all readers together.
+# Of make fuzz, for all readers together; make mutation has no end of its own.
 MINUTES ?= 10
+# Of make mutation, each with its own copy of the tree.
+PROCESSES ?= 2
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-rest test-all fuzz setup lint types docs pictures build web examples clean
+.PHONY: demo test test-rest test-all fuzz mutation coverage release setup lint types docs pictures build web examples clean
 
 demo: $(VENV)/demo.stamp
 	$(BIN)/python examples/jump.py --out out/jump $(FRAMES:%=--frames %)
@@ -33,10 +35,21 @@ test-rest: setup
 
 test-all: test test-rest
 
+# Branch coverage of these rooms by their own fast tests and those of odd numbers and faults, with a floor.
+COVERED := contact deformation fem geometry io locomotion meshing muscles render segmentation
+FLOOR := 95
+coverage: setup
+	$(PYTEST) -m "not (slow or data or example)" $(COVERED:%=tests/%) tests/test_extremes.py tests/test_faults.py \
+		$(COVERED:%=--cov=egs_warp/%) --cov-branch --cov-report=term:skip-covered --cov-fail-under=$(FLOOR)
+
 # Damaged files for every reader; Atheris drives them where it installs. What breaks a reader is kept in tests/corpus.
 fuzz: setup
 	-$(PIP) -e ".[fuzz]"
 	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz --minutes $(MINUTES)
+
+# Small changes of the code that a room's fast tests must notice; goes on where it stopped. ROOMS and COUNT say how many.
+mutation: setup
+	$(BIN)/python -m tests.mutation --processes $(PROCESSES) $(ROOMS:%=--rooms %) $(COUNT:%=--count %)
 
 # The page is built anew when its sources have changed; where npm is missing, egs-warp view says what to do.
 setup: $(VENV)/setup.stamp $(if $(shell command -v npm),web)
@@ -67,6 +80,10 @@ egs_warp/web/page.html: $(PAGE)/package-lock.json $(PAGE)/build.mjs $(PAGE)/tsco
 # Wheel and sdist into out/dist, both tried in an empty environment outside of the tree.
 build: setup web
 	VENV=$(VENV) .ci/package
+
+# Beside them a bill of materials and requirements with hashes; ALSO="win_amd64:3.12 ..." adds those of other platforms.
+release: build
+	$(BIN)/python .ci/release.py $(ALSO:%=--also %)
 
 $(VENV)/demo.stamp: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

@@ -9,13 +9,16 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import math
 import os
 import random
 import resource
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -25,43 +28,95 @@ _MEMORY = 256
 """MiB that the readers of a process may take beyond what it began with: its inputs hold some kilobytes."""
 _LARGEST_BUFFER = 4096
 """Bytes from which Hypothesis draws one input."""
-_COLUMNS = ("reader", "inputs", "valid", "refused", "broken", "mib", "by")
+_COUNTS: tuple[str, ...] = ("inputs", "valid", "refused", "broken")
+_PIECE = 20_000
+"""Inputs of one process, where there is a number to reach."""
 _SEED = 20_261_122
 
 
 def main() -> int:
     """Give each reader its share of the time; returns 1 where any promise was broken."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=float, default=10.0, help="for all readers together")
-    parser.add_argument("--inputs", type=int, default=0, help="end a reader after so many, however long (0: never)")
+    parser.add_argument("--minutes", type=float, default=10.0, help="for all readers together (%(default)s)")
+    parser.add_argument("--inputs", type=int, default=0, help="a reader that has had so many is done (0: never)")
     parser.add_argument("--reader", action="append", help="only this one; may be repeated")
-    parser.add_argument("--child", help=argparse.SUPPRESS)
+    parser.add_argument("--processes", type=int, default=1, help="at once (%(default)s)")
+    parser.add_argument("--counts", type=Path, help="adds to the counts of earlier runs, which this file holds")
+    parser.add_argument("--child", nargs=2, metavar=("READER", "SEED"), help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.child:
-        _fuzz(chosen.child, 60.0 * chosen.minutes, chosen.inputs)
+        _fuzz(chosen.child[0], int(chosen.child[1]), 60.0 * chosen.minutes, chosen.inputs)
         return 0
     from tests.support.readers import READERS
 
     names = chosen.reader or [reader.name for reader in READERS]
-    share = chosen.minutes / len(names)
-    print("| reader | inputs | valid | refused | broken | peak MiB | driven by |\n|---|---|---|---|---|---|---|")
-    total, broken = 0, 0
-    for name in names:
-        command = [sys.executable, "-m", "tests.fuzz", "--child", name, "--minutes", str(share)]
-        done = subprocess.run([*command, "--inputs", str(chosen.inputs)], capture_output=True, text=True)
-        lines = [line for line in done.stdout.splitlines() if line.startswith("{")]
-        if not lines:
-            print(f"| {name} | the process died: {done.stderr[-400:]!r} |", flush=True)
-            broken += 1
-            continue
-        found = json.loads(lines[-1])
-        total, broken = total + found["inputs"], broken + found["broken"]
-        print("| " + " | ".join(str(found[key]) for key in _COLUMNS), "|", flush=True)
-    print(f"{total} inputs, {broken} broken promises")
-    return int(broken > 0)
+    tally = Tally(names, chosen.counts)
+    deadline = time.monotonic() + 60.0 * chosen.minutes
+    share = 60.0 * chosen.minutes * chosen.processes / len(names)
+    # With a number of inputs to reach, in pieces that the processes share.
+    rounds = 1 if chosen.inputs == 0 else math.ceil(chosen.inputs / _PIECE)
+    with ThreadPoolExecutor(chosen.processes) as pool:
+        for _ in range(rounds):
+            for name in names:
+                pool.submit(_piece, name, tally, deadline, share, chosen.inputs)
+    return tally.tell()
 
 
-def _fuzz(name: str, seconds: float, inputs: int) -> None:
+class Tally:
+    """Counts of each reader, kept in a file if there is one."""
+
+    def __init__(self, names: list[str], path: Path | None) -> None:
+        self._path, self._lock = path, threading.Lock()
+        self.counts = {name: dict.fromkeys(_COUNTS, 0) | {"mib": 0, "by": ""} for name in names}
+        self.died: list[str] = []
+        self._begun = dict.fromkeys(names, 0)
+        if path is not None and path.is_file():
+            self.counts |= json.loads(path.read_text())
+
+    def seed(self, name: str) -> int:
+        """Of the next piece: another for each, in later runs too."""
+        with self._lock:
+            self._begun[name] += 1
+            return _SEED + self.counts[name]["inputs"] + 1_000_003 * self._begun[name]
+
+    def add(self, name: str, found: dict[str, Any]) -> None:
+        with self._lock:
+            known = self.counts[name]
+            self.counts[name] = {key: known[key] + found[key] for key in _COUNTS}
+            self.counts[name] |= {"mib": max(known["mib"], found["mib"]), "by": found["by"]}
+            if self._path is not None:
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+                self._path.write_text(json.dumps(self.counts, indent=1) + "\n")
+
+    def tell(self) -> int:
+        """A table; returns 1 where a promise was broken."""
+        print("| reader | inputs | valid | refused | broken | peak MiB | driven by |\n|---|---|---|---|---|---|---|")
+        for name, found in self.counts.items():
+            print(f"| {name} |", " | ".join(str(found[key]) for key in (*_COUNTS, "mib", "by")), "|")
+        for line in self.died:
+            print(line)
+        total, broken = (sum(found[key] for found in self.counts.values()) for key in ("inputs", "broken"))
+        print(f"{total} inputs, {broken + len(self.died)} broken promises")
+        return int(broken + len(self.died) > 0)
+
+
+def _piece(name: str, tally: Tally, deadline: float, share: float, inputs: int) -> None:
+    """One process of one reader, to the end of its share of the time or of what it lacks."""
+    seconds = min(deadline - time.monotonic(), share if inputs == 0 else math.inf)
+    lacking = min(inputs - tally.counts[name]["inputs"], _PIECE)
+    if seconds < 1.0 or (inputs and lacking <= 0):
+        return
+    command = [sys.executable, "-m", "tests.fuzz", "--child", name, str(tally.seed(name))]
+    command += ["--minutes", str(seconds / 60.0), "--inputs", str(lacking if inputs else 0)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    lines = [line for line in done.stdout.splitlines() if line.startswith("{")]
+    if lines:
+        tally.add(name, json.loads(lines[-1]))
+    else:
+        tally.died.append(f"{name}: the process died: {done.stderr[-400:]!r}")
+
+
+def _fuzz(name: str, seed: int, seconds: float, inputs: int) -> None:
     """Drive one reader and print what came out as a line of JSON."""
     atheris: Any = None
     if find_spec("atheris") is not None:
@@ -76,7 +131,7 @@ def _fuzz(name: str, seconds: float, inputs: int) -> None:
 
     wp.config.log_level = wp.LOG_ERROR
     reader = next(reader for reader in readers.READERS if reader.name == name)
-    counts = {"inputs": 0, "valid": 0, "refused": 0, "broken": 0}
+    counts: dict[str, int] = dict.fromkeys(_COUNTS, 0)
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         readers.prepare(reader, folder)
@@ -116,11 +171,11 @@ def _fuzz(name: str, seconds: float, inputs: int) -> None:
             one.hypothesis.fuzz_one_input(buffer)  # pyright: ignore[reportFunctionMemberAccess]
 
         if atheris is not None:
-            options = [sys.argv[0], f"-max_len={_LARGEST_BUFFER}", f"-seed={_SEED}", "-verbosity=0", "-rss_limit_mb=0"]
+            options = [sys.argv[0], f"-max_len={_LARGEST_BUFFER}", f"-seed={seed}", "-verbosity=0", "-rss_limit_mb=0"]
             options.append(f"-artifact_prefix={place}/")
             atheris.Setup(options, drive)
             atheris.Fuzz()
-        generator = random.Random(_SEED)
+        generator = random.Random(seed)
         while True:
             drive(generator.randbytes(generator.randint(0, _LARGEST_BUFFER)))
 

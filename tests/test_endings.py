@@ -15,6 +15,7 @@ import pytest
 
 from egs_warp.commands.endings import Ended, one_line_errors
 from egs_warp.errors import UserError
+from egs_warp.io import atomic_write
 
 
 def program(body: str) -> list[str]:
@@ -39,12 +40,32 @@ def ended(body: str) -> tuple[int, str]:
             1,
             "prog: out/a.ply: No space left on device; free some space, or choose another place\n",
         ),
+        (
+            PermissionError(errno.EACCES, "Permission denied", "out/a.ply"),
+            2,
+            "prog: out/a.ply: Permission denied; free some space, or choose another place\n",
+        ),
     ],
 )
 def test_each_end_is_one_line(error: BaseException, status: int, line: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(Ended) as end, one_line_errors("prog"):
         raise error
     assert end.value.code == status and capsys.readouterr().err == line
+
+
+@pytest.mark.parametrize(
+    ("number", "status"),
+    [(errno.ENOSPC, 1), (errno.EDQUOT, 1), (errno.EIO, 1), (errno.EACCES, 2), (errno.EROFS, 2), (errno.ENOTDIR, 2)],
+)
+def test_a_file_that_cannot_be_written(
+    number: int, status: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A full or broken disk is no bad input; a place where one may not write is."""
+    reason = os.strerror(number)
+    with pytest.raises(Ended) as end, one_line_errors("prog"), atomic_write(tmp_path / "a.json"):
+        raise OSError(number, reason)
+    said = f"prog: {tmp_path / 'a.json'}: cannot be written ({reason}); choose another place\n"
+    assert end.value.code == status and capsys.readouterr().err == said
 
 
 def test_errors_of_our_own_keep_their_traceback() -> None:

@@ -1,6 +1,6 @@
 """How a program ends: whatever stops it, it says one line, leaves no half-written file and has a status of its own.
 
-0 done, 1 the machine refused (memory, disk), 2 bad input, 3 written, but fallen or stopped (``animate``), 130 ended by
+0 done, 1 memory or disk gave out, 2 bad input, 3 written, but fallen or stopped (``animate``), 130 ended by
 Ctrl-C, 143 asked to end (SIGTERM).
 """
 
@@ -19,9 +19,10 @@ from typing import Any, NoReturn, TextIO
 from egs_warp.commands.flags import flag_of
 from egs_warp.errors import UserError
 
-_MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENOMEM)
-"""Errors of the machine; others are ours, and keep their traceback."""
-
+_GAVE_OUT = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+"""What a machine runs out of: no input is at fault."""
+_REFUSED = (errno.EROFS, errno.EACCES, errno.EPERM)
+"""Places that are not this user's to write or read. Errors that are in neither are ours, and keep their traceback."""
 
 _AGAIN = 0.05
 """Seconds after which a signal that was lost comes again."""
@@ -39,8 +40,8 @@ class _TerminatedError(BaseException):
 def one_line_errors(program: str) -> Iterator[None]:
     """Whatever stops the ``program`` within prints one line and ends it with a status (``docs/reliability.md``).
 
-    Bad input names flags and ends it with 2. Ctrl-C and SIGTERM unwind once: a second Ctrl-C ends it at once. A pipe
-    that is closed at its other end only silences the program.
+    Bad input names flags and ends it with 2, or with 1 where a machine that gave out is behind it. Ctrl-C and SIGTERM
+    unwind once: a second Ctrl-C ends it at once. A pipe that is closed at its other end only silences the program.
     """
 
     def end(status: int, line: str) -> NoReturn:
@@ -52,7 +53,7 @@ def one_line_errors(program: str) -> Iterator[None]:
         try:
             yield
         except UserError as error:
-            end(2, error.told(flag_of))
+            end(1 if _gave_out(error.__cause__) else 2, error.told(flag_of))
         except KeyboardInterrupt as error:
             end(130, _noted("stopped; finished files are whole, unfinished ones are gone", error))
         except _TerminatedError as error:
@@ -60,10 +61,15 @@ def one_line_errors(program: str) -> Iterator[None]:
         except MemoryError:
             end(1, "not enough memory; give a smaller capture, picture or number of Gaussians")
         except OSError as error:
-            if error.errno not in _MACHINE:
+            if error.errno not in _GAVE_OUT + _REFUSED:
                 raise
             place = f"{error.filename}: " if error.filename else ""
-            end(1, f"{place}{error.strerror}; free some space, or choose another place")
+            end(1 if _gave_out(error) else 2, f"{place}{error.strerror}; free some space, or choose another place")
+
+
+def _gave_out(cause: BaseException | None) -> bool:
+    """Whether an error, or the one behind it, is that the machine has no more of something."""
+    return isinstance(cause, MemoryError) or (isinstance(cause, OSError) and cause.errno in _GAVE_OUT)
 
 
 def _noted(line: str, error: BaseException) -> str:

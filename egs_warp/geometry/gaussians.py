@@ -12,6 +12,9 @@ from egs_warp.launching import device_of
 
 SH_BAND_0 = 0.28209479177387814
 """Spherical harmonic of band 0: a colour is 1/2 + SH_BAND_0 x its coefficient, higher bands apart."""
+LARGEST, LARGEST_LOG_SCALE = 1e18, 41.0
+"""Of any number of a cloud, and of the logarithm of a standard deviation: their squares are finite in single precision.
+"""
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,8 @@ class GaussianCloud:
     ) -> GaussianCloud:
         """Upload (n, 3), (n, 4), (n, 3), (n,), (n, K, 3) arrays; quaternions are normalised.
 
-        Raises ``UserError`` for zero Gaussians, mismatched counts or a non-finite value, which it names.
+        Raises ``UserError`` for zero Gaussians, mismatched counts, and for a value that is not finite or beyond
+        ``LARGEST``, which it names.
         """
         count = len(means)
         if count == 0:
@@ -62,6 +66,16 @@ class GaussianCloud:
                 raise UserError(
                     f"capture: {name} of {len(bad)} Gaussians is not finite (first: number {bad[0]}); "
                     "remove them and export again"
+                )
+            # Of a quaternion only the direction counts.
+            most = {"log_scales": LARGEST_LOG_SCALE, "rotations": np.inf}.get(name, LARGEST)
+            large = np.reshape(values, (count, -1)).max(axis=1) > most
+            if name != "log_scales":
+                large |= np.reshape(values, (count, -1)).min(axis=1) < -most
+            if large.any():
+                raise UserError(
+                    f"capture: {name} of {np.count_nonzero(large)} Gaussians is too large for single precision"
+                    f" (first: number {np.argmax(large)}); remove them and export again"
                 )
         if np.shape(sh)[1] not in (1, 4, 9, 16):
             raise UserError(f"capture: {np.shape(sh)[1]} SH coefficients, expected 1, 4, 9 or 16 (degree 0 to 3)")
@@ -94,7 +108,8 @@ class GaussianCloud:
 
     def opacities(self) -> np.ndarray:
         """(n,) float64 on the host, 0 to 1."""
-        return 1.0 / (1.0 + np.exp(-self.opacity_logits.numpy().astype(np.float64)))
+        with np.errstate(over="ignore"):
+            return 1.0 / (1.0 + np.exp(-self.opacity_logits.numpy().astype(np.float64)))
 
     def scaled(self, factor: float) -> GaussianCloud:
         """The same capture with every length multiplied by ``factor``."""
@@ -125,6 +140,13 @@ def unit_quaternions(quaternions: np.ndarray) -> np.ndarray:
     Quaternions that are unit already, to rounding, keep their bits, so that a capture survives any number of copies.
     """
     lengths = np.sqrt(np.einsum("ni,ni->n", quaternions, quaternions, dtype=np.float64))
+    far = ~np.isfinite(lengths) | (lengths < 1e-150)
+    if far.any():
+        # Doubles whose squares are no numbers, or none at all, and zeros.
+        largest = np.abs(quaternions[far]).max(axis=1, keepdims=True)
+        quaternions = np.array(quaternions, dtype=np.float64)
+        quaternions[far] /= np.where(largest > 0.0, largest, 1.0)
+        lengths[far] = np.linalg.norm(quaternions[far], axis=1)
     off = np.abs(lengths - 1.0) > 2.0**-22
     unit = np.array(quaternions, dtype=np.float32)
     unit[off] = quaternions[off] / np.maximum(lengths[off], 1e-300)[:, None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import time
@@ -19,6 +20,7 @@ except ImportError:
     fcntl = None
 
 _TEMPORARY = re.compile(r"\.egs-[0-9a-f]{16}(\..*)?")
+_TOLD = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.EACCES)
 _YOUNGEST = 2.0
 """Seconds: a file that is younger may not have been locked yet."""
 
@@ -131,6 +133,14 @@ def _locked(descriptor: int) -> bool:
 
 def _temporary_name(folder: Path, suffix: str) -> Path:
     return folder / f".egs-{uuid.uuid4().hex[:16]}{suffix}"
+
+
+def system_error(told: str) -> OSError | None:
+    """What other programs and libraries tell of the system, such as a full disk, as the error that Python has for it;
+    None where they tell of something else.
+    """
+    number = next((number for number in _TOLD if os.strerror(number) in told), None)
+    return None if number is None else OSError(number, os.strerror(number))
 
 
 def _reason(error: OSError) -> str:

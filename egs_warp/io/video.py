@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
+import signal
 import subprocess
 import tempfile
 from collections.abc import Sequence
@@ -12,7 +15,7 @@ from types import TracebackType
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.io.atomic import atomic_write
+from egs_warp.io.atomic import atomic_write, system_error
 
 
 def write_png(path: Path | str, image: np.ndarray) -> None:
@@ -88,6 +91,8 @@ class _AbandonedError(Exception):
     """Ends the writing of a video that failed."""
 
 
+_TOO_LARGE = getattr(signal, "SIGXFSZ", 0)
+"""The signal that ends a program whose file outgrows what its user may write; Windows has none."""
 _BT709 = ("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709")
 _CODECS = {
     ".mp4": ("mp4", "libx264", "yuv420p", ("-preset", "medium", "-movflags", "+faststart")),
@@ -173,7 +178,7 @@ class VideoWriter:
         try:
             self._process.stdin.write(np.ascontiguousarray(frame).data)
         except BrokenPipeError as error:
-            raise self._failure() from error
+            raise self._failure() from (self._refusal() or error)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -186,7 +191,7 @@ class VideoWriter:
             with contextlib.suppress(BrokenPipeError):
                 self._process.stdin.close()
             if self._process.wait() != 0 and kind is None:
-                raise self._failure()
+                raise self._failure() from self._refusal()
         except BaseException:
             self._abandon()
             raise
@@ -200,7 +205,18 @@ class VideoWriter:
         self._files.__exit__(_AbandonedError, _AbandonedError(), None)
 
     def _failure(self) -> UserError:
+        lines = self._said().splitlines()
+        reason = self._refusal()
+        told = reason.strerror if reason is not None else lines[-1] if lines else "no message"
+        return UserError(f"{self._path}: ffmpeg could not write the video ({told})")
+
+    def _refusal(self) -> OSError | None:
+        """Of the system: a full disk, say."""
+        if self._process.wait() == -_TOO_LARGE:
+            return OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+        return system_error(self._said())
+
+    def _said(self) -> str:
         self._process.wait()
         self._log.seek(0)
-        lines = self._log.read().decode(errors="replace").strip().splitlines()
-        return UserError(f"{self._path}: ffmpeg could not write the video ({lines[-1] if lines else 'no message'})")
+        return self._log.read().decode(errors="replace").strip()

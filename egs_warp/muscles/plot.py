@@ -10,6 +10,7 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.geometry.frames import square_to
 from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.io.atomic import atomic_write
 from egs_warp.muscles.fibres import FibreKind
 from egs_warp.muscles.muscle_set import MuscleSet
 
@@ -48,12 +49,10 @@ def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarra
     panels = [_panel(title, np.stack(axes), mesh, muscles) for title, axes in views.items()]
     image = np.concatenate([np.concatenate(panels, axis=1), _legend(muscles, 3 * _PANEL)])
     written, data = cv2.imencode(path.suffix, image)
-    try:
-        if not written:
-            raise OSError("encoding failed")
-        path.write_bytes(data.tobytes())
-    except OSError as error:
-        raise UserError(f"{path}: cannot write the picture ({error.strerror or error}); choose another place") from None
+    if not written:
+        raise UserError(f"{path}: the picture could not be encoded; give another ending")
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(data.tobytes())
 
 
 def _panel(title: str, axes: np.ndarray, mesh: TetMesh, muscles: MuscleSet) -> np.ndarray:

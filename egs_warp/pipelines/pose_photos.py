@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.io.atomic import writable_folder
@@ -84,7 +85,7 @@ def pose_photos(
         unreadable = () if is_video else _copied(source, images)
         if is_video:
             for frame in sharp_frames(source, frames):
-                cv2.imwrite(str(images / f"frame_{frame.number:06d}.jpg"), frame.pixels, [cv2.IMWRITE_JPEG_QUALITY, 95])
+                _write_picture(images / f"frame_{frame.number:06d}.jpg", frame.pixels, quality=95)
         for reason in unreadable:
             say(f"left out {reason}")
         names = sorted(path.relative_to(images).as_posix() for path in images.rglob("*") if path.is_file())
@@ -127,8 +128,14 @@ def _copied(source: Path, images: Path) -> tuple[str, ...]:
             shutil.copyfile(path, target)
         else:
             # Written without the tag: programs differ in whether they heed it.
-            cv2.imwrite(str(target), turned(pixels, turn), [cv2.IMWRITE_JPEG_QUALITY, 97])
+            _write_picture(target, turned(pixels, turn), quality=97)
     return tuple(unreadable)
+
+
+def _write_picture(path: Path, pixels: np.ndarray, *, quality: int) -> None:
+    """(H, W, 3) uint8 BGR. OpenCV's own writer keeps silent about a full disk."""
+    _, data = cv2.imencode(path.suffix.lower(), pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    path.write_bytes(data.tobytes())
 
 
 def _reconstructed(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,7 @@ from tqdm import tqdm
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud, with_degree
-from egs_warp.io.atomic import atomic_write
+from egs_warp.io.atomic import atomic_write, system_error
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.pipelines.export import chosen_frames
 from egs_warp.pipelines.finished_run import FinishedRun
@@ -35,7 +37,7 @@ def export_usd(run: FinishedRun, path: Path, *, every: int = 1, degree: int | No
         raise UserError(f"{path}: give a name that ends in .usdc or .usda")
     frames = chosen_frames(run, frame=None, every=every)
     t = run.trajectory
-    with atomic_write(path) as temporary:
+    with atomic_write(path) as temporary, _system_errors():
         stage = Usd.Stage.CreateNew(str(temporary))
         UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
         UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -88,6 +90,18 @@ def export_usd(run: FinishedRun, path: Path, *, every: int = 1, degree: int | No
             _write_sample(scene, still, Usd.TimeCode.Default(), Vt)
         stage.GetRootLayer().Save()
         del stage
+
+
+@contextmanager
+def _system_errors() -> Iterator[None]:
+    """USD's own errors, as Python's where they tell of the system."""
+    try:
+        yield
+    except RuntimeError as error:
+        cause = system_error(str(error))
+        if cause is None:
+            raise
+        raise cause from error
 
 
 def _modules() -> tuple[Any, ...]:

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from egs_warp.contact.coupled_step import ContactResponse, CoupledResult
+from egs_warp.contact.detection import ContactDetector
 from egs_warp.fem.body import BodyState, SoftBody, make_body
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.plane import Plane
@@ -270,3 +271,15 @@ def test_foreseen_forces_press_and_rub_no_more_than_they_may() -> None:
         np.testing.assert_allclose(along[sliding], -(pull * slip)[sliding], rtol=1e-4)
         kinds |= set(np.where(forces[:, 0] == 0.0, "free", np.where(sliding, "slides", "sticks")).tolist())
     assert kinds == {"free", "slides", "sticks"}
+
+
+def test_a_step_that_nothing_joins_is_solved_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It looks at the gaps of its start and of its end, and not again."""
+    resting = block(sag=0.01, damping_ratio=0.5)
+    for _ in range(5):
+        resting.advance(DT)
+    looks, gaps = [], ContactDetector.gaps
+    monkeypatch.setattr(ContactDetector, "gaps", lambda *given: looks.append(1) or gaps(*given))
+    _, result = resting.advance(DT)
+    # Two more are of the choice of points and of the contact set, before the step.
+    assert result.converged and result.contacts.count > 4 and len(looks) == 4

@@ -64,3 +64,20 @@ def test_forces_go_with_their_points_and_the_deep_join(geometry: ContactGeometry
     gaps = gaps_of(geometry) - 0.006
     deep = points.deeper(np.array([int(np.argmin(gaps))]), gaps, 0.005)
     assert len(deep) and (gaps[deep] < -0.005).all() and int(np.argmin(gaps)) not in deep
+
+
+def test_cells_are_as_few_wherever_the_ground_is() -> None:
+    """A wide body that begins above the ground has the cells under it that it has where it stands."""
+    mesh = block_mesh(7, 7, 3, (1.2, 1.2, 0.4))
+    side = np.linspace(-0.6, 0.6, 30)
+    embedding = embed_points(mesh, np.array([[x, y, 0.0] for x in side for y in side]), device="cpu")
+    points = [
+        ContactPoints(
+            ContactGeometry(mesh, (floor,), 0.8, embedding.tets.numpy(), embedding.weights.numpy(), 0, 0.0),
+            near=NEAR,
+            lower=1e-3,
+        )
+        for floor in (Plane(np.array([0.0, 0.0, 1.0]), 0.0), Plane(np.array([0.0, 0.0, 1.0]), 0.3))
+    ]
+    assert 0.5 * MOST_AT_REST < len(np.unique(points[0].cell_from_point)) <= MOST_AT_REST
+    assert np.array_equal(points[0].cell_from_point, points[1].cell_from_point)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import warp as wp
@@ -18,6 +20,7 @@ from egs_warp.kernels.deformation.spherical_harmonics import rotate_sh_kernel
 from egs_warp.launching import launch_rows
 from egs_warp.render import render_gaussians
 from tests.support.carrying_scenes import bent, box, covariances, matrices, random_cloud
+from tests.support.kernels import orders_kernel, rotation_parts_kernel, signed_kernel
 
 
 def colours(sh: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -313,3 +316,60 @@ def test_one_pass_on_cuda_equals_two_on_the_cpu(count: int) -> None:
     np.testing.assert_allclose(result.cloud.means.numpy(), expected.cloud.means.numpy(), atol=2e-6)
     np.testing.assert_allclose(covariances(result.cloud), covariances(expected.cloud), atol=1e-6)
     np.testing.assert_allclose(result.cloud.sh.numpy(), expected.cloud.sh.numpy(), atol=1e-4)
+
+
+def turns_of(count: int, seed: int) -> np.ndarray:
+    """(count, 3, 3) random rotations."""
+    return Rotation.from_quat(np.random.default_rng(seed).normal(size=(count, 4))).as_matrix()
+
+
+def test_the_rotation_of_a_map_that_flattens_is_that_of_its_plane(device: str) -> None:
+    """Eq. (15): of F with a singular value that is zero, or nearly, the polar decomposition by SciPy's SVD with
+    det = +1, in any order of the other two.
+    """
+    stretches = [(1.0, 0.4, 0.0), (1.0, 0.0, 0.4), (0.4, 1.0, 0.0), (0.0, 0.4, 1.0), (0.4, 0.0, 1.0), (0.0, 1.0, 0.4)]
+    stretches += [(1.0, 1e-9, 0.3), (0.3, 1.0, -0.05), (-0.05, 0.3, 1.0), (0.9, -0.02, 0.4)]
+    for turned in (False, True):
+        sides = turns_of(len(stretches), 1) if turned else np.eye(3)
+        turns = turns_of(len(stretches), 2)
+        maps = turns @ sides @ (np.array(stretches)[:, :, None] * np.swapaxes(sides * np.ones((10, 1, 1)), 1, 2))
+        given = wp.array(maps.astype(np.float32), dtype=wp.mat33, device=device)
+        found = wp.zeros(len(maps), dtype=wp.mat33, device=device)
+        wp.launch(rotation_parts_kernel, len(maps), inputs=[given], outputs=[found], device=device)
+        left, _, right = np.linalg.svd(maps)
+        left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
+        np.testing.assert_allclose(found.numpy(), left @ right, atol=2e-5)
+
+
+def test_axes_keep_their_order(device: str) -> None:
+    """Of the six orders of a frame's columns the one whose columns are best aligned with the carried, by trying."""
+    count = 200
+    frames = turns_of(count, 4)
+    carried = np.random.default_rng(10).normal(size=(count, 3, 3))
+    given = [wp.array(maps.astype(np.float32), dtype=wp.mat33, device=device) for maps in (frames, carried)]
+    out = wp.zeros(count, dtype=wp.vec3i, device=device)
+    wp.launch(orders_kernel, count, inputs=given, outputs=[out], device=device)
+    found = [tuple(order) for order in out.numpy()]
+    for frame, target, order in zip(frames, carried, found, strict=True):
+        aligned = {p: np.abs((frame[:, p] * target).sum(axis=0)).sum() for p in itertools.permutations(range(3))}
+        assert order == max(aligned, key=lambda p: float(aligned[p]))
+    assert set(found) == set(itertools.permutations(range(3)))
+
+
+def test_axes_keep_the_side_that_they_were_carried_to(device: str) -> None:
+    """Of the four choices of signs with det = +1 the one whose columns lie nearest to the carried ones, by trying."""
+    count, random = 200, np.random.default_rng(9)
+    frames = turns_of(count, 3)
+    orders = np.array([random.permutation(3) for _ in range(count)])
+    carried = random.normal(size=(count, 3, 3))
+    out = wp.zeros(count, dtype=wp.mat33, device=device)
+    given = (
+        wp.array(frames.astype(np.float32), dtype=wp.mat33, device=device),
+        wp.array(orders, dtype=wp.vec3i, device=device),
+        wp.array(carried.astype(np.float32), dtype=wp.mat33, device=device),
+    )
+    wp.launch(signed_kernel, count, inputs=[*given], outputs=[out], device=device)
+    for frame, order, target, got in zip(frames, orders, carried, out.numpy(), strict=True):
+        choices = [frame[:, order] * signs for signs in itertools.product((1.0, -1.0), repeat=3)]
+        proper = [choice for choice in choices if np.linalg.det(choice) > 0.0]
+        np.testing.assert_allclose(got, max(proper, key=lambda choice: float((choice * target).sum())), atol=1e-6)

@@ -170,3 +170,20 @@ def test_a_split_at_rest_cannot_be_seen(data_dir: Path) -> None:
         )
         pictures = [render_gaussians(each, camera).colour.numpy() for each in (cloud, split.cloud)]
         assert -10.0 * np.log10(np.mean((pictures[0] - pictures[1]) ** 2)) >= 45.0
+
+
+def test_children_are_as_opaque_as_the_rules_say() -> None:
+    """Eq. (17): the paper's two share the mass, sigma^2 of each 1 - 2 / pi, peaks at most 0.99; of the measured three
+    none is more opaque than the parent, the middle one more than the outer ones, all more with the parent.
+    """
+    opacities = np.linspace(0.0, 1.0, 401)
+    pair = child_opacities(opacities, SplitRule.PAPER)
+    peaks = 0.5 * opacities / np.sqrt(1.0 - 2.0 / np.pi)
+    np.testing.assert_allclose(pair, np.repeat(np.minimum(peaks, 0.99)[:, None], 2, axis=1), rtol=1e-12)
+    outer, middle, other = child_opacities(opacities, SplitRule.MEASURED).T
+    np.testing.assert_array_equal(outer, other)
+    assert outer[0] == middle[0] == 0.0 and (np.diff(outer) > 0.0).all() and (np.diff(middle) > 0.0).all()
+    assert (outer[1:] < middle[1:]).all() and (middle[1:] < opacities[1:]).all()
+    # Along the middle axis faint children add up to the parent: 2 outer exp(-1) + middle, to 3 %.
+    faint = slice(1, 9)
+    np.testing.assert_allclose(2.0 * outer[faint] * np.exp(-1.0) + middle[faint], opacities[faint], rtol=0.035)

@@ -11,10 +11,10 @@ import scipy.sparse as sparse
 from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import UserError
-from egs_warp.fem.body import GRAVITY, SoftBody, make_body
+from egs_warp.fem.body import GRAVITY, LARGEST_HEIGHT, LARGEST_SINK, SMALLEST_HEIGHT, SoftBody, make_body
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
-from tests.support.meshes import block_mesh, box_mesh
+from tests.support.meshes import block_mesh, box_mesh, coarse_stool
 
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 
@@ -35,6 +35,8 @@ def test_material_follows_from_height() -> None:
         assert np.allclose(made.gravity, -GRAVITY * np.array(normal))
         assert made.mass == pytest.approx(800.0 * mesh.volumes().sum())
         assert made.weight == pytest.approx(made.mass * GRAVITY)
+        assert made.time_unit == pytest.approx(np.sqrt(height / GRAVITY))
+        assert made.speed_unit == pytest.approx(np.sqrt(GRAVITY * height))
 
 
 def test_damping_ratio_of_the_first_mode(body: SoftBody) -> None:
@@ -87,6 +89,12 @@ def test_a_height_that_no_body_has_is_refused(scale: float) -> None:
         make_body(TetMesh(mesh.nodes * scale, mesh.tets), FLOOR, device="cpu")
 
 
+def test_the_smallest_and_the_largest_body_are_bodies() -> None:
+    for height in (SMALLEST_HEIGHT, LARGEST_HEIGHT):
+        mesh = box_mesh((2, 2, 2), (0.4 * height, 0.4 * height, height))
+        assert make_body(mesh, FLOOR, device="cpu").height == height
+
+
 def test_a_body_that_hangs_on_an_edge_is_refused() -> None:
     """Two boxes that share an edge are hinged: the upper one swings free, which no damping of a first mode can hold."""
     box = box_mesh((1, 1, 1), (1.0, 1.0, 1.0))
@@ -97,3 +105,21 @@ def test_a_body_that_hangs_on_an_edge_is_refused() -> None:
     tets = merged.ravel()[np.concatenate([box.tets, box.tets + len(box.nodes)])].astype(np.int32)
     with pytest.raises(UserError, match="nodes: the cage has parts that hang on a corner or an edge alone; give it"):
         make_body(TetMesh(nodes, tets), FLOOR, device="cpu")
+
+
+def test_a_body_on_thin_legs_is_stiffened_until_it_sinks_by_two_percent() -> None:
+    """docs/concepts/cage.md: its centre of mass, linearly and by a dense solve, with the nodes of its base held; a
+    column, which sinks less, stays as soft as it is.
+    """
+    for mesh, stiffened in ((coarse_stool(), True), (box_mesh((2, 2, 4), (0.8, 0.8, 2.0)), False)):
+        made = make_body(mesh, FLOOR, sag=0.05, device="cpu")
+        upper = made.assembly.matrix(made.assembly.hessian_entries(mesh.nodes))
+        free = np.repeat(mesh.nodes[:, 2] > 0.05 * made.height, 3)
+        stiffness = (upper + sparse.triu(upper, 1).T).toarray()[free][:, free]
+        moved = np.zeros(3 * len(mesh.nodes))
+        moved[free] = np.linalg.solve(stiffness, (made.node_mass[:, None] * made.gravity).ravel()[free])
+        sink = -made.centre_of_mass(moved.reshape(-1, 3))[2]
+        if stiffened:
+            assert made.stiffening > 1.5 and sink == pytest.approx(LARGEST_SINK * made.height, rel=1e-6)
+        else:
+            assert made.stiffening == pytest.approx(1.0) and sink < LARGEST_SINK * made.height

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io import read_capture, write_ply
@@ -24,8 +25,14 @@ def spoiled(path: Path, rows: slice | list[int], *, sh: float = 0.0, **values: f
         arrays[name][rows] = value
     coefficients = GOOD.sh.numpy().copy()
     coefficients[rows, -1] += np.float32(sh)
-    write_ply(path, GaussianCloud.from_numpy(sh=coefficients, device="cpu", **arrays))
+    write_ply(path, unchecked(arrays | {"sh": coefficients}))
     return path
+
+
+def unchecked(arrays: dict[str, np.ndarray]) -> GaussianCloud:
+    """With numbers that ``GaussianCloud.from_numpy`` refuses."""
+    kinds = {name: getattr(GOOD, name).dtype for name in arrays}
+    return GaussianCloud(**{name: wp.array(value, dtype=kinds[name], device="cpu") for name, value in arrays.items()})
 
 
 @pytest.mark.parametrize(

@@ -66,6 +66,21 @@ def test_an_ffmpeg_that_does_not_start_leaves_nothing(tmp_path: Path, monkeypatc
     assert os.listdir(tmp_path) == []
 
 
+def test_what_ffmpeg_says_of_a_full_disk_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the reason, with the error behind it that decides the exit status; other words of its are told as they are."""
+    for said, number in (("[out#0] Error: No space left on device", errno.ENOSPC), ("Unknown encoder", None)):
+        program = tmp_path / "ffmpeg"
+        program.write_text(f"#!/bin/sh\ncat > /dev/null\necho '{said}' >&2\nexit 1\n")
+        program.chmod(0o755)
+        monkeypatch.setattr("egs_warp.io.video.ffmpeg_program", lambda program=program: str(program))
+        with pytest.raises(UserError) as caught, VideoWriter(tmp_path / "v.mp4", 16, 16) as video:
+            video.write(np.zeros((16, 16, 3), np.uint8))
+        reason = said if number is None else os.strerror(number)
+        assert str(caught.value) == f"{tmp_path / 'v.mp4'}: ffmpeg could not write the video ({reason})"
+        assert getattr(caught.value.__cause__, "errno", None) == number
+    assert os.listdir(tmp_path) == ["ffmpeg"]
+
+
 def test_unwritable_places_are_named(tmp_path: Path) -> None:
     missing = tmp_path / "missing" / "v.mp4"
     with pytest.raises(UserError, match=r"v\.mp4: its folder does not exist; create .*missing first"):

@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from egs_warp.locomotion import audit as module
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.trajectory import Trajectory
 from tests.support.flights import rigid_flight
 from tests.support.places import DT
 from tests.support.slides import slide
+from tests.support.waves import wavy_ground
 
 
 @pytest.fixture
@@ -115,3 +117,20 @@ def test_lost_momenta_are_seen_where_contact_and_drag_act() -> None:
     spun = np.concatenate([t.velocities[:-1], t.velocities[-1:] + np.cross([0.0, 0.0, 0.01], arms)])
     found = audit(replace(t, velocities=spun))
     assert found.angular_momentum_residual > 1e-4 and found.momentum_residual < 1e-8
+
+
+def test_uneven_ground_is_that_of_the_height_field(flight: Trajectory) -> None:
+    """The audit's own heights and normals, by SciPy's splines, at points of waves: those of the field to 1e-6."""
+    field = wavy_ground(0.05)
+    t = replace(
+        flight,
+        ground_axes=field.axes,
+        ground_origin=field.origin,
+        ground_spacing=field.spacing,
+        ground_coefficients=field.coefficients,
+    )
+    points = np.random.default_rng(2).uniform(-1.5, 1.5, (200, 3))
+    lift, normals = module._ground(t, points)
+    np.testing.assert_allclose(lift, field.lift(points), atol=1e-9)
+    np.testing.assert_allclose(normals, field.frames(points)[:, 0], atol=1e-6)
+    assert np.ptp(normals[:, 0]) > 0.3 and np.ptp(normals[:, 1]) > 0.2

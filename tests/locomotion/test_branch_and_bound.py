@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egs_warp.locomotion.branch_and_bound import exact_states
+from egs_warp.locomotion.branch_and_bound import ExactResult, exact_states
 from egs_warp.locomotion.complementarity import STATIC
 from tests.support.contact_programs import optimum_of_each, small_problem
 
@@ -47,3 +47,11 @@ def test_a_limit_is_not_called_a_proof() -> None:
     assert cut is not None and not cut.proved
     assert cut.bound < whole.objective <= cut.objective + 1e-9
     assert exact_states(program, qp_limit=1) is None
+
+
+@pytest.mark.parametrize("objective", [0.0, 0.3, -4.0, 1e3])
+def test_what_a_proof_may_leave_open(objective: float) -> None:
+    """A millionth of the objective, or of one where that is more."""
+    for share, proved in ((0.9e-6, True), (1.1e-6, False)):
+        bound = objective - share * (1.0 + abs(objective))
+        assert ExactResult(np.zeros(1), np.zeros(1, int), objective, bound, 1).proved == proved

@@ -10,7 +10,7 @@ import pytest
 
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import UnsolvableStepError
-from egs_warp.locomotion.rollout import Simulation, roll_out
+from egs_warp.locomotion.rollout import Simulation, roll_out, settle
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
@@ -62,3 +62,18 @@ def test_steps_that_have_no_solution(made: CoarseCreature) -> None:
         done = run(made, start)
         assert done.stopped and len(done.reports) == 0 and done.frames.tolist() == [0]
         assert done.trajectory.activations.shape == (0, made.stepper.muscles.segment_count)
+
+
+def test_a_body_that_stands_still_is_settled_in_few_steps(
+    made: CoarseCreature, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ends where another long step would move it by less than 2e-4 of its height, its weight carried, before the
+    last of twelve.
+    """
+    steps, passive = [], LocomotionStepper.passive_step
+    monkeypatch.setattr(LocomotionStepper, "passive_step", lambda *given: steps.append(1) or passive(*given))
+    state, body = settle(made.stepper), made.stepper.body
+    assert 1 < len(steps) < 12
+    more = made.stepper.passive_step(state, made.stepper.initial_memory(), 0.25 * body.time_unit)
+    assert 0.25 * body.time_unit * np.abs(more.velocities).max() < 2e-4 * body.height
+    assert more.forces[:, 0].sum() == pytest.approx(body.weight, rel=0.01)

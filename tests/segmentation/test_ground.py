@@ -9,14 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.capture import read_capture
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, on_its_ground
+from egs_warp.segmentation import ground as module
 from egs_warp.segmentation.ground import MeasuredGround, measure_ground
 from egs_warp.segmentation.object_mask import ObjectSpec, segment
-from tests.support.grounds import RADIUS, ball, on_folds
+from tests.support.grounds import RADIUS, ball, level, on_folds, sheet
 from tests.support.waves import wave
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -143,3 +145,19 @@ def test_ground_reaches_up_to_what_stands_on_it() -> None:
     assert np.abs(lifted[known]).max() < 1e-9 and lifted.max() == pytest.approx(field.heights(means).min())
     # What hovers is not stood on.
     assert measured.touched_by(ball(0.2), 1.0) is field
+
+
+def test_what_the_object_hid_is_not_taken_for_ground() -> None:
+    """A floor with a hole under a ball, and another floor far below: through the hole one sees the lower one."""
+    up = np.array([[0.0, 0.0, 1.0]])
+    top = level((-2.0, -2.0), (2.0, 2.0), 0.0, 0.04)
+    top = top[np.linalg.norm(top[:, :2], axis=1) > 0.4]
+    below = level((-4.0, -4.0), (4.0, 4.0), -1.0, 0.08)
+    floors = [
+        sheet(part, np.repeat(up, len(part), axis=0), gap, (0.5, 0.5, 0.5))
+        for part, gap in ((top, 0.04), (below, 0.08))
+    ]
+    bare = joined(*floors)
+    camera = Camera.look_at(np.array([0.3, -0.3, 4.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]), width=64, height=64)
+    seen = module._seen_points(joined(bare, ball()), bare, camera)
+    assert len(seen) > 1000 and np.abs(seen[:, 2]).max() < 0.05

@@ -236,3 +236,20 @@ def test_point_at_hits_the_surface() -> None:
     camera = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.8, count=1, size=128)[0]
     hit = point_at(cloud, camera, 64.0, 64.0)
     np.testing.assert_allclose(np.linalg.norm(hit - [0.0, 0.0, 0.5]), 0.5, atol=0.03)
+
+
+def test_a_click_finds_what_is_small_in_a_large_room() -> None:
+    """A ball of one unit between walls that are 120 apart: guesses of its size are halved until it is found."""
+    cloud, truth = ball_on_floor()
+    line = np.linspace(-60.0, 60.0, 60)
+    walls = [np.column_stack([np.full(60, x), line, np.full(60, z)]) for x in (-60.0, 60.0) for z in (0.5, 1.5)]
+    means = np.concatenate([cloud.means.numpy(), *walls])
+    count = len(means) - cloud.count
+    whole = GaussianCloud.from_numpy(
+        means,
+        np.tile([1.0, 0.0, 0.0, 0.0], (len(means), 1)),
+        np.concatenate([cloud.log_scales.numpy(), np.full((count, 3), -2.0)]),
+        np.concatenate([cloud.opacity_logits.numpy(), np.full(count, 3.0)]),
+        np.concatenate([cloud.sh.numpy(), np.zeros((count, *cloud.sh.shape[1:], 3))]),
+    )
+    check(whole, np.concatenate([truth, np.zeros(count, bool)]), ObjectSpec(point=np.array([0.0, -0.5, 0.5])))

@@ -58,17 +58,18 @@ def passive_body(
     friction: float = 0.5,
     state: BodyState | None = None,
     tolerance: float = 1e-8,
+    device: str = "cpu",
 ) -> PassiveBody:
     """``body`` over ``plane`` with contact points at ``places`` (P, 3) of its rest shape, one at its middle if it is to
     fly; at rest unless ``state`` is given.
     """
     nodes = body.mesh.nodes
     middle = body.mesh.nodes[body.mesh.tets[len(body.mesh.tets) // 2]].mean(axis=0)
-    soles = embed_points(body.mesh, middle[None] if places is None else places, device="cpu")
+    soles = embed_points(body.mesh, middle[None] if places is None else places, device=device)
     geometry = ContactGeometry(body.mesh, (plane,), friction, soles.tets.numpy(), soles.weights.numpy(), 0, 0.0)
     height = body.height
     solver = CoupledSolver(
-        ContactDetector(geometry, device="cpu"),
+        ContactDetector(geometry, device=device),
         ContactPoints(geometry, near=0.01 * height, lower=1e-3 * height),
         SparseFactors(body.assembly.upper_pattern),
         push_out_cap=0.05 * float(np.sqrt(np.linalg.norm(body.gravity) * height)),

@@ -210,17 +210,8 @@ def element_projected_hessians_kernel(
     u = Mat33()
     s = Vec3()
     v = Mat33()
+    # u and v are rotations: what mirrors is in the sign of s.
     wp.svd3(f, u, s, v)
-    if wp.determinant(u) < real(0.0):
-        u = wp.matrix_from_cols(
-            Vec3(u[0, 0], u[1, 0], u[2, 0]), Vec3(u[0, 1], u[1, 1], u[2, 1]), -Vec3(u[0, 2], u[1, 2], u[2, 2])
-        )
-        s = Vec3(s[0], s[1], -s[2])
-    if wp.determinant(v) < real(0.0):
-        v = wp.matrix_from_cols(
-            Vec3(v[0, 0], v[1, 0], v[2, 0]), Vec3(v[0, 1], v[1, 1], v[2, 1]), -Vec3(v[0, 2], v[1, 2], v[2, 2])
-        )
-        s = Vec3(s[0], s[1], -s[2])
     pressure = lam * wp.log(s[0] * s[1] * s[2]) - mu
     scaling = Mat33()
     direct = Mat33()

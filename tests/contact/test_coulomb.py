@@ -1,0 +1,77 @@
+"""Contact forces for a given Delassus operator: the sweeps against a slow twin, and what the answer must fulfil where
+tangents differ. The laws themselves are in ``test_detection.py``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+
+from egs_warp.contact.coulomb import coulomb_forces
+from egs_warp.kernels.contact.coulomb import gauss_seidel_kernel
+
+COUNT = 5
+
+
+def problem(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A Delassus operator (3n, 3n) in which one tangent is nine times as soft as the other, now the first, now the
+    second; velocities (3n,) that press and slide, shifts (n,) and forces (n, 3) to start from.
+    """
+    random = np.random.default_rng(seed)
+    soft = np.where(np.arange(COUNT)[:, None] % 2, [1.0, 0.6, 1.8], [1.0, 1.8, 0.6])
+    half = random.normal(size=(3 * COUNT, 3 * COUNT + 4)) * soft.reshape(-1, 1)
+    start = np.abs(random.normal(size=(COUNT, 3)))
+    return half @ half.T, random.normal(size=3 * COUNT), 0.1 * random.normal(size=COUNT), start
+
+
+def swept_twin(
+    delassus: np.ndarray, free: np.ndarray, shift: np.ndarray, friction: float, start: np.ndarray, sweeps: int
+) -> np.ndarray:
+    """Contact by contact: the normal force that stops its approach, then the tangents', shortened to the cone."""
+    f = start.ravel().copy()
+    for _ in range(sweeps):
+        for n in range(0, 3 * COUNT, 3):
+            u = free[n : n + 3] + delassus[n : n + 3] @ f
+            change = max(f[n] - (u[0] + shift[n // 3]) / delassus[n, n], 0.0) - f[n]
+            softest = max(delassus[n + 1, n + 1], delassus[n + 2, n + 2])
+            pull = f[n + 1 : n + 3] - (u[1:] + delassus[n + 1 : n + 3, n] * change) / softest
+            f[n] += change
+            f[n + 1 : n + 3] = pull * min(1.0, friction * f[n] / max(np.linalg.norm(pull), 1e-300))
+    return f.reshape(-1, 3)
+
+
+@pytest.mark.parametrize("sweeps", [1, 3])
+@pytest.mark.parametrize("friction", [0.0, 0.4, 5.0])
+def test_sweeps_equal_their_twin(friction: float, sweeps: int) -> None:
+    """Eq. (8), (9): to rounding, where contacts separate, stick and slide."""
+    kinds = set()
+    for seed in range(60):
+        delassus, free, shift, start = problem(seed)
+        forces = wp.array(start.ravel(), dtype=wp.float64, device="cpu")
+        given = [wp.array(value, device="cpu") for value in (delassus, free, shift)]
+        wp.launch(gauss_seidel_kernel, dim=1, inputs=[*given, friction, sweeps, forces], device="cpu")
+        got = forces.numpy().reshape(-1, 3)
+        expected = swept_twin(delassus, free, shift, friction, start, sweeps)
+        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12 * max(1.0, np.abs(expected).max()))
+        slack = friction * got[:, 0] - np.linalg.norm(got[:, 1:], axis=1)
+        kinds |= set(np.where(got[:, 0] == 0.0, "free", np.where(slack > 1e-9, "stick", "slide")).tolist())
+    assert kinds == {"free", "slide"} | ({"stick"} if friction else set())
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.4, 1.5])
+def test_the_answer_obeys_where_tangents_differ(friction: float) -> None:
+    """Eq. (8), (9): complementarity, the cone, and friction straight against the slip, to 1e-9, from any start."""
+    for seed in range(6):
+        delassus, free, shift, start = problem(seed)
+        forces, size = coulomb_forces(delassus, free, shift, friction, start)
+        speed = (free + delassus @ forces.ravel()).reshape(-1, 3)
+        normal = speed[:, 0] + shift
+        assert size < 1e-9 and forces[:, 0].min() >= 0.0 and normal.min() > -1e-9
+        assert np.abs(forces[:, 0] * normal).max() < 1e-8
+        pull, slip = np.linalg.norm(forces[:, 1:], axis=1), np.linalg.norm(speed[:, 1:], axis=1)
+        assert (pull <= friction * forces[:, 0] * (1.0 + 1e-9) + 1e-12).all()
+        sliding = slip > 1e-6
+        np.testing.assert_allclose(pull[sliding], friction * forces[sliding, 0], atol=1e-8)
+        along = (forces[:, 1:] * speed[:, 1:]).sum(axis=1)
+        np.testing.assert_allclose(along[sliding], -(pull * slip)[sliding], atol=1e-7)

@@ -1,0 +1,10 @@
+"""``make mutation``; ``python -m tests.mutation --help``. What it does is in ``tests/support/mutation.py``."""
+
+from __future__ import annotations
+
+import sys
+
+from tests.support.mutation import main
+
+if __name__ == "__main__":
+    sys.exit(main())

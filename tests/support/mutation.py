@@ -1,0 +1,288 @@
+"""``make mutation``: small changes of the code, one by one, that the fast tests of a room must notice.
+
+``python -m tests.mutation --help``. Each process has its own copy of the package and of the tests, and its own cache of
+kernels. What is found is kept in a session as it comes, so that a run that was cut off goes on where it stopped; a
+result holds as long as the changed file stays as it is. Survivors that are no gap are listed with reasons in
+``tests/support/survivors.py``. Nothing is fetched: cosmic-ray's operators and pytest are all that it takes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import queue
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from tests.support.mutants import ROOMS, ROOT, Mutant, sample, tests_of
+from tests.support.survivors import reason_for
+
+OUT = Path("out/mutation")
+_SEED = 20_261_123
+_FAST = "not (slow or data or example or cuda)"
+_LEAST_KILLED = 0.8
+"""Share of a room's mutants, without those that are no gap."""
+_PATIENCE = 4.0
+"""Times what a room's tests take unchanged; a mutant that takes longer is killed by time."""
+_HEAD_START = 60.0
+"""s beside that, for kernels that are compiled anew."""
+_KINDS = ("assertion", "exception", "time", "survived")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one mutant."""
+
+    kind: str
+    """How its test failed: by an assertion, by an exception, by time; or ``survived``."""
+    seconds: float
+    test: str
+    """The test that failed."""
+
+
+class Session:
+    """The results so far: lines of JSON, one a mutant, and the time that a room's tests take unchanged."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lock = threading.Lock()
+        self.results: dict[str, dict[str, Any]] = {}
+        self.baselines: dict[str, float] = {}
+        if path.is_file():
+            for line in path.read_text().splitlines():
+                self._take(json.loads(line))
+        path.parent.mkdir(parents=True, exist_ok=True)
+
+    def add(self, entry: dict[str, Any]) -> None:
+        with self._lock:
+            self._take(entry)
+            with self._path.open("a") as file:
+                file.write(json.dumps(entry) + "\n")
+
+    def _take(self, entry: dict[str, Any]) -> None:
+        if "baseline" in entry:
+            self.baselines[entry["baseline"]] = entry["seconds"]
+        else:
+            self.results[entry["key"]] = entry
+
+
+class Copy:
+    """A copy of the tree that one process changes."""
+
+    def __init__(self, folder: Path, kernels: Path) -> None:
+        self.folder = folder
+        self._kernels = folder / "kernels"
+        for name in ("egs_warp", "tests"):
+            shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("client", "corpus", "*.pyc"))
+        for name in ("pyproject.toml", "README.md", "docs", "examples"):
+            copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
+            copy(ROOT / name, folder / name)
+        if kernels.is_dir():
+            shutil.copytree(kernels, self._kernels)
+
+    def run(self, tests: Sequence[str], limit: float) -> Outcome:
+        """Of the copy as it stands, until a test fails."""
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", _FAST, "--tb=native", "--durations=0"]
+        command += ["-p", "no:cacheprovider", "-p", "no:randomly", *tests]
+        began = time.monotonic()
+        with tempfile.TemporaryFile("w+", errors="replace") as output:
+            process = subprocess.Popen(
+                command,
+                cwd=self.folder,
+                env=self._environment(),
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+            try:
+                status = process.wait(limit)
+            except subprocess.TimeoutExpired:
+                return Outcome("time", time.monotonic() - began, "")
+            finally:
+                _end(process)
+            output.seek(0)
+            text = output.read()
+        seconds = time.monotonic() - began
+        if status == 0:
+            return Outcome("survived", seconds, "")
+        failed = [line for line in text.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+        if status == 5 or "unrecognized arguments" in text:
+            raise RuntimeError(f"no test ran: {text[-600:]}")
+        kind = "assertion" if "AssertionError" in text else "exception"
+        return Outcome(kind, seconds, failed[0].split()[1] if failed else f"exit status {status}: {text[-300:]}")
+
+    def try_mutant(self, mutant: Mutant, limit: float) -> Outcome:
+        place = self.folder / mutant.file
+        try:
+            place.write_text(mutant.text())
+            return self.run(tests_of(mutant.room, mutant.file), limit)
+        finally:
+            shutil.copy2(ROOT / mutant.file, place)
+
+    def keep_kernels(self, kernels: Path) -> None:
+        """What this copy has compiled, for other copies."""
+        shutil.copytree(self._kernels, kernels, dirs_exist_ok=True)
+
+    def _environment(self) -> dict[str, str]:
+        paths = [str(self.folder), *filter(None, [os.environ.get("PYTHONPATH")])]
+        threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+        own = {"PYTHONPATH": os.pathsep.join(paths), "WARP_CACHE_PATH": str(self._kernels)}
+        # No stale bytecode of a change that is as long as what it replaces; no network, should a test ask for it.
+        return os.environ | threads | own | {"PYTHONDONTWRITEBYTECODE": "1", "CUDA_VISIBLE_DEVICES": ""}
+
+
+def main() -> int:
+    """Returns 1 where fewer are killed than must be, or where the tests fail on the code as it is."""
+    chosen = _arguments()
+    began = time.monotonic()
+    session = Session(chosen.session)
+    with tempfile.TemporaryDirectory(prefix="mutation-") as place:
+        if not _baselines(chosen, session, Path(place)):
+            return 1
+        mutants = _samples(chosen)
+        open_ones = [mutant for mutant in mutants if _is_open(mutant, session, chosen.again)]
+        print(f"{len(mutants)} mutants, {len(open_ones)} to try", flush=True)
+        _try_all(open_ones, chosen, session, Path(place), began + 60.0 * chosen.minutes)
+    return _tell(mutants, session, chosen.json)
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rooms", default=",".join(ROOMS), help="with commas between; all unless told")
+    parser.add_argument("--count", type=int, default=200, help="mutants a room (%(default)s)")
+    parser.add_argument("--seed", type=int, default=_SEED, help="of the sample (%(default)s)")
+    parser.add_argument("--processes", type=int, default=1, help="at once, each with its own copy (%(default)s)")
+    parser.add_argument("--minutes", type=float, default=1e6, help="no mutant begins later; those that run are ended")
+    parser.add_argument("--session", type=Path, default=OUT / "session.jsonl", help="(%(default)s)")
+    parser.add_argument("--json", type=Path, default=OUT / "survivors.json", help="survivors (%(default)s)")
+    parser.add_argument("--again", action="store_true", help="try those that survived once more")
+    chosen = parser.parse_args()
+    chosen.rooms = chosen.rooms.split(",")
+    unknown = sorted(set(chosen.rooms) - set(ROOMS))
+    if unknown:
+        parser.error(f"no such room: {', '.join(unknown)}; there are {', '.join(ROOMS)}")
+    return chosen
+
+
+def _samples(chosen: argparse.Namespace) -> list[Mutant]:
+    """Of all rooms in turn, so that a run that is cut off has seen of each."""
+    with ProcessPoolExecutor(min(chosen.processes, len(chosen.rooms))) as pool:
+        rooms = len(chosen.rooms)
+        samples = list(pool.map(sample, chosen.rooms, [chosen.count] * rooms, [chosen.seed] * rooms))
+    longest = max(map(len, samples))
+    return [found[i] for i in range(longest) for found in samples if i < len(found)]
+
+
+def _is_open(mutant: Mutant, session: Session, again: bool) -> bool:
+    known = session.results.get(mutant.key)
+    return known is None or (again and known["kind"] == "survived" and reason_for(mutant) is None)
+
+
+def _baselines(chosen: argparse.Namespace, session: Session, place: Path) -> bool:
+    """Each room's tests on the code as it is: whether they pass, how long they take, and their kernels."""
+    state = _digest(ROOT.joinpath(name) for name in ("egs_warp", "tests"))
+    kernels = OUT / "kernels"
+    rooms = [room for room in chosen.rooms if f"{room}:{state}" not in session.baselines or not kernels.is_dir()]
+
+    def one(room: str) -> tuple[str, Outcome]:
+        copy = Copy(place / f"right-{room}", kernels)
+        outcome = copy.run(tests_of(room, ""), 1800.0)
+        copy.keep_kernels(place / "kernels" / room)
+        return room, outcome
+
+    with ThreadPoolExecutor(chosen.processes) as pool:
+        found = list(pool.map(one, rooms))
+    for room, outcome in found:
+        if outcome.kind != "survived":
+            print(f"{room}: a test fails on the code as it is: {outcome.test or outcome.kind}")
+            return False
+        shutil.copytree(place / "kernels" / room, kernels, dirs_exist_ok=True)
+        session.add({"baseline": f"{room}:{state}", "seconds": round(outcome.seconds, 1)})
+    for room in chosen.rooms:
+        session.baselines[room] = session.baselines[f"{room}:{state}"]
+        print(f"{room}: its tests take {session.baselines[room]:.0f} s", flush=True)
+    return True
+
+
+def _try_all(
+    mutants: Iterable[Mutant], chosen: argparse.Namespace, session: Session, place: Path, deadline: float
+) -> None:
+    copies: queue.SimpleQueue[Copy] = queue.SimpleQueue()
+
+    def one(mutant: Mutant) -> None:
+        try:
+            copy = copies.get_nowait()
+        except queue.Empty:
+            copy = Copy(Path(tempfile.mkdtemp(dir=place)) / "tree", OUT / "kernels")
+        try:
+            limit = _HEAD_START + _PATIENCE * session.baselines[mutant.room]
+            left = deadline - time.monotonic()
+            if left <= 0.0 or mutant.is_stale:
+                return
+            outcome = copy.try_mutant(mutant, min(limit, left))
+            if outcome.kind == "time" and left < limit:
+                return
+        finally:
+            copies.put(copy)
+        entry = {"key": mutant.key, **asdict(mutant), "kind": outcome.kind, "seconds": round(outcome.seconds, 1)}
+        session.add(entry | {"test": outcome.test})
+        if outcome.kind == "survived" and reason_for(mutant) is None:
+            print(f"survived: {mutant.file}:{mutant.line}\n  - {mutant.before}\n  + {mutant.after}", flush=True)
+
+    with ThreadPoolExecutor(chosen.processes) as pool:
+        for done in as_completed([pool.submit(one, mutant) for mutant in mutants]):
+            done.result()
+
+
+def _tell(mutants: list[Mutant], session: Session, path: Path) -> int:
+    """A table of the rooms, and the survivors as a file."""
+    print("| room | tried | by assertion | by exception | by time | survived | of these no gap | killed | s a mutant |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    survivors, short = [], False
+    for room in dict.fromkeys(mutant.room for mutant in mutants):
+        known = [mutant for mutant in mutants if mutant.room == room and mutant.key in session.results]
+        if not known:
+            continue
+        results = [session.results[mutant.key] for mutant in known]
+        count = {kind: sum(result["kind"] == kind for result in results) for kind in _KINDS}
+        alive = [m for m, result in zip(known, results, strict=True) if result["kind"] == "survived"]
+        survivors += [asdict(mutant) | {"no gap": reason_for(mutant)} for mutant in alive]
+        no_gap = sum(reason_for(mutant) is not None for mutant in alive)
+        killed = len(known) - len(alive)
+        share = killed / max(len(known) - no_gap, 1)
+        mean = sum(result["seconds"] for result in results) / len(results)
+        short |= share < _LEAST_KILLED
+        cells = (room, len(known), *count.values(), no_gap, f"{100 * share:.0f} %", f"{mean:.1f}")
+        print("| " + " | ".join(map(str, cells)) + " |")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(survivors, indent=1) + "\n")
+    print(f"survivors: {path}")
+    return int(short)
+
+
+def _digest(folders: Iterable[Path]) -> str:
+    state = hashlib.sha256()
+    for path in sorted(path for folder in folders for path in folder.rglob("*.py")):
+        state.update(path.relative_to(ROOT).as_posix().encode() + path.read_bytes())
+    return state.hexdigest()[:12]
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """With all that it has started."""
+    try:
+        os.killpg(process.pid, signal.SIGKILL)
+    except ProcessLookupError:
+        pass
+    process.wait()

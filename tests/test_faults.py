@@ -1,0 +1,187 @@
+"""Every file that a command writes cannot be written once: the disk is full, or the place is another's."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import resource
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from itertools import count
+from pathlib import Path
+
+import pytest
+
+from egs_warp.assets.pawn import pawn
+from egs_warp.cli import main
+from egs_warp.io import write_ply
+from egs_warp.io.run_folder import MANIFEST
+
+COMMANDS = {
+    "convert to ply": "convert {capture} {out}/a.ply",
+    "convert to compressed ply": "convert {capture} {out}/a.compressed.ply",
+    "convert to spz": "convert {capture} {out}/a.spz",
+    "convert to sog": "convert {capture} {out}/a.sog",
+    "convert to splat": "convert {capture} {out}/a.splat",
+    "convert to glb": "convert {capture} {out}/a.glb",
+    "samples": "samples {out}",
+    "info": "info {capture} --up z --plot {out}/info.png",
+    "muscles": "muscles {capture} --up z --plot {out}/muscles.png",
+    "view": "view {run} --export {out}/page.html",
+    "video": "render {run} --out {out}/close.mp4 --size 64",
+    "video with alpha": "render {run} --out {out}/close.mov --size 64 --background transparent",
+    "pictures": "render {run} --out {out} --show depth --size 64",
+    "frames": "export {run} --to spz --out {out} --every 6",
+    "glTF": "export {run} --to glb --frame 4 --out {out}",
+    "usd": "export {run} --to usd --out {out}/a.usdc",
+    "usd as text": "export {run} --to usd --out {out}/a.usda",
+    "bundle": "export {run} --to bundle --out {out}/a.npz",
+    "animate": "animate {capture} --up z --frames 2 --size 64 --out {out}",
+}
+SLOW = {"samples", "info", "muscles", "pictures"}
+"""Where there is much to do before each file, or many files."""
+Command = Callable[[str, Path], int]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("capture") / "pawn.ply"
+    write_ply(path, pawn(gaussian_count=1500).cloud)
+    return path
+
+
+@pytest.fixture
+def command(capture: Path, run_folder: Path) -> Command:
+    """Runs a line of ``COMMANDS`` into a folder, and returns its status."""
+
+    def run(line: str, out: Path) -> int:
+        words = [word.format(capture=capture, run=run_folder, out=out) for word in line.split()]
+        try:
+            return main(words)
+        except SystemExit as end:
+            assert isinstance(end.code, int)
+            return end.code
+
+    return run
+
+
+@contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """As on a full disk, no file grows beyond ``size`` bytes; programs that are started inherit it."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if path.is_file())
+
+
+def assert_one_line(said: str, reason: str) -> None:
+    """The last line tells it; those before are of what was being done."""
+    assert "Traceback" not in said
+    assert said.splitlines()[-1].startswith("egs-warp: ") and reason in said.splitlines()[-1], said
+
+
+@pytest.mark.parametrize("size", [pytest.param(0, marks=pytest.mark.slow), 700])
+@pytest.mark.parametrize("line", COMMANDS.values(), ids=list(COMMANDS))
+def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
+    line: str, size: int, command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The write itself fails, at its first byte or in its midst: status 1; files that are there are whole."""
+    with largest_file(size):
+        status = command(line, tmp_path / "out") if line.endswith("{out}") else command(line, tmp_path)
+    assert status == 1
+    assert_one_line(capsys.readouterr().err, "File too large")
+    # Of a run that was cut off, what it began with.
+    assert {path.name for path in files(tmp_path)} <= {"manifest.json", "run.yaml"}
+
+
+@pytest.mark.parametrize(
+    ("reason", "status"),
+    [
+        pytest.param(errno.ENOSPC, 1, id="full"),
+        pytest.param(errno.EACCES, 2, id="refused", marks=pytest.mark.slow),
+        pytest.param(errno.EPIPE, 2, id="pipe", marks=pytest.mark.slow),
+    ],
+)
+@pytest.mark.parametrize(
+    "line",
+    [pytest.param(line, id=name, marks=[pytest.mark.slow] if name in SLOW else []) for name, line in COMMANDS.items()],
+)
+def test_each_opening_and_renaming_fails_once(
+    line: str,
+    reason: int,
+    status: int,
+    command: Command,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One after the other, until none is left: one line, no temporary file, and a last run without a fault writes
+    everything. (Of ``animate``: ``tests/pipelines/test_animate.py``.)
+    """
+    out = tmp_path / "out"
+    for number in range(200):
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir()
+        with monkeypatch.context() as patch:
+            failed = fail_once(patch, number, reason)
+            ended = command(line, out)
+        said = capsys.readouterr().err
+        assert not [path for path in files(out) if path.name.startswith(".egs-")]
+        if not failed:
+            break
+        assert ended == status
+        assert_one_line(said, os.strerror(reason))
+    assert ended == 0 and number >= 2 and files(out)
+
+
+def fail_once(patch: pytest.MonkeyPatch, number: int, reason: int) -> list[Path]:
+    """Of the openings of new files and the renamings in ``egs_warp.io.atomic`` the one with this number fails, which
+    then is in the list.
+    """
+    failed: list[Path] = []
+    calls = count()
+
+    def failing(usual: Callable[..., object], path: Path, *given: int) -> object:
+        # Locks are opened as well; they are not exclusive.
+        if (usual is os.replace or (given and given[0] & os.O_EXCL)) and next(calls) == number:
+            failed.append(path)
+            raise OSError(reason, os.strerror(reason))
+        return usual(path, *given)
+
+    class System:
+        """The ``os`` that the module sees."""
+
+        def __getattr__(self, name: str) -> object:
+            usual = getattr(os, name)
+            return partial(failing, usual) if name in ("open", "replace") else usual
+
+    patch.setattr("egs_warp.io.atomic.os", System())
+    return failed
+
+
+def test_a_clock_that_jumps_changes_nothing(
+    command: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a day forward or back at each look at it, with a file of a killed process beside that seems to come from
+    tomorrow: the run is finished, nothing of it is swept, what was left is.
+    """
+    left = tmp_path / ".egs-0123456789abcdef.ply"
+    left.write_text("half")
+    tomorrow = time.time() + 86_400.0
+    os.utime(left, (tomorrow, tomorrow))
+    looks, clock = count(), time.time
+    monkeypatch.setattr(time, "time", lambda: clock() + 86_400.0 * (next(looks) % 3 - 1) + 7.0)
+    assert command(COMMANDS["animate"], tmp_path) == 0
+    assert "Traceback" not in capsys.readouterr().err
+    assert next(looks) >= 1 and not left.exists()
+    assert json.loads((tmp_path / MANIFEST).read_text())["finished"] and (tmp_path / "jump.mp4").stat().st_size > 500

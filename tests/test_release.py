@@ -1,0 +1,74 @@
+"""What goes with a release: every package with its hash, who needs whom, and what the page holds."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import runpy
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+RELEASE = runpy.run_path(str(ROOT / ".ci" / "release.py"))
+PINNED = dict(line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line)
+
+
+def entry(name: str, version: str, digest: str, needs: list[str], **more: Any) -> dict[str, Any]:
+    archive = {"archive_info": {"hashes": {"sha256": digest}}}
+    return {"metadata": {"name": name, "version": version, "requires_dist": needs, **more}, "download_info": archive}
+
+
+@pytest.fixture
+def wheel(tmp_path: Path) -> Path:
+    path = tmp_path / "egs_warp-0.1.0-py3-none-any.whl"
+    path.write_bytes(b"a wheel")
+    return path
+
+
+def reports() -> list[dict[str, Any]]:
+    """As pip writes them: here, and on another platform, where one package has another file."""
+    own = {"metadata": {"name": "egs_warp", "version": "0.1.0", "requires_dist": ["NumPy>=1.26", "scipy>=1.12"]}}
+    scipy = entry("scipy", "1.17.1", "b" * 64, ["numpy<3", 'pytest; extra == "test"'], license="BSD\n" * 40)
+    here = [own, scipy, entry("numpy", "2.4.6", "a" * 64, [], license_expression="BSD-3-Clause")]
+    return [{"install": here}, {"install": [own, scipy, entry("numpy", "2.4.6", "c" * 64, [])]}]
+
+
+def test_requirements_hold_every_package_with_its_hashes() -> None:
+    expected = f"numpy==2.4.6 \\\n    --hash=sha256:{'a' * 64} \\\n    --hash=sha256:{'c' * 64}\n"
+    expected += f"scipy==1.17.1 \\\n    --hash=sha256:{'b' * 64}\n"
+    assert RELEASE["requirements_of"](reports()) == expected
+
+
+def test_the_bill_names_every_part_and_who_needs_it(wheel: Path) -> None:
+    lock = json.loads((ROOT / "egs_warp" / "web" / "client" / "package-lock.json").read_text())
+    bill = RELEASE["bill_of"](wheel, reports(), lock)
+    assert (bill["bomFormat"], bill["specVersion"], bill["version"]) == ("CycloneDX", "1.6", 1)
+    assert re.fullmatch(r"urn:uuid:[0-9a-f]{8}(-[0-9a-f]{4}){3}-[0-9a-f]{12}", bill["serialNumber"])
+    itself = bill["metadata"]["component"]
+    assert itself["hashes"] == [{"alg": "SHA-256", "content": hashlib.sha256(b"a wheel").hexdigest()}]
+    parts = {part["bom-ref"]: part for part in bill["components"]}
+    assert parts["pkg:pypi/numpy@2.4.6"]["licenses"] == [{"license": {"name": "BSD-3-Clause"}}]
+    assert "licenses" not in parts["pkg:pypi/scipy@1.17.1"]
+    page = {part["name"]: part for part in parts.values() if part["purl"].startswith("pkg:npm/")}
+    # As THIRD_PARTY.md has them.
+    assert set(page) == {"three", "@sparkjsdev/spark", "fflate"}
+    for name, part in page.items():
+        assert f"{part['version']}" in (ROOT / "THIRD_PARTY.md").read_text(), name
+        assert part["hashes"][0]["alg"] == "SHA-512" and len(part["hashes"][0]["content"]) == 128
+    needs = {one["ref"]: one["dependsOn"] for one in bill["dependencies"]}
+    assert set(needs[itself["bom-ref"]]) == set(parts)
+    assert needs["pkg:pypi/scipy@1.17.1"] == ["pkg:pypi/numpy@2.4.6"]
+    assert RELEASE["bill_of"](wheel, reports(), lock) == bill
+
+
+def test_every_dependency_is_pinned() -> None:
+    """Of the package and of all its extras, by the names in ``pyproject.toml``."""
+    import tomllib
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    asked = [*project["dependencies"], *(line for extra in project["optional-dependencies"].values() for line in extra)]
+    names = {RELEASE["canonical"](re.match(r"[\w.-]+", line).group()) for line in asked}  # pyright: ignore[reportOptionalMemberAccess]
+    assert names <= {RELEASE["canonical"](name) for name in PINNED}
