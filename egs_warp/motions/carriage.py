@@ -11,8 +11,8 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from egs_warp.fem.body import SoftBody
 from egs_warp.motions.feet import Base, Foot, base_of, halves
+from egs_warp.motions.gait import carrying_time
 from egs_warp.motions.route import Pace
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.stance import SHEAR
@@ -26,6 +26,11 @@ LIFT = 0.03
 PIVOT, ROLL = 0.3, 0.05
 """Radians by which a body on one base turns about one side, and tips to lift the other, at most: faster, it would throw
 itself off the side on which it stands."""
+SPENT = 1.2
+"""Peak of the torque about up that a pivot would take over what friction under the one side gives; it may lag a little
+(measured on monkey and pawn)."""
+_PEAK = 5.77
+"""Largest second derivative of the way from 0 to 1 that a foot is carried in a time of 1."""
 LEGS = 0.2
 """Body heights: on shorter legs a body goes as on one base."""
 _SOLE = 0.02
@@ -55,8 +60,9 @@ class Carriage(Protocol):
 class OnLegs:
     """Each leg goes with its foot, the rest of the body with the centre of mass."""
 
-    def __init__(self, body: SoftBody, standing: np.ndarray, feet: Sequence[Foot]) -> None:
-        """``standing`` (N, 3): nodes at rest, in the frame of the start."""
+    def __init__(self, place: Place, feet: Sequence[Foot]) -> None:
+        """The body stands at ``place``."""
+        body, standing = place.body, place.ground.local(place.standing)
         self._start_com = body.centre_of_mass(standing)
         self._arms = standing - self._start_com
         self._legs = np.array([foot.leg for foot in feet])
@@ -78,17 +84,32 @@ class OnLegs:
 class OnBase:
     """The two sides of the base turn and tip the body as a whole, as one walks a wardrobe; it leans over them."""
 
-    def __init__(self, body: SoftBody, standing: np.ndarray, feet: Sequence[Foot]) -> None:
-        """``standing`` (N, 3): nodes at rest, in the frame of the start; the two ``feet``."""
+    def __init__(self, place: Place, feet: Sequence[Foot]) -> None:
+        """The body stands at ``place``; the two ``feet``."""
+        body, standing = place.body, place.ground.local(place.standing)
         soles = np.array([standing[foot.sole].mean(axis=0) for foot in feet])
         self._arms = standing - soles.mean(axis=0)
         self._com = body.centre_of_mass(self._arms)
         self._between = soles[0] - soles[1]
         self._width = float(np.hypot(*self._between[:2]))
-        self.pace = Pace(0.5 * PIVOT * self._width, 0.5 * PIVOT)
+        pivot = min(PIVOT, SPENT * self._pivot(place, soles))
+        self.pace = Pace(0.5 * pivot * self._width, 0.5 * pivot)
         self.lift = min(ROLL * self._width, LIFT * body.height)
         self.catch = 0.0
         self.hold = 50.0  # what turns about a patch slides at its edges
+
+    @staticmethod
+    def _pivot(place: Place, soles: np.ndarray) -> float:
+        """Radians by which friction under one side turns the body while the other is carried ahead."""
+        body = place.body
+        touching = place.ground.local(place.touching)[:, :2]
+        away = np.linalg.norm(touching[:, None] - soles[:, :2], axis=2)
+        patches = [touching[away.argmin(axis=1) == side] for side in (0, 1)]
+        arms = [np.linalg.norm(patch - patch.mean(axis=0), axis=1).mean() for patch in patches if len(patch)]
+        gravity, up = float(np.linalg.norm(body.gravity)), place.ground.axes[2]
+        torque = place.friction * body.mass * gravity * min(map(float, arms), default=0.0)
+        time = carrying_time(float(np.sqrt(body.height / gravity)))
+        return torque * time**2 / (_PEAK * float(up @ body.inertia(place.standing) @ up))
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
         """See ``Carriage``; the places of the feet turn it, not ``heading``."""

@@ -87,6 +87,11 @@ class Gait:
         return smooth(progress / 0.3)
 
 
+def carrying_time(time_unit: float) -> float:
+    """Seconds in which a foot is carried ahead in a swing at the usual speed; ``time_unit`` is sqrt(H / g)."""
+    return _CARRIED * _SWING * time_unit
+
+
 def smooth(s: float) -> float:
     """From 0 at 0 to 1 at 1, at rest and without acceleration at both."""
     s = min(max(s, 0.0), 1.0)

@@ -129,7 +129,7 @@ class Walk:
         self._standing = self.ground.local(place.standing)
         feet = tuple(feet[k] for k in around(np.array([self._standing[foot.sole, :2].mean(axis=0) for foot in feet])))
         self.feet = feet
-        self._carriage = carriage(body, self._standing, feet)
+        self._carriage = carriage(place, feet)
         self._soles = np.array([self._standing[foot.sole].mean(axis=0) for foot in feet])
         self._grips = self._touching(self.ground.local(place.touching)[:, :2])
         self._start_com = body.centre_of_mass(self._standing)

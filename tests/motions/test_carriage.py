@@ -19,7 +19,7 @@ def carried(place: Place) -> tuple[np.ndarray, tuple[Foot, ...], Carriage, np.nd
     feet, kind = carried_on(place)
     standing = place.ground.local(place.standing)
     soles = np.array([standing[foot.sole].mean(axis=0) for foot in feet])
-    return standing, feet, kind(place.body, standing, feet), np.column_stack([soles, np.zeros(len(feet))])
+    return standing, feet, kind(place, feet), np.column_stack([soles, np.zeros(len(feet))])
 
 
 @pytest.mark.parametrize("place", [block_place(), block_place(coarse_stool()), block_place(figure())])
@@ -55,7 +55,10 @@ def test_a_base_turns_and_tips_with_its_sides() -> None:
     assert isinstance(carriage, OnBase) and len(feet) == 2
     width = float(soles[0, 1] - soles[1, 1])
     assert width > 0.2, "the left side comes first"
-    assert carriage.pace.length == pytest.approx(0.5 * PIVOT * width) and carriage.catch == 0.0
+    assert carriage.pace.length == pytest.approx(carriage.pace.turn * width) and carriage.catch == 0.0
+    rubber, ice = (OnBase(replace(place, friction=friction), feet).pace for friction in (9.0, 0.05))
+    assert rubber.turn == pytest.approx(0.5 * PIVOT)
+    assert ice.turn == pytest.approx(0.05 / place.friction * carriage.pace.turn), "friction turns it"
     com = place.body.centre_of_mass(standing) + [0.01, 0.03, 0.0]
     soles[0, 0] += 0.04
     soles[1, 2] += 0.01

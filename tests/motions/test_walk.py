@@ -115,7 +115,7 @@ def test_a_body_on_two_legs_keeps_its_balance(route: Route) -> None:
 @pytest.mark.parametrize("route", [straight(0.04), pytest.param(turning(0.2), marks=pytest.mark.slow)])
 def test_a_block_waddles(route: Route) -> None:
     """It lifts one side of its base, turns about the other, and so on: it comes to its place, upright."""
-    done = walked(strong(block_mesh()), route, 0.06)
+    done = walked(strong(block_mesh()), route, 0.04)
     body, reached, place = done.creature.place.body, measure(done.trajectory), done.walk.places[-1]
     assert reached.distance * body.height == pytest.approx(place[0], abs=0.2 * 0.04)
     assert reached.heading_degrees == pytest.approx(np.degrees(place[2]), abs=3.0) and reached.tilt_degrees < 3.0
