@@ -114,7 +114,11 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
 )
 @pytest.mark.parametrize(
     "line",
-    [pytest.param(line, id=name, marks=[pytest.mark.slow] if name in SLOW else []) for name, line in COMMANDS.items()],
+    [
+        pytest.param(line, id=name, marks=[pytest.mark.slow] if name in SLOW else [])
+        for name, line in COMMANDS.items()
+        if name != "animate"
+    ],
 )
 def test_each_opening_and_renaming_fails_once(
     line: str,

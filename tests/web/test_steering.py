@@ -96,7 +96,7 @@ def test_a_click_sends_it_there(tmp_path: Path):
     place = played.session.steering.place
     feet = sole_shares(place.body, place.ground, place.standing)
     start = feet @ played.session.state.positions
-    goal = start + 0.2 * place.ground.axes[0]
+    goal = start + 0.16 * place.ground.axes[0]
     played.ask("go", x=goal[0], y=goal[1])
     played.until_idle(most=900)
     end = feet @ played.session.state.positions
