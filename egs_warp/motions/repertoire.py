@@ -105,8 +105,8 @@ def _way(points: np.ndarray) -> float:
 
 
 def _paces(way: float, request: MotionRequest) -> int:
-    """Frames at 60 Hz within which a ``way`` of so many body heights is walked, in paces of half of the usual."""
-    return 170 + int(np.ceil(36 * way / (0.5 * _PACE) / request.asked["speed"]))
+    """Frames at 60 Hz within which a ``way`` of so many body heights is walked."""
+    return 170 + int(np.ceil(36 * way / _SHORTEST / request.asked["speed"]))
 
 
 def _follows(request: MotionRequest, height: float) -> list[Part]:
@@ -122,8 +122,10 @@ def _keys(request: MotionRequest) -> tuple[Key, ...]:
 
 _SPEED = Value("speed", 1.0, 0.3, 1.6, "times the usual")
 _STEP_LENGTH = Value("step_length", _PACE, 0.0, LARGEST_TARGET, "body heights", above=True)
-_ROUND = 0.06 * 24
+_ROUND = 2.5
 """Body heights of way that take as long as a turn on the spot all the way round."""
+_SHORTEST = 0.02
+"""Body heights: the pace of a narrow base; so many fill the frames of a walk."""
 
 
 def _length(name: str, default: float, *, above: bool = False) -> Value:
