@@ -41,6 +41,8 @@ LOADED = 0.01
 """Share of the weight that a foot must carry to count as landed."""
 DOWN = 0.005
 """Body heights over the ground at which a foot at the end of its swing counts as landed, too."""
+SHORTEST = 0.002
+"""Body heights: a shorter pace is none."""
 HIGHEST_STEP = 0.03
 """Body heights: what is higher above the ground, or lower below it, stands in the way."""
 _BETWEEN = 0.3
@@ -137,6 +139,10 @@ class Walk:
         self._time_unit = float(np.sqrt(body.height / self.gravity))
         self._asked_length = pace_length
         pace = Pace(min(pace_length, self._carriage.pace.length), self._carriage.pace.turn)
+        if pace.length < SHORTEST * body.height:
+            raise UserError(
+                f"walk: friction {place.friction:g} cannot turn the body about a side of its base; jump or hop"
+            )
         self.places = route(pace)
         """(P+1, 3) the body before the first and after each pace: see ``motions.route``."""
         self._check_way(place)
@@ -294,8 +300,10 @@ class Walk:
         self.swinging = tuple(foot for foot in self.swinging if foot != index)
         sole = self.feet[index].sole
         now, rest = (x[sole, :2] - x[sole, :2].mean(axis=0) for x in (local, self._standing))
-        heading = np.arctan2((rest[:, 0] * now[:, 1] - rest[:, 1] * now[:, 0]).sum(), (rest * now).sum())
-        self._footprints[index] = self._on_ground(index, local[sole, :2].mean(axis=0), float(heading))
+        heading = float(np.arctan2((rest[:, 0] * now[:, 1] - rest[:, 1] * now[:, 0]).sum(), (rest * now).sum()))
+        planned = float(self.places[self.gait.landing(self.swing)][2])
+        heading += 2.0 * np.pi * round((planned - heading) / (2.0 * np.pi))
+        self._footprints[index] = self._on_ground(index, local[sole, :2].mean(axis=0), heading)
 
     def _progress(self, phase: WalkPhase, swing: int, elapsed: float) -> float:
         """Paces that the body should have done ``elapsed`` seconds into a phase."""

@@ -173,6 +173,25 @@ def test_it_is_planned_to_press_where_its_feet_are(mesh: Callable[[], TetMesh]) 
         assert nearest == np.linalg.norm(swing - walk._soles[stands[0], :2])
 
 
+def test_a_foot_that_has_turned_all_the_way_round_is_told_so() -> None:
+    """A heading is told as near to the planned one as whole turns let it."""
+    place = coarse_creature(stool(), forward=AHEAD, settled=False).place
+    walk = Walk(place, turning(np.radians(420.0)), 0.08)
+    walk.swing = walk.gait.swings - 1
+    local = place.ground.local(place.standing)
+    com = place.body.centre_of_mass(local)
+    turn = np.eye(3)
+    turn[:2, :2] = [[0.5, -np.sqrt(0.75)], [np.sqrt(0.75), 0.5]]
+    walk._stands(0, com + (local - com) @ turn.T)
+    assert walk._footprints[0, 3] == pytest.approx(np.radians(420.0))
+
+
+def test_a_base_on_ice_is_told_that_it_cannot_turn() -> None:
+    place = replace(coarse_creature(block_mesh(), forward=AHEAD, settled=False).place, friction=0.001)
+    with pytest.raises(UserError, match=r"walk: friction 0\.001 cannot turn the body about a side of its base"):
+        Walk(place, straight(0.2), 0.1)
+
+
 def test_what_has_no_feet_and_what_stands_in_the_way_is_told() -> None:
     bar = block_mesh(12, 3, 3, (2.0, 0.3, 0.3))
     with pytest.raises(UserError, match="walk: the body has no feet, and no flat base of which it could lift a side"):
