@@ -56,7 +56,7 @@ def add_parser(commands: Commands) -> None:
         default="jump",
         help='jump (default), hop, twist, walk, several as "hop x3, twist 180", or a script.json',
     )
-    motion.add_argument("--distance", type=float, help="body heights: of a jump (0.5), hop (0.7), twist (0) walk (0.4)")
+    motion.add_argument("--distance", type=float, help="body heights: jump (0.5), hop (0.7), twist (0), walk (0.4)")
     motion.add_argument(
         "--height",
         type=float,

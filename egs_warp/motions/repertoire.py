@@ -104,7 +104,7 @@ def _way(points: np.ndarray) -> float:
     return float(np.linalg.norm(steps, axis=1).sum()) + _ROUND
 
 
-def _paces(way: float, request: MotionRequest) -> int:
+def _frames_of_walk(way: float, request: MotionRequest) -> int:
     """Frames at 60 Hz within which a ``way`` of so many body heights is walked."""
     return 170 + int(np.ceil(36 * way / _SHORTEST / request.asked["speed"]))
 
@@ -153,7 +153,7 @@ REPERTOIRE: Mapping[str, MotionKind] = {
             _SPEED,
         ),
         _walks,
-        lambda request: _paces(abs(request.asked["distance"]), request),
+        lambda request: _frames_of_walk(abs(request.asked["distance"]), request),
     ),
     "walk to": MotionKind(
         (
@@ -163,18 +163,18 @@ REPERTOIRE: Mapping[str, MotionKind] = {
             _SPEED,
         ),
         _walks_to,
-        lambda request: _paces(_way(np.array([[request.asked["ahead"], request.asked["left"]]])), request),
+        lambda request: _frames_of_walk(_way(np.array([[request.asked["ahead"], request.asked["left"]]])), request),
     ),
     "walk along": MotionKind(
         (_STEP_LENGTH, _SPEED),
         _walks_along,
-        lambda request: _paces(_way(_path(request)) + 2.0 * _ROUND, request),
+        lambda request: _frames_of_walk(_way(_path(request)) + 2.0 * _ROUND, request),
         file="a file of points, as walk along way.csv",
     ),
     "turn": MotionKind(
         (Value("heading_degrees", 90.0, -LARGEST_TURN, LARGEST_TURN, "degrees"), _SPEED),
         _turns_on_the_spot,
-        lambda request: _paces(_ROUND * abs(request.asked["heading_degrees"]) / 360.0, request),
+        lambda request: _frames_of_walk(_ROUND * abs(request.asked["heading_degrees"]) / 360.0, request),
     ),
     "trajectory": MotionKind(
         (),
