@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from egs_warp.errors import UserError
@@ -32,21 +31,18 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.carriage import carried_on
 from egs_warp.motions.feet import around, foot_loads, foot_of_contact, foot_of_node
 from egs_warp.motions.footfalls import Footfalls, footfalls
+from egs_warp.motions.footing import Footing
 from egs_warp.motions.gait import Gait, smooth
-from egs_warp.motions.pendulum import PendulumPlan, drift, is_line, nearest_in_hull
+from egs_warp.motions.pendulum import PendulumPlan, drift, nearest_in_hull
 from egs_warp.motions.route import Pace, Route
 from egs_warp.motions.sequence import Place
 
 LOADED = 0.01
 """Share of the weight that a foot must carry to count as landed."""
-DOWN = 0.005
-"""Body heights over the ground at which a foot at the end of its swing counts as landed, too."""
 SHORTEST = 0.002
 """Body heights: a shorter pace is none."""
 HIGHEST_STEP = 0.03
 """Body heights: what is higher above the ground, or lower below it, stands in the way."""
-_BETWEEN = 0.3
-"""Of the distance of two feet: what is about as near to the one as to the other belongs to neither."""
 _SHIFT, _GATHER, _REST = 1.5, 3.0, 1.0
 """Of sqrt(H / g): how long the first and the last phase take, and how long the body stands then."""
 _PLAN_STEP, _PLANNED = 1.0 / 12.0, 8
@@ -132,8 +128,7 @@ class Walk:
         feet = tuple(feet[k] for k in around(np.array([self._standing[foot.sole, :2].mean(axis=0) for foot in feet])))
         self.feet = feet
         self._carriage = carriage(place, feet)
-        self._soles = np.array([self._standing[foot.sole].mean(axis=0) for foot in feet])
-        self._grips = self._touching(self.ground.local(place.touching)[:, :2])
+        self._footing = Footing(place, feet)
         self._start_com = body.centre_of_mass(self._standing)
         self.gravity = float(np.linalg.norm(body.gravity))
         self._time_unit = float(np.sqrt(body.height / self.gravity))
@@ -156,7 +151,7 @@ class Walk:
         self.phase = WalkPhase.SHIFT
         self.swing = -1
         self._entered: float | None = None
-        self._footprints = np.column_stack([self._soles, np.zeros(len(feet))])
+        self._footprints = self._footing.start
         """(F, 4) where each foot stands, or was lifted from: see ``motions.carriage``."""
         self.swinging: tuple[int, ...] = ()
         """The feet that are lifted, carried and set down."""
@@ -165,22 +160,6 @@ class Walk:
         self._pressed: np.ndarray | None = None
         """(2,) the centre of pressure that was asked for last."""
         self._late = 0
-
-    def _touching(self, points: np.ndarray) -> list[np.ndarray]:
-        """For each foot (k, 2) where it touches the ground at rest, from the middle of its sole, of ``points`` (n, 2);
-        its whole sole where it hangs."""
-        centres = self._soles[:, :2]
-        away = np.linalg.norm(points[:, None] - centres, axis=2)
-        owner = np.argmin(away, axis=1)
-        nearest, second = np.sort(away, axis=1)[:, :2].T
-        clear = second - nearest > _BETWEEN * np.linalg.norm(centres[owner] - centres[np.argsort(away)[:, 1]], axis=1)
-        grips = []
-        for index, foot in enumerate(self.feet):
-            own = points[clear & (owner == index)]
-            if len(own) < 3 or is_line(own):
-                own = self._standing[foot.sole, :2]
-            grips.append((own if is_line(own) else own[ConvexHull(own).vertices]) - centres[index])
-        return grips
 
     def _check_way(self, place: Place) -> None:
         for x, y, _ in self.places:
@@ -206,7 +185,9 @@ class Walk:
     def _stride(self) -> float:
         """Metres: the longest way between two footprints of one foot, of what turns as well."""
         rounds = len(self.gait.groups)
-        prints = np.array([[self._home(place, foot)[:2] for place in self.places] for foot in range(len(self.feet))])
+        prints = np.array(
+            [[self._footing.home(place, foot)[:2] for place in self.places] for foot in range(len(self.feet))]
+        )
         apart = prints[:, min(rounds, self.gait.paces) :] - prints[:, : -min(rounds, self.gait.paces)]
         return float(np.linalg.norm(apart, axis=2).max())
 
@@ -258,7 +239,7 @@ class Walk:
         if self.swinging and elapsed >= gait.carried_until:
             loads = foot_loads(self.feet, report, self.body.weight)
             for index in self.swinging:
-                if loads[index] > LOADED or (elapsed >= gait.swing_time and self._is_down(index, local)):
+                if loads[index] > LOADED or (elapsed >= gait.swing_time and self._footing.is_down(index, local)):
                     self._stands(index, local)
         if self.phase is WalkPhase.SWING and elapsed >= gait.swing_time:
             if not self.swinging or elapsed >= 2.0 * gait.swing_time:
@@ -290,20 +271,11 @@ class Walk:
             WalkPhase.REST: _REST * self._time_unit,
         }[phase]
 
-    def _is_down(self, index: int, local: np.ndarray) -> bool:
-        """Whether foot ``index`` is on the ground, and if it carries nothing."""
-        sole = local[self.feet[index].sole].mean(axis=0)
-        return bool(sole[2] - self._on_ground(index, sole[:2], 0.0)[2] < DOWN * self.body.height)
-
     def _stands(self, index: int, local: np.ndarray) -> None:
         """Foot ``index`` has landed where it is."""
         self.swinging = tuple(foot for foot in self.swinging if foot != index)
-        sole = self.feet[index].sole
-        now, rest = (x[sole, :2] - x[sole, :2].mean(axis=0) for x in (local, self._standing))
-        heading = float(np.arctan2((rest[:, 0] * now[:, 1] - rest[:, 1] * now[:, 0]).sum(), (rest * now).sum()))
         planned = float(self.places[self.gait.landing(self.swing)][2])
-        heading += 2.0 * np.pi * round((planned - heading) / (2.0 * np.pi))
-        self._footprints[index] = self._on_ground(index, local[sole, :2].mean(axis=0), heading)
+        self._footprints[index] = self._footing.landed(index, local, planned)
 
     def _progress(self, phase: WalkPhase, swing: int, elapsed: float) -> float:
         """Paces that the body should have done ``elapsed`` seconds into a phase."""
@@ -324,17 +296,6 @@ class Walk:
 
     def _heading(self, elapsed: float) -> float:
         return float(self._place_at(self._progress(self.phase, self.swing, elapsed))[2])
-
-    def _home(self, place: np.ndarray, index: int) -> np.ndarray:
-        """(4,) where foot ``index`` belongs when the body is at ``place`` (3,)."""
-        centre = self._start_com[:2]
-        level = centre + place[:2] + _flat(place[2]) @ (self._soles[index, :2] - centre)
-        return self._on_ground(index, level, float(place[2]))
-
-    def _on_ground(self, index: int, level: np.ndarray, heading: float) -> np.ndarray:
-        """(4,) foot ``index`` on the ground at ``level`` (2,)."""
-        start = self._soles[index]
-        return np.array([*level, start[2] + self._slope @ (level - start[:2]), heading])
 
     def _planned_pendulum(self) -> PendulumPlan:
         """From the start of this phase on: the centre of pressure as near as the feet let it to where the centre of
@@ -371,19 +332,16 @@ class Walk:
                 phase, swing = WalkPhase.SWING, swing + 1
                 continue
             lifted = self.gait.group(swing)
-            standing = [self._sole_at(foot, footprints[foot]) for foot in range(len(self.feet)) if foot not in lifted]
-            yield phase, np.array([nearest_in_hull(np.concatenate(standing), place) for place in wanted])
+            standing = [foot for foot in range(len(self.feet)) if foot not in lifted]
+            under = self._footing.pressed(footprints, standing, self.control.planned_margin)
+            yield phase, np.array([nearest_in_hull(under, place) for place in wanted])
             for foot in lifted:
-                footprints[foot] = self._home(self.places[self.gait.landing(swing)], foot)
+                footprints[foot] = self._footing.home(self.places[self.gait.landing(swing)], foot)
             phase = self._after_swing(swing)
 
     def _com_at(self, progress: float) -> np.ndarray:
         """(2,) where the centre of mass belongs after so many paces."""
         return self._start_com[:2] + self._place_at(progress)[:2]
-
-    def _sole_at(self, index: int, footprint: np.ndarray) -> np.ndarray:
-        """(k, 2) where foot ``index`` on its ``footprint`` (4,) is planned to press, drawn in towards its middle."""
-        return footprint[:2] + _drawn_in(self._grips[index], self.control.planned_margin) @ _flat(footprint[3]).T
 
     def _com_velocity(self, local: np.ndarray, velocity: np.ndarray, elapsed: float, dt: float) -> np.ndarray:
         """(3,) m/s at the end of the step; steered by a centre of pressure under the standing feet, so that the
@@ -391,7 +349,9 @@ class Walk:
         com = self.body.centre_of_mass(local)
         pressure, divergent = self._plan.at(elapsed)
         off = com[:2] + velocity[:2] / self._rate - divergent
-        pressed = nearest_in_hull(self._support(local), pressure + self.control.balance * off)
+        standing = [foot for foot in range(len(self.feet)) if foot not in self.swinging]
+        under = self._footing.pressed(self._footing.now(local, self._footprints), standing, self.control.margin)
+        pressed = nearest_in_hull(under, pressure + self.control.balance * off)
         self._pressed = pressed
         if self.swinging and elapsed < self.gait.carried_until:
             left = max(self.gait.swing_time - elapsed, 0.0)
@@ -404,22 +364,12 @@ class Walk:
         up = self._slope @ velocity[:2] + 6.0 / self._time_unit * (height - com[2])
         return np.array([*level, up])
 
-    def _support(self, local: np.ndarray) -> np.ndarray:
-        """(k, 2) where the standing feet may press, each drawn in towards its middle."""
-        pieces = []
-        for index, foot in enumerate(self.feet):
-            if index not in self.swinging:
-                turn = _flat(self._footprints[index, 3])
-                grip = _drawn_in(self._grips[index], self.control.margin)
-                pieces.append(local[foot.sole, :2].mean(axis=0) + grip @ turn.T)
-        return np.concatenate(pieces)
-
     def _foot_targets(self, elapsed: float) -> np.ndarray:
         """(F, 4) where the feet should be ``elapsed`` seconds into the phase."""
         targets, gait = self._footprints.copy(), self.gait
         for index in self.swinging:
             progress = elapsed / gait.swing_time
-            goal = self._home(self.places[gait.landing(self.swing)], index)
+            goal = self._footing.home(self.places[gait.landing(self.swing)], index)
             goal[:3] += [*self._sidestep, self._slope @ self._sidestep]
             targets[index] += gait.carried(progress) * (goal - self._footprints[index])
             # One that has found no ground in time reaches down for it.
@@ -430,11 +380,7 @@ class Walk:
         self, index: int, local: np.ndarray, before: np.ndarray, after: np.ndarray, elapsed: float, dt: float
     ) -> Objective:
         sole, part, control = self.feet[index].sole, self._parts[index], self.control
-        arms = self._standing[sole] - self._soles[index]
-        now, then = (
-            np.column_stack([arms[:, :2] @ _flat(place[3]).T, arms[:, 2]]) + place[:3]
-            for place in (before[index], after[index])
-        )
+        now, then = (self._footing.sole(index, place[index]) for place in (before, after))
         # The sole that stood is not the flat one that swings: torn straight in the first step, it would drag.
         share = control.foot_share * self.gait.eased(elapsed / self.gait.swing_time)
         velocity = (share * (now - local[sole]) + then - now) / dt
@@ -457,14 +403,3 @@ class Walk:
         """(3,) rotation vector that best carries ``before`` (N, 3) to ``after`` (N, 3)."""
         arms, aims = (x - self.body.centre_of_mass(x) for x in (before, after))
         return Rotation.from_matrix(best_turn(self.body.node_mass, arms, aims)).as_rotvec()
-
-
-def _flat(angle: float) -> np.ndarray:
-    """(2, 2) turn by ``angle`` radians."""
-    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-
-
-def _drawn_in(points: np.ndarray, margin: float) -> np.ndarray:
-    """``points`` (k, 2) drawn in towards their mean to ``margin`` of their size."""
-    middle = points.mean(axis=0)
-    return middle + margin * (points - middle)

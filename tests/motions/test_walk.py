@@ -149,7 +149,7 @@ def test_feet_go_to_where_they_belong_when_the_body_turns() -> None:
         turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
         moved = (standing[:, :2] - com[:2]) @ turn.T + com[:2] + [x, y]
         for index, foot in enumerate(walk.feet):
-            home = walk._home(np.array([x, y, heading]), index)
+            home = walk._footing.home(np.array([x, y, heading]), index)
             assert home[:2] == pytest.approx(moved[foot.sole].mean(axis=0), abs=1e-12) and home[3] == heading
 
 
@@ -164,10 +164,10 @@ def test_it_is_planned_to_press_where_its_feet_are(mesh: Callable[[], TetMesh]) 
     lifted = walk.gait.group(0)
     stands = [index for index in range(len(walk.feet)) if index not in lifted]
     assert stands and len(stands) < len(walk.feet)
-    under = np.concatenate([walk._soles[index, :2] + walk._grips[index] for index in stands])
+    under = np.concatenate([walk._footing.soles[index, :2] + walk._footing.grips[index] for index in stands])
     assert nearest_in_hull(under, swing) == pytest.approx(swing, abs=1e-9)
     if len(lifted) == 1:  # the diagonals of four feet cross
-        other = walk._soles[lifted[0], :2] + walk._grips[lifted[0]]
+        other = walk._footing.soles[lifted[0], :2] + walk._footing.grips[lifted[0]]
         assert np.linalg.norm(nearest_in_hull(other, swing) - swing) > 0.0
     reach = 0.3 + np.ptp(place.standing[:, :2], axis=0)
     assert np.all(np.abs(plan.divergent - walk._start_com[:2]) < reach)
