@@ -124,12 +124,12 @@ class Walk:
         normal = place.ground.axes @ place.ground.surface_normal
         self._slope = -normal[:2] / normal[2]
         """Metres that the ground rises for each metre forward and to the left."""
-        self._standing = self.ground.local(place.standing)
-        feet = tuple(feet[k] for k in around(np.array([self._standing[foot.sole, :2].mean(axis=0) for foot in feet])))
+        standing = self.ground.local(place.standing)
+        feet = tuple(feet[k] for k in around(np.array([standing[foot.sole, :2].mean(axis=0) for foot in feet])))
         self.feet = feet
         self._carriage = carriage(place, feet)
         self._footing = Footing(place, feet)
-        self._start_com = body.centre_of_mass(self._standing)
+        self._start_com = body.centre_of_mass(standing)
         self.gravity = float(np.linalg.norm(body.gravity))
         self._time_unit = float(np.sqrt(body.height / self.gravity))
         self._asked_length = pace_length
