@@ -12,9 +12,10 @@ from enum import Enum
 import numpy as np
 
 from egs_warp.fem.body import BodyState
-from egs_warp.locomotion.objectives import AnyObjective
+from egs_warp.locomotion.objectives import AnyObjective, BodyPart, Coordinates, part_velocity
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.carriage import OnLegs, carried_on
 from egs_warp.motions.facing import Facing, Straight
 from egs_warp.motions.jump_plan import FURTHEST_LEAN, LEAN, JumpPlan, JumpTarget, plan_jump, stopping_time
 from egs_warp.motions.sequence import Place
@@ -51,6 +52,11 @@ SETTLING = 0.3
 """Of sqrt(H / g): when it begins to crouch."""
 BLEND = 0.3
 """Of sqrt(H / g): the time in which a phase's pose takes over from the last one's."""
+URGENT = 0.5
+"""Of the way from the middle of the feet to their edge: with its capture point beyond, a body that lands is balanced
+with more than the usual share of the weights."""
+LEGS = 5.0
+"""Weight of the feet of a body on legs in the air: they swing ahead under a trunk that keeps its shape."""
 
 
 class JumpPhase(Enum):
@@ -89,6 +95,8 @@ class Jump:
             landing.world(ground.local(place.touching)),
             place.friction,
         )
+        feet, carriage = carried_on(place)
+        self._feet = [BodyPart.of(body, "foot", foot.sole) for foot in feet] if carriage is OnLegs else []
         ahead = ground.axes[0] @ (place.touching - body.centre_of_mass(place.standing)).T
         self.plan = plan_jump(
             target,
@@ -264,7 +272,18 @@ class Jump:
         spin = np.linalg.solve(self.body.inertia(state.positions), momentum)
         pose = self.facing.airborne_pose(pose, momentum, self.ground.axes[2], left)
         velocity = seen.velocity - np.array([0.0, 0.0, self.gravity * dt])
-        return self._write(state, velocity, pose, spin, dt, left=left)
+        return [*self._write(state, velocity, pose, spin, dt, left=left), *self._swung(state, pose, left)]
+
+    def _swung(self, state: BodyState, pose: np.ndarray, left: float) -> list[AnyObjective]:
+        """Feet on legs go to where the ``pose`` (3, 3) of the landing has them, in ``left`` s."""
+        rate = min(IN_TIME / left, 6.0 / self._time_unit)
+        com, about = self.body.centre_of_mass(state.positions), Coordinates(np.eye(3), True)
+
+        def swung(foot: BodyPart) -> AnyObjective:
+            way = pose @ foot.centre(self.pose.arms) - (foot.centre(state.positions) - com)
+            return part_velocity(self.body, foot, rate * way, LEGS, about)
+
+        return [swung(foot) for foot in self._feet]
 
     def _land(self, state: BodyState, seen: Measurement, dt: float) -> list[AnyObjective]:
         rate = self.plan.landing_rate
@@ -278,7 +297,9 @@ class Jump:
         pose = self.pose.over_base(np.array([*goal[:2], seen.com[2] + dt * velocity[2]]), seen.base, heading)
         upright = self._landed_share(state.time + dt) * self._upright(state, pose)
         velocity, spin = self.pose.balanced(state, seen, velocity, upright, dt)
-        return self._write(state, velocity, pose, spin, dt)
+        # Little is asked of what comes to rest by itself.
+        urgent = (self.pose.urgency(seen) - URGENT) / (1.0 - URGENT)
+        return self._write(state, velocity, pose, spin, dt, urgent=urgent)
 
     def _landed_share(self, time: float) -> float:
         """How much is asked for at ``time`` s of what a standing body is asked for."""
@@ -339,8 +360,10 @@ class Jump:
         dt: float,
         *,
         left: float | None = None,
+        urgent: float = 0.0,
     ) -> list[AnyObjective]:
-        """``left``: seconds before the landing, of a body in the air."""
+        """``left``: seconds before the landing, of a body in the air; ``urgent``: share of their weight with which one
+        that lands is balanced, if that is more than the usual one."""
         # Where a phase begins with another pose than the last ended with, the way between them is gone in some steps.
         share = min((state.time + dt - self._entered) / (BLEND * self._time_unit), 1.0)
         pose = self._pose_before + share * share * (3.0 - 2.0 * share) * (pose - self._pose_before)
@@ -352,7 +375,7 @@ class Jump:
         falling = self.phase is JumpPhase.FLIGHT and float(com_velocity[2]) < 0.0
         follow, weights = 6.0 / self._time_unit, self.weights
         if self.phase is JumpPhase.LAND or falling:
-            share = 0.0 if falling else weights.landing
+            share = 0.0 if falling else max(weights.landing, min(urgent, 1.0))
             weights = replace(weights, com=share * weights.com, up=share * weights.up, spin=share * weights.spin)
         if left is not None:
             follow, weights = min(IN_TIME / left, follow), replace(weights, pose=weights.airborne)

@@ -151,7 +151,8 @@ class PoseFamily:
         self.body, self.ground, self.friction = body, ground, friction
         self._normal = ground.axes @ ground.surface_normal
         local = ground.local(standing)
-        self._arms = (local - body.centre_of_mass(local)) @ ground.axes
+        self.arms = (local - body.centre_of_mass(local)) @ ground.axes
+        """(N, 3) metres, world axes: the standing nodes from their centre of mass."""
         self.standing_height = float(body.centre_of_mass(local)[2])
         self._sole_share = sole_shares(body, ground, standing)
         self._standing = standing
@@ -206,10 +207,22 @@ class PoseFamily:
 
         The capture point, of the momentum about the feet, is steered to it.
         """
-        gravity = float(np.linalg.norm(self.body.gravity))
-        pendulum = gravity / self._lever(seen.com)
-        capture = seen.com[:2] + (seen.velocity[:2] + seen.swing) / np.sqrt(pendulum)
-        return -2.0 * pendulum * (capture - goal) + pendulum * (seen.com[:2] - goal)
+        pendulum = self._pendulum(seen)
+        return -2.0 * pendulum * (self._capture(seen) - goal) + pendulum * (seen.com[:2] - goal)
+
+    def urgency(self, seen: Measurement) -> float:
+        """How far the capture point is from the middle of what the body stands on, 1 at its edge: beyond it, it falls
+        unless it steps."""
+        middle, reach = seen.support.mean(axis=0), 0.5 * (seen.support[1] - seen.support[0])
+        return float((np.abs(self._capture(seen) - middle) / np.maximum(reach, 1e-3 * self.body.height)).max())
+
+    def _pendulum(self, seen: Measurement) -> float:
+        """1/s^2, of the linear inverted pendulum."""
+        return float(np.linalg.norm(self.body.gravity)) / self._lever(seen.com)
+
+    def _capture(self, seen: Measurement) -> np.ndarray:
+        """(2,) where the body, told to hold there, would come to rest over its feet."""
+        return seen.com[:2] + (seen.velocity[:2] + seen.swing) / np.sqrt(self._pendulum(seen))
 
     def _lever(self, com: np.ndarray) -> float:
         """Metres: height of the centre of mass ``com`` (3,), ground coordinates, over the feet."""
@@ -253,11 +266,11 @@ class PoseFamily:
     def rotation(self, positions: np.ndarray) -> np.ndarray:
         """(3, 3) best-fit rotation from the standing pose, world axes."""
         arms = positions - self.body.centre_of_mass(positions)
-        return best_turn(self.body.node_mass, self._arms, arms)
+        return best_turn(self.body.node_mass, self.arms, arms)
 
     def sole_heading(self, positions: np.ndarray) -> float:
         """Radians about the ground's normal by which the feet alone are turned from the standing pose."""
-        return heading_between(self._arms, positions, self._sole_share, self.ground)
+        return heading_between(self.arms, positions, self._sole_share, self.ground)
 
     def over_base(self, com: np.ndarray, base: np.ndarray, heading: float = 0.0) -> np.ndarray:
         """(3, 3) the pose whose sole is flat at ``base`` (2,) while the centre of mass is at ``com`` (3,),
@@ -322,8 +335,8 @@ class PoseFamily:
         com = body.centre_of_mass(state.positions)
         arms = state.positions - com
         velocity = self.ground.axes.T @ com_velocity
-        wanted = self._arms @ pose.T
-        pose_velocity = velocity + self._arms @ pose_rate.T + follow * (wanted - arms)
+        wanted = self.arms @ pose.T
+        pose_velocity = velocity + self.arms @ pose_rate.T + follow * (wanted - arms)
         momentum = body.inertia(state.positions) @ spin
         return [
             *self._balance(velocity, weights),
@@ -344,7 +357,7 @@ class PoseFamily:
 
     def turn_towards(self, state: BodyState, pose: np.ndarray) -> np.ndarray:
         """(3,) rotation vector, world axes, from the measured best-fit rotation to that of ``pose``."""
-        wanted = best_turn(self.body.node_mass, self._arms, self._arms @ pose.T)
+        wanted = best_turn(self.body.node_mass, self.arms, self.arms @ pose.T)
         return Rotation.from_matrix(wanted @ self.rotation(state.positions).T).as_rotvec()
 
 

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 from egs_warp.fem.body import BodyState
+from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.locomotion.objectives import Objective, SpinObjective
 from egs_warp.motions.jump import Jump, JumpPhase
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.twist import Turning
-from tests.support.places import DT, moved
+from tests.support.meshes import coarse_stool
+from tests.support.places import DT, block_place, moved
 
 
 def test_a_landing_frame_holds_the_landed_body(place: Place) -> None:
@@ -33,3 +36,30 @@ def test_the_weight_goes_ahead_with_the_distance_and_stays_well_behind_the_toes(
 ) -> None:
     """0.15 of the distance, at most 0.35 of the 0.2 metres to the front of the feet."""
     assert Jump(place, JumpTarget(distance, 0.3)).plan.lean == pytest.approx(lean)
+
+
+@pytest.mark.parametrize(("mesh", "feet"), [(coarse_stool(), 4), (None, 0)])
+def test_feet_on_legs_swing_ahead_of_a_body_in_the_air(mesh: TetMesh | None, feet: int) -> None:
+    """Each asked to go ahead and not aside; a body on one base is asked for its pose alone."""
+    place = block_place(mesh)
+    jump = Jump(place, JumpTarget(0.5, 0.3))
+    jump.phase = JumpPhase.THRUST
+    flying, speed = place.standing + [0.25, 0.0, 0.3], np.array([0.8, 0.0, 0.0])
+    asked = jump.objectives(BodyState(flying, np.tile(speed, (len(flying), 1)), 0.01), None, DT)
+    swung = [one for one in asked if isinstance(one, Objective) and one.name == "foot velocity"]
+    assert jump.phase is JumpPhase.FLIGHT and len(swung) == feet
+    for objective in swung:
+        assert objective.target[0] > 0.05 > abs(objective.target[1])
+
+
+def test_a_landing_that_may_fail_is_balanced_in_full() -> None:
+    """Asked little of while its capture point is near the middle of its feet, everything once that is at their edge."""
+    place = block_place()
+    weights = []
+    for speed in (0.0, 2.0):
+        jump = Jump(place, JumpTarget(0.0, 0.3))
+        jump.phase = JumpPhase.LAND
+        moving = np.tile([speed, 0.0, 0.0], (len(place.standing), 1))
+        asked = jump.objectives(BodyState(place.standing, moving, 0.01), None, DT)
+        weights.append(next(objective.weight for objective in asked if isinstance(objective, SpinObjective)))
+    assert weights == pytest.approx([jump.weights.landing * jump.weights.spin, jump.weights.spin])

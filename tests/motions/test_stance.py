@@ -132,6 +132,18 @@ def test_a_body_that_turns_forward_is_caught_further_ahead(place: Place) -> None
     np.testing.assert_allclose(caught, -2.0 * np.sqrt(GRAVITY / seen.com[2]) * same, atol=1e-9)
 
 
+@pytest.mark.parametrize(("ahead", "urgency"), [(0.0, 0.0), (0.05, 0.25), (-0.1, 0.5), (0.3, 1.5)])
+def test_balance_is_urgent_by_how_near_the_capture_point_is_to_the_edge(
+    place: Place, ahead: float, urgency: float
+) -> None:
+    """Over a base of 0.2 metres either way, by the speed alone."""
+    pose = PoseFamily(place.body, place.ground, place.standing, place.touching, place.friction)
+    height = place.body.centre_of_mass(place.standing)[2]
+    speed = np.array([ahead * np.sqrt(GRAVITY / height), 0.0, 0.0])
+    seen = pose.measure(BodyState(place.standing, np.tile(speed, (len(place.standing), 1))), None)
+    assert pose.urgency(seen) == pytest.approx(urgency, abs=0.02)
+
+
 def test_a_body_that_leans_turns_as_far_as_strains_it_least(place: Place) -> None:
     """The static bend under a pull along the ground, its sole taken out of a dense system: the pose is the affine map
     nearest to it by mass, found by least squares."""
