@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     scene = pawn(device=options.device)
     with tempfile.TemporaryDirectory() as folder:
         # The first run compiles the kernels.
-        animate(scene.cloud, folder, plane=scene.plane, options=AnimateOptions(frames=1), quiet=True)
+        animate(scene.cloud, folder, plane=scene.plane, options=AnimateOptions(frames=2), quiet=True)
         asked = AnimateOptions(frames=frames, seed=options.seed)
         told, milliseconds = timed(
             animate, scene.cloud, folder, plane=scene.plane, options=asked, quiet=True, overwrite=True

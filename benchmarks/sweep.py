@@ -219,7 +219,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     runs = [case for case in cases(options.quick) if case not in known]
     # Kernels compile once, here, not in every worker.
     one = partial(run, device=options.device, seed=options.seed)
-    one(Case("pawn", "jump", 0.6, 0.05, 1 / 60), frames=3)
+    one(Case("pawn", "jump", 0.6, 0.05, 1 / 60), frames=4)
     # Workers share the cores between them.
     os.environ["OMP_NUM_THREADS"] = "1"
     context = multiprocessing.get_context("spawn")

@@ -48,14 +48,14 @@ def coarse() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What ``egs-warp animate`` writes: twelve frames of a small, coarse pawn that crouches."""
+    """What ``egs-warp animate`` writes: thirteen pictures of a small, coarse pawn that crouches."""
     from egs_warp.assets.pawn import pawn
     from egs_warp.pipelines.animate import AnimateOptions, animate
     from tests.support.coarse import coarse_cages
 
     folder = tmp_path_factory.mktemp("run")
     made = pawn(gaussian_count=6000)
-    options = AnimateOptions(frames=12, size=64)
+    options = AnimateOptions(frames=13, size=64)
     with coarse_cages(120):
         animate(made.cloud, folder, plane=made.plane, options=options, source="pawn", quiet=True)
     return folder

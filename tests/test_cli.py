@@ -34,7 +34,7 @@ from egs_warp.segmentation.clearance import Clearing
         (["--distance", "-1"], "--distance -1.0: give a number of body heights from 0 to 10"),
         (["--height", "11"], "--height 11.0: give a number of body heights from 0 to 10"),
         (["--height", "0"], "--height 0: a jump needs a height above 0 body heights"),
-        (["--frames", "0"], "--frames 0: give a whole number of at least 1"),
+        (["--frames", "0"], "--frames 0: give a whole number of at least 2; the first picture is at rest"),
         (["--size", "99999"], "--size 99999x99999: give pixels from 16 to 4096, as 512 or 640x360"),
         (["--camera", "none.json"], "none.json: no such file"),
         (["--fps", "-1"], "--fps -1.0: give a number of frames a second from 1 to 1000"),

@@ -165,7 +165,7 @@ def test_ctrl_c_in_any_phase_is_one_line(after: float, tmp_path: Path) -> None:
         import numpy as np
         import egs_warp as egs
         pawn = egs.scene("pawn", device="cpu")
-        options = egs.AnimateOptions(frames=60, size=64)
+        options = egs.AnimateOptions(frames=61, size=64)
         egs.animate(pawn.object, sys.argv[1], plane=pawn.plane, options=options, quiet=True)
     """
     out = tmp_path / "out"

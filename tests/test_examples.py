@@ -35,7 +35,7 @@ def example(name: str) -> ModuleType:
     ],
 )
 def test_example_writes_its_files(tmp_path: Path, name: str, asked: dict[str, float]) -> None:
-    report = example(name).main(["--out", str(tmp_path), "--frames", "3", "--size", "64"]).to_json()
+    report = example(name).main(["--out", str(tmp_path), "--frames", "4", "--size", "64"]).to_json()
     assert json.loads((tmp_path / "report.json").read_text()) == json.loads(json.dumps(report))
     (entry,) = report["motion"]
     assert entry["name"] == name and entry["asked"] == asked

@@ -105,7 +105,7 @@ def test_the_lines_of_the_readme_run(tmp_path: Path, monkeypatch: pytest.MonkeyP
     egs.write_ply(tmp_path / "scene.ply", room.subset(near))
     monkeypatch.chdir(tmp_path)
     simulate = egs.simulate
-    monkeypatch.setattr(egs, "simulate", lambda creature, motion: simulate(creature, motion, frames=24))
+    monkeypatch.setattr(egs, "simulate", lambda creature, motion: simulate(creature, motion, frames=25))
     names: dict[str, object] = {}
     exec(compile(readme_lines(), "README.md", "exec"), names)
     performance = names["performance"]

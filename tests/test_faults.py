@@ -40,7 +40,7 @@ COMMANDS = {
     "usd": "export {run} --to usd --out {out}/a.usdc",
     "usd as text": "export {run} --to usd --out {out}/a.usda",
     "bundle": "export {run} --to bundle --out {out}/a.npz",
-    "animate": "animate {capture} --up z --frames 2 --size 64 --out {out}",
+    "animate": "animate {capture} --up z --frames 3 --size 64 --out {out}",
 }
 SLOW = {"samples", "info", "muscles", "pictures"}
 """Where there is much to do before each file, or many files."""

@@ -54,7 +54,7 @@ def test_a_capture_enters_at_most_fourteen_rooms_on_its_way_to_a_pixel(tmp_path:
     """From the command's line to the film; thirty-four when the package lay flat."""
     made = egs.scene("pawn", device="cpu")
     egs.write_ply(tmp_path / "pawn.ply", made.object)
-    line = ["animate", str(tmp_path / "pawn.ply"), "--up", "z", "--frames", "1", "--size", "32"]
+    line = ["animate", str(tmp_path / "pawn.ply"), "--up", "z", "--frames", "2", "--size", "32"]
     rooms = rooms_entered(lambda: main([*line, "--out", str(tmp_path / "run")]))
     assert {"commands", "io", "pipelines", "meshing", "deformation", "render"} <= rooms
     assert len(rooms) <= 14, sorted(rooms)

@@ -63,7 +63,7 @@ def add_parser(commands: Commands) -> None:
         help="rise of the centre of mass, body heights: of a jump (0.2), hop (0.3) or twist (0.3)",
     )
     motion.add_argument("--heading-degrees", type=float, help="of a twist, counter-clockwise from above (180)")
-    motion.add_argument("--frames", type=int, help="length of the video at 60 Hz (until the body rests)")
+    motion.add_argument("--frames", type=int, help="pictures at 60 Hz, the first at rest (until the body rests)")
     body = animate.add_argument_group("body and ground")
     body.add_argument("--up", help="axis that points up: x, y, z or with a minus, as --up=-y; else it is guessed")
     body.add_argument("--front", help="x,y,z or an axis: the way it faces and moves, as --front=-x; else it is guessed")

@@ -27,7 +27,7 @@ from egs_warp.pipelines.drawn import DrawnCreature
 from egs_warp.pipelines.film import draw_film
 from egs_warp.pipelines.finished_run import PARTS
 from egs_warp.pipelines.oddities import oddities
-from egs_warp.pipelines.performance import simulate
+from egs_warp.pipelines.performance import check_frames, simulate
 from egs_warp.pipelines.plots import draw_plots
 from egs_warp.pipelines.report import Report, report_of_run
 from egs_warp.pipelines.shot import LARGEST_SIDE, SMALLEST_SIDE, Shot
@@ -45,7 +45,7 @@ class AnimateOptions:
     height: float | None = None
     heading_degrees: float | None = None
     frames: int | None = None
-    """None: until the last motion has come to rest."""
+    """Pictures at 60 Hz, the first at rest; None: until the last motion has come to rest."""
     size: int = 512
     """Pixels, both sides."""
     seed: int = 0
@@ -66,8 +66,7 @@ class AnimateOptions:
         if turn is not None and not abs(turn) <= LARGEST_TURN:
             span = f"from -{LARGEST_TURN:g} to {LARGEST_TURN:g}"
             raise ArgumentError("heading_degrees", f"give a number of degrees {span}", value=turn)
-        if self.frames is not None and self.frames < 1:
-            raise ArgumentError("frames", "give a whole number of at least 1", value=self.frames)
+        check_frames(self.frames)
         if not SMALLEST_SIDE <= self.size <= LARGEST_SIDE:
             advice = f"give a number of pixels from {SMALLEST_SIDE} to {LARGEST_SIDE}"
             raise ArgumentError("size", advice, value=self.size)
@@ -166,9 +165,8 @@ def animate(
         if front is None:
             notes = (*notes, creature.front.told(creature.frame))
         notes = (*notes, *oddities(creature.cloud, creature.cage.mesh, creature.body.height))
-        with tqdm(
-            total=options.frames or asked.frames(creature.body.height), desc="simulate", unit="frame", disable=quiet
-        ) as bar:
+        total = asked.frames(creature.body.height) if options.frames is None else options.frames - 1
+        with tqdm(total=total, desc="simulate", unit="frame", disable=quiet) as bar:
             performance = simulate(
                 creature,
                 asked,

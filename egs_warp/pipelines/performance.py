@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from egs_warp.errors import ArgumentError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.frames import box_corners
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -22,6 +23,8 @@ from egs_warp.pipelines.planned import planned_com
 
 FILMED_FROM = (0.6, -1.0, 0.22)
 """From the body to the camera of a film: ahead, left and up; it shows the face and the way."""
+LEAST_FRAMES = 2
+"""Of a film; the first one is at rest."""
 _FROM_ABOVE = 0.5
 """Up for one along the ground, in a scene, which has a floor to be seen."""
 _IN_THE_WAY = 0.7
@@ -112,6 +115,13 @@ class Performance:
         return np.array([*ways[first], _FROM_ABOVE])
 
 
+def check_frames(frames: int | None) -> None:
+    """Raise ``ArgumentError`` for a film without motion."""
+    if frames is not None and frames < LEAST_FRAMES:
+        advice = f"give a whole number of at least {LEAST_FRAMES}; the first picture is at rest"
+        raise ArgumentError("frames", advice, value=frames)
+
+
 def simulate(
     creature: Creature,
     motion: Script,
@@ -122,13 +132,14 @@ def simulate(
     resume: Path | None = None,
     progress: Callable[[int], object] = lambda frame: None,
 ) -> Performance:
-    """Run ``motion`` for ``frames`` at 60 Hz, or else until the body has come to rest or fallen, or the motion is cut
-    off.
+    """Run ``motion`` for ``frames`` pictures at 60 Hz, the first of them at rest, or else until the body has come to rest
+    or fallen, or the motion is cut off.
 
     ``step``: the seconds of a solver step, if not the usual; ``parts`` tells the folder that takes the steps as they
     are done, ``resume`` is that of a run that was cut off and goes on. ``progress`` is told each frame done. Raises
     ``UserError`` for a motion that the body cannot do, and a folder that another run has left.
     """
+    check_frames(frames)
     place = first_place(creature, step=step)
     motion.check(place)
     sequence = MotionSequence(place, motion.parts(creature.body.height))
@@ -140,7 +151,7 @@ def simulate(
         creature.geometry,
         creature.start,
         watch,
-        frames=frames or round(share * motion.frames(creature.body.height)),
+        frames=round(share * motion.frames(creature.body.height)) if frames is None else frames - 1,
         step=step,
         place=creature.frame,
         parts=parts,

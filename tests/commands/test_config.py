@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from imageio_ffmpeg import count_frames_and_secs
 
 from egs_warp import cli
 from egs_warp.assets import pawn
@@ -16,6 +17,7 @@ from egs_warp.commands import COMMANDS
 from egs_warp.commands.config import with_config, write_config
 from egs_warp.errors import UserError
 from egs_warp.io import write_ply
+from egs_warp.pipelines.finished_run import FinishedRun
 
 
 @pytest.mark.usefixtures("coarse")
@@ -27,6 +29,11 @@ def test_a_run_from_its_file_has_the_same_bits(tmp_path: Path, capsys: pytest.Ca
     assert cli.main(again) == 0
     for name in ("jump.mp4", "sheet.png", "trajectory.npz", "creature.npz", "run.yaml"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
+    # So many pictures, the first at rest, as asked.
+    assert count_frames_and_secs(str(tmp_path / "a" / "jump.mp4"))[0] == 4
+    run = FinishedRun.read(tmp_path / "a")
+    assert len(run.steps) == run.report["asked"]["frames"] == 4
+    assert run.trajectory.time[-1] == pytest.approx(3 / 60)
     assert '"run.yaml"' in (tmp_path / "a" / "manifest.json").read_text()
     assert "is not the file" not in capsys.readouterr().err
     write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=4100).cloud)

@@ -57,7 +57,7 @@ def test_after_warm_a_run_compiles_nothing(tmp_path: Path) -> None:
     code = (
         "import sys; from egs_warp.assets.pawn import pawn; from egs_warp.pipelines.animate import *;"
         "made = pawn(gaussian_count=4000);"
-        "animate(made.cloud, sys.argv[1], plane=made.plane, options=AnimateOptions(frames=2, size=32), quiet=True)"
+        "animate(made.cloud, sys.argv[1], plane=made.plane, options=AnimateOptions(frames=3, size=32), quiet=True)"
     )
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "out")], env=environment, check=True, timeout=400)
     assert {path for path in (tmp_path / "cache").rglob("*.o")} == there

@@ -28,7 +28,7 @@ from egs_warp.pipelines.report import Report, verdict
 from tests.support.slides import slide
 
 FILES = ["cage.vtu", "creature.npz", "jump.mp4", MANIFEST, "plots.png", "report.json", "sheet.png", "trajectory.npz"]
-OPTIONS = AnimateOptions(frames=1, size=32, friction=0.6)
+OPTIONS = AnimateOptions(frames=2, size=32, friction=0.6)
 
 
 @cache
@@ -39,9 +39,9 @@ def thing() -> BuiltInObject:
 
 @pytest.fixture(scope="module")
 def performance() -> Performance:
-    """One frame of a coarse pawn."""
+    """Two pictures of a coarse pawn."""
     creature = make_creature(thing().cloud, plane=thing().plane, friction=0.6, nodes=120)
-    return simulate(creature, motion("jump"), frames=1)
+    return simulate(creature, motion("jump"), frames=2)
 
 
 @pytest.fixture
@@ -64,7 +64,7 @@ def test_a_run_holds_what_was_asked_and_its_manifest(run: Callable[..., Report],
     report = run(tmp_path)
     assert sorted(os.listdir(tmp_path)) == FILES and finished(tmp_path)
     asked = json.loads((tmp_path / "report.json").read_text())["asked"]
-    assert asked["friction"] == 0.6 and asked["size"] == 32 and asked["frames"] == 1 and asked["up"] is None
+    assert asked["friction"] == 0.6 and asked["size"] == 32 and asked["frames"] == 2 and asked["up"] is None
     assert asked["plane"] == pytest.approx([*thing().plane.normal, thing().plane.offset])
     assert verdict(report.audit).startswith("audit: passed (momentum_residual ")
     energy = json.loads((tmp_path / "report.json").read_text())["energy"]

@@ -32,7 +32,7 @@ WHERE_IT_LIES = {"body_axes", "body_origin", "metres_per_unit"}
 
 
 def jump(lying: Lying, *, frames: int | None = None, by_up: bool = False) -> tuple[Creature, Simulation]:
-    """The first ``frames`` of a jump, or all of it; the plane is given, or found from up alone."""
+    """The first ``frames`` pictures of a jump, or all of it; the plane is given, or found from up alone."""
     if by_up:
         creature = make_creature(lying.cloud, up=lying.up)
     else:
@@ -60,14 +60,14 @@ def thing() -> Lying:
 
 @pytest.fixture(scope="module")
 def first_steps(thing: Lying) -> tuple[Creature, Simulation]:
-    return jump(thing, frames=2, by_up=True)
+    return jump(thing, frames=3, by_up=True)
 
 
 @pytest.fixture(scope="module")
 def elsewhere(thing: Lying) -> tuple[Lying, Creature, Simulation]:
     """The same, moved, turned and in another unit, with its plane."""
     lying = thing.moved((3.0, 1.0, -2.0)).turned().scaled(0.37)
-    return lying, *jump(lying, frames=2)
+    return lying, *jump(lying, frames=3)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_same_bits_however_the_file_lies(
     thing: Lying, first_steps: tuple[Creature, Simulation], other: Callable[[Lying], Lying]
 ) -> None:
     creature, simulation = first_steps
-    again, simulated = jump(other(thing), frames=2, by_up=True)
+    again, simulated = jump(other(thing), frames=3, by_up=True)
     for mine, its in (
         (again.cage.mesh, creature.cage.mesh),
         (again.muscles, creature.muscles),
@@ -118,7 +118,7 @@ def test_same_pictures_elsewhere(
 def test_same_pictures_from_up_alone(
     thing: Lying, first_steps: tuple[Creature, Simulation], other: Callable[[Lying], Lying]
 ) -> None:
-    assert_same_pictures(first_steps, jump(other(thing), frames=2, by_up=True))
+    assert_same_pictures(first_steps, jump(other(thing), frames=3, by_up=True))
 
 
 def test_trajectory_leads_back_to_the_capture(elsewhere: tuple[Lying, Creature, Simulation]) -> None:

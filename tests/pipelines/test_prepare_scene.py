@@ -165,7 +165,7 @@ def test_one_command_from_a_scene_to_a_film(
     """As without PyTorch, whose training takes a minute."""
     monkeypatch.setattr("egs_warp.pipelines.prepare_scene.has_torch", lambda: False)
     scene, out = str(scene_file), tmp_path / "out"
-    flags = ["--object", "0,-0.5,0.5", "--frames", "1", "--size", "64", "--out", str(out)]
+    flags = ["--object", "0,-0.5,0.5", "--frames", "2", "--size", "64", "--out", str(out)]
     assert main(["animate", scene, *flags]) == 0
     wrote = capsys.readouterr().out.splitlines()[-1]
     assert (out / "jump.mp4").stat().st_size > 0
