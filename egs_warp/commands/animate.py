@@ -17,7 +17,7 @@ from egs_warp.commands.flags import (
     parse_direction,
     parse_up,
 )
-from egs_warp.commands.scene_flags import add_flat_flag, add_object_flags, say, start
+from egs_warp.commands.scene_flags import add_flat_flag, add_object_flags, add_overwrite_flag, say, start
 from egs_warp.commands.segment import add_straddling_flag, clearing_of
 from egs_warp.errors import UserError
 
@@ -44,9 +44,7 @@ def add_parser(commands: Commands) -> None:
     animate = commands.add_parser("animate", help="bring a capture to life")
     animate.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
     animate.add_argument("--out", required=True, type=named_path, help="folder for video, sheet, report and trajectory")
-    animate.add_argument(
-        "--overwrite", action="store_true", help="move an earlier run in --out aside, into earlier-1, earlier-2, ..."
-    )
+    add_overwrite_flag(animate, "--out")
     add_config_flag(animate)
     animate.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
     animate.add_argument("--seed", type=int, help="recorded in the report; a jump has nothing random (0)")
@@ -189,9 +187,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
         run.begin_with(lambda: write_config(run.file(NAME), chosen, chosen.parser))
         scene = given.prepared(options, progress=lambda stage: say(f"{stage} ..."))
         # Whatever goes wrong later, the minutes that these took are not lost.
-        for name in ("object.ply", "background.ply", "plane.json"):
-            run.file(name)
-        scene.write(run.path)
+        scene.write(run)
         pictures = _write_pictures(run, given, scene)
         for note in scene.notes:
             say(note)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egs_warp.commands.flags import Commands, add_inpainter_flags, chosen_inpainter, named_path, parse_plane
-from egs_warp.commands.scene_flags import start
+from egs_warp.commands.scene_flags import add_overwrite_flag, start
 from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ def add_parser(commands: Commands) -> None:
     inpaint.add_argument("--hole", help="x,y,z,radius of a round hole, scene units")
     inpaint.add_argument("--out", required=True, type=named_path, help="filled capture to write, .ply")
     inpaint.add_argument("--picture", type=named_path, help="before, after and depth as PNG (--out with .png)")
+    add_overwrite_flag(inpaint, "their place")
     add_inpainter_flags(inpaint, default="patch")
     inpaint.add_argument("--steps", type=int, help="of training against the inpainted picture (100); 0: no PyTorch")
     inpaint.add_argument("--margin", type=float, help="by how much the hole is made larger, of its side (0.01)")
@@ -47,6 +48,7 @@ def _inpaint(chosen: argparse.Namespace) -> int:
     from egs_warp.inpainting.inpaint import InpaintOptions, inpaint
     from egs_warp.inpainting.picture import before_and_after
     from egs_warp.io import read_capture, write_ply
+    from egs_warp.io.named_files import check_named_files, named_files
     from egs_warp.io.video import write_png
 
     given = {"steps": chosen.steps, "margin": chosen.margin, "seed": chosen.seed}
@@ -59,6 +61,7 @@ def _inpaint(chosen: argparse.Namespace) -> int:
     for file in (chosen.out, picture):
         if not file.parent.is_dir():
             raise UserError(f"{file}: its folder does not exist; create {file.parent} first")
+    check_named_files(chosen.out, picture, overwrite=chosen.overwrite)
     plane, recorded = _plane(chosen.plane)
     said = sum([chosen.object is not None, chosen.mask is not None, chosen.hole is not None])
     if said > 1 or (said == 0 and recorded is None):
@@ -71,9 +74,12 @@ def _inpaint(chosen: argparse.Namespace) -> int:
     background = read_capture(chosen.background, device=chosen.device)
     hole = _hole(chosen, plane, recorded, background.cloud)
     assert hole is not None, "one of them was given"
-    result = inpaint(background.cloud, hole, inpainter=inpainter, options=options)
-    write_ply(chosen.out, result.cloud)
-    write_png(picture, before_and_after(result))
+    with named_files(chosen.out, picture, overwrite=chosen.overwrite) as files:
+        result = inpaint(background.cloud, hole, inpainter=inpainter, options=options)
+        compared = before_and_after(result)
+        files.begin()
+        write_ply(chosen.out, result.cloud)
+        write_png(picture, compared)
     for note in (*background.notes, *result.notes):
         print(f"note: {note}")
     print(f"wrote {chosen.out} and {picture} in {sum(result.seconds.values()):.1f} s")

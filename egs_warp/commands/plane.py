@@ -25,8 +25,7 @@ def _plane(chosen: argparse.Namespace) -> int:
     from egs_warp.commands.scene_input import read_scene
     from egs_warp.commands.scene_planes import planes_of_scene, write_ring
     from egs_warp.errors import UserError
-    from egs_warp.io.atomic import writable_folder
-    from egs_warp.io.run_folder import check_out
+    from egs_warp.io.run_folder import check_run_folder, run_folder
     from egs_warp.io.video import write_png
     from egs_warp.pipelines.pictures import picture_cameras, plane_picture
 
@@ -34,21 +33,22 @@ def _plane(chosen: argparse.Namespace) -> int:
         raise UserError("plane: give --object, or --plane-mask with --cameras")
     if chosen.count < 1:
         raise UserError(f"--count {chosen.count}: give a whole number of at least 1")
-    check_out(chosen.out)
+    check_run_folder(chosen.out, overwrite=chosen.overwrite)
     given = read_scene(chosen)
-    folder = writable_folder(chosen.out)
-    found = planes_of_scene(given, plane_mask=chosen.plane_mask, view=chosen.view, count=chosen.count)
-    for note in (*given.notes, *found.notes):
-        say(note)
-    cameras = picture_cameras(found.planes[0], found.centre, found.size, given.cameras)
-    found.write(folder / "plane.json")
-    picture = plane_picture(given.cloud, found.planes, cameras, centre=found.centre, size=found.size)
-    write_png(folder / "plane.png", picture)
-    wrote = "plane.json, plane.png"
-    if not given.posed:
-        write_ring(folder, given.cloud, found.planes[0], found.centre, found.size)
-        wrote += ", cameras.json and images/ for a segmenter"
+    with run_folder(chosen.out, command="plane", overwrite=chosen.overwrite) as run:
+        found = planes_of_scene(given, plane_mask=chosen.plane_mask, view=chosen.view, count=chosen.count)
+        for note in (*given.notes, *found.notes):
+            say(note)
+        cameras = picture_cameras(found.planes[0], found.centre, found.size, given.cameras)
+        picture = plane_picture(given.cloud, found.planes, cameras, centre=found.centre, size=found.size)
+        found.write(run.file("plane.json"))
+        write_png(run.file("plane.png"), picture)
+        wrote = "plane.json, plane.png"
+        if not given.posed:
+            write_ring(run, given.cloud, found.planes[0], found.centre, found.size)
+            wrote += ", cameras.json and images/ for a segmenter"
+        run.finish()
     first = found.planes[0]
     print("plane: " + ",".join(f"{x:.6g}" for x in (*first.normal, first.offset)))
-    print(f"wrote {wrote} into {folder}")
+    print(f"wrote {wrote} into {chosen.out}")
     return 0

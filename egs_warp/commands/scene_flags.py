@@ -27,11 +27,21 @@ def add_flat_flag(parser: argparse._ActionsContainer) -> None:
     )
 
 
+def add_overwrite_flag(parser: argparse._ActionsContainer, where: str) -> None:
+    """Add the flag that lets an earlier run be moved aside; ``where`` tells of which place."""
+    parser.add_argument(
+        "--overwrite",
+        action="store_true",
+        help=f"move an earlier run in {where} aside, into earlier-1, earlier-2, ...",
+    )
+
+
 def add_scene_flags(parser: argparse.ArgumentParser) -> None:
     """Add everything that the commands before the animation share."""
     parser.add_argument("capture", help=".ply, compressed .ply, .spz, .splat, .sog, .glb or an unbundled SOG folder")
     add_object_flags(parser)
     parser.add_argument("--out", required=True, type=named_path, help="folder for the result and its picture")
+    add_overwrite_flag(parser, "--out")
     parser.add_argument(
         "--up", help="axis that points roughly up: x, y, z or with a minus, as --up=-y; else it is guessed"
     )

@@ -17,6 +17,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import writable_folder
 from egs_warp.io.cameras import write_cameras
 from egs_warp.io.planes import KnownPlane, write_planes
+from egs_warp.io.run_folder import RunFolder
 from egs_warp.io.video import write_png
 from egs_warp.pipelines.locate_plane import known_of_fit, locate_plane
 from egs_warp.render.rasteriser import render_gaussians
@@ -81,11 +82,11 @@ def planes_of_scene(given: SceneInput, *, plane_mask: str | None, view: str | No
     return ScenePlanes(known, centre, size, notes)
 
 
-def write_ring(folder: Path, cloud: GaussianCloud, plane: Plane, centre: np.ndarray, size: float) -> None:
+def write_ring(run: RunFolder, cloud: GaussianCloud, plane: Plane, centre: np.ndarray, size: float) -> None:
     """``cameras.json`` and ``images/`` of a ring about the object, for a segmenter to make masks of."""
     cameras = ring_cameras(plane, centre, 0.6 * size, count=12, size=512)
     names = [f"ring{number:02d}.png" for number in range(len(cameras))]
-    images = writable_folder(folder / "images")
+    images = writable_folder(run.folder("images"))
     for name, camera in zip(names, cameras, strict=True):
         write_png(images / name, render_gaussians(cloud, camera).colour_srgb8())
-    write_cameras(folder / "cameras.json", cameras, names)
+    write_cameras(run.file("cameras.json"), cameras, names)

@@ -46,25 +46,26 @@ def clearing_of(chosen: argparse.Namespace) -> Clearing | None:
 def _segment(chosen: argparse.Namespace) -> int:
     from egs_warp.commands.scene_input import read_scene
     from egs_warp.errors import UserError
-    from egs_warp.io.atomic import writable_folder
     from egs_warp.io.planes import read_planes
-    from egs_warp.io.run_folder import check_out
+    from egs_warp.io.run_folder import check_run_folder, run_folder
     from egs_warp.io.video import write_png
     from egs_warp.pipelines.pictures import picture_cameras, segmentation_picture
     from egs_warp.pipelines.prepare_scene import SceneOptions
 
     if not chosen.object:
         raise UserError("segment: give --object: a mask, a point, a box or a pixel")
-    check_out(chosen.out)
+    check_run_folder(chosen.out, overwrite=chosen.overwrite)
     given = read_scene(chosen)
     known = read_planes(chosen.plane) if chosen.plane and Path(chosen.plane).is_file() else []
-    folder = writable_folder(chosen.out)
-    scene = given.prepared(SceneOptions(clearing=clearing_of(chosen), flat=chosen.flat, inpaint=False))
-    for note in (*given.notes, *scene.notes):
-        say(note)
-    scene.write(folder, known)
-    cameras = picture_cameras(scene.plane, scene.located.centre, scene.located.size, given.cameras)
-    write_png(folder / "segment.png", segmentation_picture(given.cloud, scene.object, scene.background, cameras))
+    with run_folder(chosen.out, command="segment", overwrite=chosen.overwrite) as run:
+        scene = given.prepared(SceneOptions(clearing=clearing_of(chosen), flat=chosen.flat, inpaint=False))
+        for note in (*given.notes, *scene.notes):
+            say(note)
+        scene.write(run, known)
+        cameras = picture_cameras(scene.plane, scene.located.centre, scene.located.size, given.cameras)
+        picture = segmentation_picture(given.cloud, scene.object, scene.background, cameras)
+        write_png(run.file("segment.png"), picture)
+        run.finish()
     print(f"object: {scene.object.count} Gaussians, background: {scene.background.count}")
-    print(f"wrote object.ply, background.ply, plane.json, segment.png into {folder}")
+    print(f"wrote object.ply, background.ply, plane.json, segment.png into {chosen.out}")
     return 0

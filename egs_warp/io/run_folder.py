@@ -1,7 +1,7 @@
 """A folder of results belongs to one run: locked while it is written, described by a manifest that comes last.
 
-``manifest.json`` holds ``schema``, ``version``, ``finished`` and ``files``: size and SHA-256 of each file by its name,
-null for those of a run that has not finished.
+``manifest.json`` holds ``schema``, ``version``, ``command``, ``finished`` and ``files``: size and SHA-256 of each file by
+its name, below a folder of the run too; null for the files and folders of a run that has not finished.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from egs_warp.errors import ArgumentError, UserError
@@ -22,6 +22,8 @@ from egs_warp.io.text import parse_json, read_text
 from egs_warp.version import __version__
 
 MANIFEST = "manifest.json"
+ANIMATE = "animate"
+"""The command whose runs ``resume`` goes on with."""
 _LOCK = ".egs-run.lock"
 _SCHEMA = 1
 
@@ -29,11 +31,15 @@ _SCHEMA = 1
 class RunFolder:
     """What one run writes; made by ``run_folder``."""
 
-    def __init__(self, path: Path, *, overwrite: bool = False, names: Sequence[str] = ()) -> None:
+    def __init__(
+        self, path: Path, *, command: str = ANIMATE, overwrite: bool = False, names: Sequence[str] = ()
+    ) -> None:
         """``names``: files of a run that was cut off and goes on."""
         self.path = path
         self.resumed = bool(names)
+        self._command = command
         self._overwrite = overwrite
+        self._kept: set[str] = set()
         self._names = list(names)
         self._begin: Callable[[], object] | None = None
 
@@ -53,53 +59,70 @@ class RunFolder:
         if begin is not None:
             begin()
         if not self._names:
-            self._move_aside(_known(self.path))
+            move_aside(self.path, _known(self.path))
         if name not in self._names:
             self._names.append(name)
             if (self.path / name).exists():
                 if not self._overwrite:
                     raise _occupied(self.path, f"it has {name}")
-                self._move_aside([name])
+                move_aside(self.path, [name])
             self._write_manifest(dict.fromkeys(self._names), finished=False)
         return self.path / name
 
+    def folder(self, name: str) -> Path:
+        """Where the run's folder ``name`` goes, all of whose files are results: as ``file``."""
+        self._kept.add(name)
+        return self.file(name)
+
     def finish(self) -> None:
-        """Describe all files; the manifest says from now on that the run has finished. Folders, which a run needs only
-        to go on, are gone then.
+        """Describe all files; the manifest says from now on that the run has finished. Folders of ``file``, which a run
+        needs only to go on, are gone then; those of ``folder`` stay.
         """
-        facts = {name: _facts(self.path / name) for name in self._names if (self.path / name).is_file()}
+        files = {name: self.path / name for name in self._names}
+        for name in self._kept:
+            files |= {path.relative_to(self.path).as_posix(): path for path in sorted(files[name].rglob("*"))}
+        facts = {name: _facts(path) for name, path in files.items() if path.is_file()}
         self._write_manifest(facts, finished=True)
         for name in self._names:
-            if name not in facts:
+            if name not in facts and name not in self._kept:
                 shutil.rmtree(self.path / name, ignore_errors=True)
         # What the run that was cut off has left was too young when this one began, perhaps.
         sweep(self.path)
 
     def _write_manifest(self, files: dict[str, Any], *, finished: bool) -> None:
-        content = {"schema": _SCHEMA, "version": __version__, "finished": finished, "files": files}
+        about = {"schema": _SCHEMA, "version": __version__, "command": self._command, "finished": finished}
+        content = {**about, "files": files}
         with atomic_write(self.path / MANIFEST) as temporary:
             temporary.write_text(json.dumps(content, indent=1) + "\n")
 
-    def _move_aside(self, names: Sequence[str]) -> None:
-        there = [name for name in names if (self.path / name).exists()]
-        if not there:
-            return
-        number = 1
-        while (self.path / f"earlier-{number}").exists():
-            number += 1
-        aside = self.path / f"earlier-{number}"
-        try:
-            aside.mkdir()
-            # The manifest goes last: until then it names what is still to be moved.
-            for name in there:
-                os.replace(self.path / name, aside / name)
-        except OSError as error:
-            raise UserError(f"{self.path}: the earlier run cannot be moved aside ({error.strerror})") from error
+
+def move_aside(folder: Path, names: Sequence[str]) -> None:
+    """Into the first free of ``earlier-1``, ``earlier-2``, ... below ``folder`` go the files ``names`` that are there.
+
+    Raises ``UserError`` where that cannot be done.
+    """
+    there = [name for name in names if (folder / name).exists()]
+    if not there:
+        return
+    number = 1
+    while (folder / f"earlier-{number}").exists():
+        number += 1
+    aside = folder / f"earlier-{number}"
+    try:
+        aside.mkdir()
+        # The manifest goes last: until then it names what is still to be moved.
+        for name in there:
+            os.replace(folder / name, aside / name)
+    except OSError as error:
+        raise UserError(f"{folder}: the earlier run cannot be moved aside ({error.strerror})") from error
 
 
 @contextmanager
-def run_folder(out: Path | str | RunFolder, *, overwrite: bool = False, resume: bool = False) -> Iterator[RunFolder]:
-    """The folder ``out``, made where it is missing and locked, for one run; a ``RunFolder`` is handed on as it is.
+def run_folder(
+    out: Path | str | RunFolder, *, command: str = ANIMATE, overwrite: bool = False, resume: bool = False
+) -> Iterator[RunFolder]:
+    """The folder ``out``, made where it is missing and locked, for one run of ``command``; a ``RunFolder`` is handed on
+    as it is.
 
     Raises ``UserError`` where another run is writing, or where an earlier run lies and may not be moved aside
     (``overwrite``); of a run that goes on (``resume``), where there is none, or none that was cut off.
@@ -116,7 +139,9 @@ def run_folder(out: Path | str | RunFolder, *, overwrite: bool = False, resume: 
         # What came between the check and the lock.
         _check(out, overwrite=overwrite, resume=resume)
         sweep(folder)
-        yield RunFolder(folder, overwrite=overwrite, names=_known(folder)[:-1] if resume else ())
+        yield RunFolder(
+            folder, command=command, overwrite=overwrite, names=_known(folder)[:-1] if resume else ()
+        )
 
 
 def _check(out: Path | str, *, overwrite: bool, resume: bool) -> None:
@@ -137,6 +162,9 @@ def has_finished(out: Path | str) -> bool:
     manifest = parse_json(read_text(path), path)
     if not isinstance(manifest, dict) or not _names_in(manifest):
         raise UserError(f"{path}: is no manifest of a run; begin the run again")
+    command = manifest.get("command", ANIMATE)
+    if command != ANIMATE:
+        raise UserError(f"{out}: egs-warp {command} wrote here, which cannot go on; begin it again")
     if manifest.get("finished") is True:
         return True
     if manifest.get("version") != __version__:
@@ -196,10 +224,11 @@ def _known(folder: Path) -> list[str]:
 
 
 def _names_in(manifest: Any) -> list[str]:
-    """Files that a manifest tells of; not of other folders."""
+    """Files and folders that a manifest tells of; not those of other folders."""
     files = manifest.get("files") if isinstance(manifest, dict) else None
     names = files if isinstance(files, dict) else {}
-    return [name for name in names if Path(name).name == name and name != MANIFEST]
+    first = dict.fromkeys(part for name in names for part in PurePosixPath(name).parts[:1])
+    return [name for name in first if Path(name).name == name and name not in ("..", MANIFEST)]
 
 
 def _facts(path: Path) -> dict[str, Any]:

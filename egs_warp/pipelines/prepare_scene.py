@@ -19,6 +19,7 @@ from egs_warp.inpainting.holes import Hole, hole_under
 from egs_warp.inpainting.underside import with_underside
 from egs_warp.io.planes import KnownPlane, write_planes
 from egs_warp.io.ply import write_ply
+from egs_warp.io.run_folder import RunFolder
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, on_its_ground
 from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane, reach_across
 from egs_warp.segmentation.object_mask import ObjectSpec
@@ -75,15 +76,16 @@ class PreparedScene:
         """What the object stands on where that is not flat."""
         return self.located.ground
 
-    def write(self, folder: Path, known: Sequence[KnownPlane] = ()) -> None:
-        """``object.ply``, ``background.ply`` and ``plane.json`` into ``folder``.
+    def write(self, out: Path | RunFolder, known: Sequence[KnownPlane] = ()) -> None:
+        """``object.ply``, ``background.ply`` and ``plane.json`` into the folder ``out``, or as files of a run.
 
         ``known`` is what the file that gave the plane held; what is not found anew goes along.
         """
-        write_ply(folder / "object.ply", self.object)
-        write_ply(folder / "background.ply", self.background)
+        place = out.file if isinstance(out, RunFolder) else out.joinpath
+        write_ply(place("object.ply"), self.object)
+        write_ply(place("background.ply"), self.background)
         first = replace(self.located.known(), hole=self.hole.outline())
-        write_planes(folder / "plane.json", [first.over(known[0]) if known else first, *known[1:]])
+        write_planes(place("plane.json"), [first.over(known[0]) if known else first, *known[1:]])
 
 
 def prepare_scene(
