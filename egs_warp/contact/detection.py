@@ -17,6 +17,7 @@ from egs_warp.errors import ArgumentError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.rows import distinct_rows
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.kernels.contact import gaps as kernels
 from egs_warp.kernels.contact.height_field import ground_gaps_kernel
@@ -26,6 +27,10 @@ LEAST_OUTSIDE = 0.1
 """Share of the Gaussians above the ground that are outside of all solids at rest."""
 _SHORTENINGS = 40
 """Halvings in which an arm finds where it meets uneven ground."""
+_BEND = 1e-7
+"""Of a tetrahedron's points: far above the rounding of a double, far below what makes a point of a grid a vertex."""
+_SLACK = 0.25
+"""Of the grid: what is not deeper is in the plane once it is moved to the grid."""
 _FINE = 0.5
 """Of the spacing of uneven ground: in each such square of it the lowest point of each tetrahedron counts."""
 
@@ -106,6 +111,7 @@ def contact_geometry(
     solids: tuple[Solid, ...] = (),
     friction: float = 0.8,
     gamma: float = 3.0,
+    grid: float | None = None,
     device: str | None = None,
 ) -> ContactGeometry:
     """Points of all T+ and T- (Eq. 3); endpoints below a plane at rest are shortened to it (docs/concepts/contact.md).
@@ -113,7 +119,9 @@ def contact_geometry(
     ``planes`` bound half spaces, the first of them the ground, whose place ``field`` takes where it is not flat;
     ``solids`` stand on it. Only vertices of the convex hull of each tetrahedron's points are kept: a deformation is
     affine inside a tetrahedron, so the deepest point of it is always one of those. A bump can be deepest between them:
-    over uneven ground the lowest point of each small square stays as well.
+    over uneven ground the lowest point of each small square stays as well. With a ``grid`` (metres) all are moved to
+    the nearest of its points and put in the order of their places: of the same body in another file, whose numbers
+    are rounded otherwise, nearly all are the same then.
 
     Raises ``UserError`` for a solid that holds the body.
     """
@@ -123,10 +131,12 @@ def contact_geometry(
     arms = gamma * np.exp(cloud.log_scales.numpy().astype(np.float64))[:, None, :] * axes
     obstacles = [Solid((plane,)) for plane in planes] + list(solids)
     grounds = planes if field is None else (field, *planes[1:])
-    above = np.all([ground.heights(means) >= 0.0 for ground in grounds], axis=0)
+    # Of a base that is flat many means and arms lie in the plane, to rounding: none of them is below it.
+    slack = 0.0 if grid is None else _SLACK * grid
+    above = np.all([ground.heights(means) >= -slack for ground in grounds], axis=0)
     least = LEAST_OUTSIDE * np.count_nonzero(above)
     for number, solid in enumerate(solids, start=1):
-        above &= np.any([face.heights(means) >= 0.0 for face in solid.faces], axis=0)
+        above &= np.any([face.heights(means) >= -slack for face in solid.faces], axis=0)
         if np.count_nonzero(above) < least:
             raise ArgumentError(
                 "solids",
@@ -145,13 +155,17 @@ def contact_geometry(
                 rooms = np.stack([face.heights(means[above]) for face in solid.faces])
                 facing = np.argmax(rooms, axis=0)
                 normals = np.stack([face.normal for face in solid.faces])[facing]
-                drop, room = -(arm * normals).sum(axis=1), rooms.max(axis=0)
+                drop, room = -(arm * normals).sum(axis=1), rooms.max(axis=0) + slack
                 reach = np.minimum(reach, np.where(drop > room, room / np.where(drop > room, drop, 1.0), 1.0))
             points.append(means[above] + reach[:, None] * arm)
     everything = np.concatenate(points)
+    places = everything
+    if grid is not None:
+        places = distinct_rows(np.rint(everything / grid).astype(np.int64))[0].astype(np.float64)
+        everything = grid * places
     embedding = embed_points(mesh, everything, device=device)
     tet_from_point, weights = embedding.tets.numpy(), embedding.weights.numpy()
-    kept = _hull_points(tet_from_point, weights, len(mesh.tets))
+    kept = _hull_points(tet_from_point, weights[:, 1:] if grid is None else places, len(mesh.tets))
     if field is not None:
         kept = np.union1d(kept, _lowest_points(tet_from_point, everything, field))
     return ContactGeometry(
@@ -187,8 +201,10 @@ def _lowest_points(tet_from_point: np.ndarray, points: np.ndarray, field: Height
     return np.sort(order[first])
 
 
-def _hull_points(tet_from_point: np.ndarray, weights: np.ndarray, tet_count: int) -> np.ndarray:
-    local = weights[:, 1:]
+def _hull_points(tet_from_point: np.ndarray, places: np.ndarray, tet_count: int) -> np.ndarray:
+    """(k,) of the points the vertices of the hull of those of each tetrahedron; ``places`` (P, 3) in any axes, even
+    oblique ones.
+    """
     order = np.argsort(tet_from_point, kind="stable")
     bounds = np.searchsorted(tet_from_point[order], np.arange(tet_count + 1))
     kept = []
@@ -196,11 +212,21 @@ def _hull_points(tet_from_point: np.ndarray, weights: np.ndarray, tet_count: int
         members = order[start:stop]
         if len(members) > 8:
             try:
-                members = members[ConvexHull(local[members]).vertices]
+                members = members[ConvexHull(_bent_in(places[members])).vertices]
             except QhullError:  # all in one plane: each may matter
                 pass
         kept.append(members)
     return np.sort(np.concatenate(kept))
+
+
+def _bent_in(places: np.ndarray) -> np.ndarray:
+    """``places`` (n, 3), each a little nearer to the middle the nearer it is: what lies in an edge or a face of the
+    hull lies inside then (|p|^2 is convex), and what does not stays a vertex. Else such points are vertices or none by
+    luck.
+    """
+    arms = places - places.mean(axis=0)
+    arms /= max(float(np.abs(arms).max()), 1e-300)
+    return arms * (1.0 + _BEND * (arms**2).sum(axis=1, keepdims=True))
 
 
 class ContactDetector:

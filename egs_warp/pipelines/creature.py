@@ -17,7 +17,7 @@ from egs_warp.geometry.body_frame import GROUND, BodyFrame
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
-from egs_warp.geometry.tetmesh import mean_edge_length
+from egs_warp.geometry.tetmesh import TetMesh, mean_edge_length
 from egs_warp.locomotion.rollout import settle, solver_steps
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.stepper import LocomotionStepper
@@ -38,6 +38,14 @@ STEEPEST_SLOPE = 45.0
 """Degrees: nothing stands on a steeper one."""
 _GROUND_SPACING = 0.5
 """Edges of the cage between the nodes of uneven ground: points of contact are 0.4 apart."""
+_CAGE_BITS = 32
+"""Of the height, that the coordinates of the cage keep."""
+_CONTACT_GRID = 2.0**-10
+"""Of the height: what points of contact are rounded to. A jump makes much of the last bit of a number, and a file's
+numbers change by theirs when the capture is turned or its unit is another one.
+"""
+_FRONT_GRID = np.pi / 2**12
+"""Radians, what the front is rounded to, likewise."""
 _FOOT = 0.1
 """Of the height over uneven ground: what is lower may stand on it."""
 
@@ -131,7 +139,14 @@ def make_creature(
         # A cage gives way to nothing finer than it is itself.
         field = frame.height_field(ground).coarser(_GROUND_SPACING * mean_edge_length(cage.mesh))
     geometry = contact_geometry(
-        standing.gaussians, cage.mesh, (GROUND,), field=field, solids=solids, friction=friction, device=device
+        standing.gaussians,
+        cage.mesh,
+        (GROUND,),
+        field=field,
+        solids=solids,
+        friction=friction,
+        grid=_CONTACT_GRID * cage.height(GROUND),
+        device=device,
     )
     against_gravity = None if gravity_up is None else frame.axes @ gravity_up
     progress("front")
@@ -213,9 +228,15 @@ def stand(
     solid = solid_from_gaussians(gaussians)
     cage = cage_of_body(gaussians, target_nodes=nodes, solid=solid)
     metres = 1.0 / cage.height(GROUND) if metres_per_unit is None else metres_per_unit / frame.scale
-    cage = cage.scaled(metres)
+    cage = _rounded(cage.scaled(metres))
     limbs = find_limbs(Sections.of_solid(solid.scaled(metres), cage.mesh), cage.mesh.nodes)
     return Standing(frame.moved(anchor).scaled(metres), gaussians.scaled(metres), cage, limbs)
+
+
+def _rounded(cage: Cage) -> Cage:
+    """Without the last bits of its coordinates, which hang on how large the capture's unit is."""
+    step = 2.0 ** (np.rint(np.log2(cage.height(GROUND))) - _CAGE_BITS)
+    return replace(cage, mesh=TetMesh(step * np.rint(cage.mesh.nodes / step), cage.mesh.tets))
 
 
 def face(standing: Standing, front: np.ndarray | None = None, *, seen_from: np.ndarray | None = None) -> Front:
@@ -224,7 +245,9 @@ def face(standing: Standing, front: np.ndarray | None = None, *, seen_from: np.n
     axes = standing.frame.axes
     if front is None:
         seen = None if seen_from is None else axes @ seen_from
-        return find_front(standing.gaussians, standing.cage.mesh, seen_from=seen)
+        found = find_front(standing.gaussians, standing.cage.mesh, seen_from=seen)
+        angle = _FRONT_GRID * np.rint(np.arctan2(found.direction[1], found.direction[0]) / _FRONT_GRID)
+        return replace(found, direction=np.array([np.cos(angle), np.sin(angle), 0.0]))
     x, y, _ = axes @ front
     return Front(np.array([x, y, 0.0]) / np.hypot(x, y), None)
 
