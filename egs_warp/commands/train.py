@@ -5,14 +5,16 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egs_warp.commands.camera_flags import COLOURS, parse_colour
 from egs_warp.commands.flags import Commands, named_path
+from egs_warp.commands.scene_flags import add_overwrite_flag
 from egs_warp.errors import UserError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from egs_warp.pipelines.train_capture import TrainResult
 
 _SHEET_PHOTOS = 6
@@ -35,6 +37,10 @@ def add_parser(commands: Commands) -> None:
         required=True,
         type=named_path,
         help="capture to write: .ply, .compressed.ply, .spz, .sog, .splat or .glb",
+    )
+    add_overwrite_flag(train, "its place")
+    train.add_argument(
+        "--resume", action="store_true", help="go on with a training that was cut off; give its flags again"
     )
     train.add_argument("--iterations", type=int, help="optimiser steps, one photo each (cpu 2000, cuda 7000)")
     train.add_argument(
@@ -64,11 +70,24 @@ def _train(chosen: argparse.Namespace) -> int:
             raise UserError(f"{flag} {value}: give a whole number of at least {least}")
     if not 0 <= chosen.sh_degree <= 3:
         raise UserError(f"--sh-degree {chosen.sh_degree}: give 0, 1, 2 or 3")
-    from egs_warp.io.run_folder import check_out
+    from egs_warp.io.named_files import check_named_files, named_files
     from egs_warp.io.writing import writer_of
 
     write = writer_of(chosen.out)
-    check_out(chosen.out.parent if chosen.out.parent != Path(".") else Path.cwd())
+    stem = chosen.out.name.split(".")[0]
+    sheet, told = chosen.out.with_name(f"{stem}.sheet.png"), chosen.out.with_name(f"{stem}.report.json")
+    checkpoint = chosen.out.with_name(f"{stem}.training.npz")
+    if chosen.resume and chosen.out.exists() and not checkpoint.exists():
+        print(f"{chosen.out}: this training has finished")
+        return 0
+    if checkpoint.exists() and not (chosen.resume or chosen.overwrite):
+        raise UserError(
+            f"--out {chosen.out}: a training was cut off here; --resume goes on with it, --overwrite begins again"
+        )
+    outputs = (chosen.out, sheet, told)
+    # Of a training that goes on what is there was said to be moved aside, or is its own last work.
+    overwrite = chosen.overwrite or (chosen.resume and checkpoint.exists())
+    check_named_files(*outputs, overwrite=overwrite)
     import warp as wp
 
     from egs_warp.launching import use_device
@@ -79,41 +98,52 @@ def _train(chosen: argparse.Namespace) -> int:
         from egs_warp.pipelines.train_capture import train
     except ImportError as error:
         raise UserError("train: PyTorch is not installed; pip install 'egs-warp[torch]'") from error
-    from egs_warp.io import read_cameras, writable_folder
+    from egs_warp.io import read_cameras
+    from egs_warp.io.video import write_png
     from egs_warp.pipelines.train_report import TrainReport
 
     # Poses that cannot be read must not leave a new folder behind.
     read_cameras(chosen.posed)
-    folder = writable_folder(chosen.out.parent)
     iterations, gaussians, side = _DEFAULTS["cuda" if chosen.device.startswith("cuda") else "cpu"]
     iterations = chosen.iterations or iterations
     progress = _Progress(iterations)
     began = time.perf_counter()
-    result = train(
-        chosen.posed,
-        iterations=iterations,
-        max_gaussians=chosen.gaussians or gaussians,
-        sh_degree=chosen.sh_degree,
-        background=background,
-        max_side=chosen.max_side or side,
-        seed=chosen.seed,
-        device=chosen.device,
-        progress=progress.step,
-        stage=progress.say,
-    )
-    progress.say(f"writing {chosen.out}")
-    stem = chosen.out.name.split(".")[0]
-    write(chosen.out, result.cloud)
-    report = TrainReport.of(
-        result,
-        seconds=time.perf_counter() - began,
-        frames_per_second=progress.frames_per_second,
-        device=chosen.device,
-        seed=chosen.seed,
-        sh_degree=chosen.sh_degree,
-    )
-    report.write(folder / f"{stem}.report.json")
-    _write_sheet(folder / f"{stem}.sheet.png", result)
+    with named_files(*outputs, overwrite=overwrite) as files:
+        try:
+            result = train(
+                chosen.posed,
+                iterations=iterations,
+                max_gaussians=chosen.gaussians or gaussians,
+                sh_degree=chosen.sh_degree,
+                background=background,
+                max_side=chosen.max_side or side,
+                seed=chosen.seed,
+                device=chosen.device,
+                checkpoint=checkpoint,
+                resume=chosen.resume,
+                progress=progress.step,
+                stage=progress.say,
+            )
+        except BaseException as error:
+            if checkpoint.is_file():
+                error.add_note("--resume beside the same flags goes on")
+            raise
+        progress.say(f"writing {chosen.out}")
+        report = TrainReport.of(
+            result,
+            seconds=time.perf_counter() - began,
+            frames_per_second=progress.frames_per_second,
+            device=chosen.device,
+            seed=chosen.seed,
+            sh_degree=chosen.sh_degree,
+        )
+        compared = _sheet(result)
+        files.begin()
+        write(chosen.out, result.cloud)
+        report.write(told)
+        write_png(sheet, compared)
+        # What is needed only to go on.
+        checkpoint.unlink(missing_ok=True)
     wrote = f"wrote {chosen.out} ({result.cloud.count} Gaussians), {stem}.sheet.png, {stem}.report.json"
     print(*report.summary(), wrote, sep="\n")
     return 0
@@ -126,6 +156,7 @@ class _Progress:
         self._iterations = iterations
         self._terminal = sys.stderr.isatty()
         self._first: float | None = None
+        self._before = 0
         self._shown = 0.0
         self.frames_per_second = 0.0
 
@@ -138,9 +169,9 @@ class _Progress:
         now = time.perf_counter()
         done = step + 1
         if self._first is None:
-            self._first = now
+            self._first, self._before = now, step
             return
-        self.frames_per_second = step / max(now - self._first, 1e-9)
+        self.frames_per_second = (step - self._before) / max(now - self._first, 1e-9)
         last = done == self._iterations
         due = now - self._shown > 0.5 if self._terminal else done % max(1, self._iterations // 10) == 0
         if not (due or last):
@@ -155,11 +186,11 @@ class _Progress:
         print(f"\r{text}\x1b[K" if self._terminal else text, end=end, file=sys.stderr, flush=True)
 
 
-def _write_sheet(path: Path, result: TrainResult) -> None:
-    """Photo beside render, of photos held out where there are any."""
+def _sheet(result: TrainResult) -> np.ndarray:
+    """(H, W, 3) uint8: photo beside render, of photos held out where there are any."""
     import numpy as np
 
-    from egs_warp.io.video import contact_sheet, write_png
+    from egs_warp.io.video import contact_sheet
     from egs_warp.render import render_gaussians
 
     pairs = list(zip(result.views, result.scores, strict=True))
@@ -176,4 +207,4 @@ def _write_sheet(path: Path, result: TrainResult) -> None:
         ):
             frames.append(picture)
             labels.append(kind)
-    write_png(path, contact_sheet(frames, 4 if len(picked) > 2 else 2, labels))
+    return contact_sheet(frames, 4 if len(picked) > 2 else 2, labels)

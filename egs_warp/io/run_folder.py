@@ -1,7 +1,7 @@
 """A folder of results belongs to one run: locked while it is written, described by a manifest that comes last.
 
-``manifest.json`` holds ``schema``, ``version``, ``command``, ``finished`` and ``files``: size and SHA-256 of each file by
-its name, below a folder of the run too; null for the files and folders of a run that has not finished.
+``manifest.json`` holds ``schema``, ``version``, ``command``, ``finished`` and ``files``: size and SHA-256 of each file
+by its name, below a folder of the run too; null for the files and folders of a run that has not finished.
 """
 
 from __future__ import annotations
@@ -139,9 +139,7 @@ def run_folder(
         # What came between the check and the lock.
         _check(out, overwrite=overwrite, resume=resume)
         sweep(folder)
-        yield RunFolder(
-            folder, command=command, overwrite=overwrite, names=_known(folder)[:-1] if resume else ()
-        )
+        yield RunFolder(folder, command=command, overwrite=overwrite, names=_known(folder)[:-1] if resume else ())
 
 
 def _check(out: Path | str, *, overwrite: bool, resume: bool) -> None:

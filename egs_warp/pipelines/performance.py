@@ -132,8 +132,8 @@ def simulate(
     resume: Path | None = None,
     progress: Callable[[int], object] = lambda frame: None,
 ) -> Performance:
-    """Run ``motion`` for ``frames`` pictures at 60 Hz, the first of them at rest, or else until the body has come to rest
-    or fallen, or the motion is cut off.
+    """Run ``motion`` for ``frames`` pictures at 60 Hz, the first of them at rest, or else until the body has come to
+    rest or fallen, or the motion is cut off.
 
     ``step``: the seconds of a solver step, if not the usual; ``parts`` tells the folder that takes the steps as they
     are done, ``resume`` is that of a run that was cut off and goes on. ``progress`` is told each frame done. Raises

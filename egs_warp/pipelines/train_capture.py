@@ -15,6 +15,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.cameras import read_points
 from egs_warp.render import render_gaussians
+from egs_warp.training.checkpoint import Checkpoint
 from egs_warp.training.finetune import Densification, FinetuneOptions, TrainingView, finetune
 from egs_warp.training.likeness import in_tone_of, psnr, ssim_of
 from egs_warp.training.misfits import misfitting
@@ -92,6 +93,8 @@ def train(
     seed: int = 0,
     device: str | None = None,
     threads: int | None = None,
+    checkpoint: Path | None = None,
+    resume: bool = False,
     progress: Callable[[int, float], None] | None = None,
     stage: Callable[[str], None] | None = None,
 ) -> TrainResult:
@@ -104,9 +107,10 @@ def train(
 
     Photos with alpha or masks (``read_photo``) are trained before a random colour each step, so that nothing can pass
     for the backdrop. They are judged before ``background``; without one, it is white for those and the mean colour
-    along the photos' borders for others, so that no Gaussians are spent on a plain backdrop. ``progress`` is called
-    with each step's number and loss, ``stage`` with what begins. Raises ``UserError`` where no photo can be used and
-    for impossible options.
+    along the photos' borders for others, so that no Gaussians are spent on a plain backdrop. ``checkpoint`` names a
+    file (.npz) that is written every half a minute and stays; with ``resume`` the training goes on from
+    it, with the same arguments on a CPU to the same bits. ``progress`` is called with each step's number and loss,
+    ``stage`` with what begins. Raises ``UserError`` where no photo can be used and for impossible options.
     """
     if iterations < 1 or (max_gaussians is not None and max_gaussians < 100) or not 0 <= sh_degree <= 3:
         raise UserError(
@@ -137,7 +141,8 @@ def train(
         threads=threads,
     )
     say(f"training on {len(chosen)} photos (the first run compiles kernels: up to a minute)")
-    result = finetune(start, chosen, options=options, progress=progress)
+    kept = None if checkpoint is None else Checkpoint(Path(checkpoint), resume=resume)
+    result = finetune(start, chosen, options=options, checkpoint=kept, progress=progress)
     say("judging every photo")
     scores = [
         score_photo(result.cloud, view, background, held_out=out, threads=threads)

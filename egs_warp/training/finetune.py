@@ -18,6 +18,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.render import render_gaussians
 from egs_warp.render.autograd import render_torch
+from egs_warp.training.checkpoint import Checkpoint, State, digest_of
 from egs_warp.training.growth import Growth
 from egs_warp.training.likeness import ssim
 from egs_warp.training.misfits import Misfits
@@ -132,14 +133,16 @@ def finetune(
     options: FinetuneOptions | None = None,
     extra_loss: ExtraLoss | None = None,
     trainable: np.ndarray | None = None,
+    checkpoint: Checkpoint | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> FinetuneResult:
     """Fit ``cloud`` to ``views`` by Adam, one view a step in shuffled rounds; a new cloud on the same device.
 
     ``extra_loss`` adds to the loss from the parameters themselves (``L_seg`` of Eq. 21, for one). ``trainable`` (n,)
-    bool picks the Gaussians that may change; it cannot be combined with relocation. ``progress`` is called with the
-    step's number and loss. Raises ``UserError`` for views that do not fit their cameras and for a loss that is not
-    finite.
+    bool picks the Gaussians that may change; it cannot be combined with relocation. ``checkpoint`` is written now and
+    then, and gone on from if it is told to, on a CPU to the bits of a run that was not cut off. ``progress`` is called
+    with the step's number and loss. Raises ``UserError`` for views that do not fit their cameras and for a loss that is
+    not finite.
     """
     options = options or FinetuneOptions()
     _check(cloud, views, options, trainable)
@@ -161,7 +164,14 @@ def finetune(
     # Asking a GPU for a loss waits for it: the losses of many steps are fetched at once.
     patience = 1 if device == "cpu" else _UNSEEN_STEPS
     queue: list[int] = []
-    for step in range(options.iterations):
+    lasting = {"population": population, "misfits": misfits, "growth": growth} | ({"tones": tones} if tones else {})
+    saved = None if checkpoint is None else checkpoint.begin(_digest(cloud, views, options))
+    if saved is not None:
+        order.bit_generator.state, queue = saved["order"], list(saved["queue"])
+        losses[: saved["step"]] = saved["losses"]
+        for name, part in lasting.items():
+            part.restore(_below(saved, name))
+    for step in range(0 if saved is None else int(saved["step"]), options.iterations):
         if not queue:
             kept = [number for number in range(len(views)) if number not in misfits.found]
             queue = [kept[i] for i in order.permutation(len(kept))]
@@ -219,9 +229,26 @@ def finetune(
                 misfits.judge(step / options.iterations)
         if relocating:
             population.evolve(step, options.iterations, growth)
+        if checkpoint is not None and not pending and checkpoint.due():
+            state = {"step": step + 1, "losses": losses[: step + 1], "order": order.bit_generator.state, "queue": queue}
+            for name, part in lasting.items():
+                state |= {f"{name}/{key}": value for key, value in part.state().items()}
+            checkpoint.write(state)
     return FinetuneResult(
         _cloud(population.tensors), losses, None if tones is None else tones.matrices(), tuple(misfits.found)
     )
+
+
+def _digest(cloud: GaussianCloud, views: Sequence[TrainingView], options: FinetuneOptions) -> str:
+    """What tells this training from another."""
+    first = [getattr(cloud, one.name).numpy() for one in fields(cloud)]
+    pictures = [array for view in views for array in (view.image, view.alpha, view.weight)]
+    return digest_of([*first, *pictures], [view.camera for view in views], options)
+
+
+def _below(state: State, name: str) -> State:
+    """The part ``name`` of a whole ``state``."""
+    return {key.removeprefix(f"{name}/"): value for key, value in state.items() if key.startswith(f"{name}/")}
 
 
 def views_of_capture(

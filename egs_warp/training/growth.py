@@ -7,6 +7,8 @@ import os
 import numpy as np
 import torch
 
+from egs_warp.training.checkpoint import State
+
 _LEAST_STEPS = 300
 """Steps whose losses are compared, in whole rounds of the views."""
 _LEAST_GAIN = 0.02
@@ -43,6 +45,15 @@ class Growth:
             self._idle = self._idle + 1 if worth < _LEAST_GAIN else 0
         if self._idle >= _WINDOWS:
             self.cap = min(self.cap, count)
+
+    def state(self) -> State:
+        """All that lasts from step to step."""
+        return {"cap": self.cap, "history": self.history, "recent": self._losses, "idle": self._idle}
+
+    def restore(self, state: State) -> None:
+        """Go on from ``state``."""
+        self.cap, self._losses, self._idle = int(state["cap"]), list(state["recent"]), int(state["idle"])
+        self.history = [(float(loss), int(count)) for loss, count in state["history"]]
 
 
 def _room(device: str) -> int:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from egs_warp.training.checkpoint import State
+
 _JUDGED_AT = (0.3, 0.5, 0.7)
 """Shares of the steps."""
 _LAST_VISITS = 3
@@ -39,6 +41,14 @@ class Misfits:
         room = int(_MOST * len(self._losses)) - len(self.found)
         worst = np.array(numbers)[misfitting(values)]
         self.found += sorted(worst.tolist(), key=lambda n: -np.mean(self._losses[n][-_LAST_VISITS:]))[: max(room, 0)]
+
+    def state(self) -> State:
+        """All that lasts from step to step."""
+        return {"found": self.found, "losses": self._losses, "judged": self._judged}
+
+    def restore(self, state: State) -> None:
+        """Go on from ``state``."""
+        self.found, self._losses, self._judged = list(state["found"]), state["losses"], int(state["judged"])
 
 
 def misfitting(losses: np.ndarray) -> np.ndarray:

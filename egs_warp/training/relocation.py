@@ -14,6 +14,7 @@ import warp as wp
 from egs_warp.kernels.training.population import jitter_kernel, pull_kernel
 from egs_warp.launching import launch_rows
 from egs_warp.render.autograd import torch_stream
+from egs_warp.training.checkpoint import State
 from egs_warp.training.growth import Growth
 
 _FAINT = 0.005
@@ -112,6 +113,31 @@ class Population:
             self._share(chosen)
             self._forget(chosen)
             self._append(chosen)
+
+    def state(self) -> State:
+        """All that lasts from step to step: parameters, Adam's moments, random numbers."""
+        state: State = {"random": self._generator.get_state().numpy()}
+        for name, tensor in self.tensors.items():
+            state[name] = tensor.detach().cpu().numpy().copy()
+            for key, value in self._optimiser.state.get(tensor, {}).items():
+                state[f"{name}.{key}"] = value.cpu().numpy().copy()
+        return state
+
+    def restore(self, state: State) -> None:
+        """Go on from ``state``."""
+        self._generator.set_state(torch.from_numpy(state["random"]))
+        for group in self._optimiser.param_groups:
+            old, name = group["params"][0], group["name"]
+            new = torch.from_numpy(state[name]).to(old.device).requires_grad_()
+            moments = [key for key in state if key.startswith(f"{name}.")]
+            # Adam counts its steps on the host, unless it is fused.
+            places = {key: old.device if group["fused"] or not key.endswith(".step") else "cpu" for key in moments}
+            if moments:
+                self._optimiser.state[new] = {
+                    key.removeprefix(f"{name}."): torch.from_numpy(state[key]).to(places[key]) for key in moments
+                }
+            group["params"] = [new]
+            self.tensors[name] = new
 
     def _draw(self, weights: torch.Tensor, count: int) -> torch.Tensor:
         # Not torch.multinomial, which takes at most 2^24 weights.

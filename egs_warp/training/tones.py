@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from egs_warp.training.checkpoint import State
+
 _RATE, _LAST_RATE = 1e-2, 1e-4
 """Step of Adam at the start and at the end."""
 _PULL = 1e-2
@@ -45,6 +47,17 @@ class Tones:
         size = (second / (1 - 0.99**visits)).sqrt() + 1e-12
         self._offsets[number] -= rate / (1 - 0.9**visits) * first / size
         self._offsets -= self._offsets.mean(dim=0)
+
+    def state(self) -> State:
+        """All that lasts from step to step."""
+        arrays = {"offsets": self._offsets, "first": self._first, "second": self._second}
+        return {name: tensor.cpu().numpy().copy() for name, tensor in arrays.items()} | {"visits": self._visits}
+
+    def restore(self, state: State) -> None:
+        """Go on from ``state``."""
+        for name, tensor in (("offsets", self._offsets), ("first", self._first), ("second", self._second)):
+            tensor.copy_(torch.from_numpy(state[name]))
+        self._visits = list(state["visits"])
 
     def matrices(self) -> np.ndarray:
         """(views, 3, 4) float64."""

@@ -13,11 +13,10 @@ from PIL import Image
 
 from egs_warp.cli import main
 from egs_warp.errors import UserError
-from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io import read_capture
 from egs_warp.io.photos import turned
-from egs_warp.render import render_gaussians
-from tests.support.training_views import ball, ring
+from tests.support.posed import posed_folder
+from tests.support.training_views import ring
 
 pytest.importorskip("torch")
 from egs_warp.pipelines.train_capture import train
@@ -25,26 +24,6 @@ from egs_warp.training.finetune import TrainingView
 from egs_warp.training.likeness import psnr
 from egs_warp.training.posed_photos import backdrop_colour, laid_over, read_views
 from egs_warp.training.rough_cloud import middle_of, rough_cloud
-
-
-def posed_folder(folder: Path, *, count: int = 9, size: int = 32, alpha: bool = False) -> Path:
-    """Renders of a ball of Gaussians as a NeRF-synthetic set."""
-    folder.mkdir(parents=True, exist_ok=True)
-    cloud = GaussianCloud.from_numpy(**ball(80), device="cpu")
-    frames = []
-    for number, camera in enumerate(ring(count, size)):
-        picture = render_gaussians(cloud, camera, background=(0.2, 0.3, 0.4))
-        pixels = picture.colour_srgb8()[:, :, ::-1]
-        if alpha:
-            pixels = np.dstack([pixels, np.rint(picture.alpha.numpy() * 255).astype(np.uint8)])
-        assert cv2.imwrite(str(folder / f"r_{number}.png"), pixels)
-        matrix = np.eye(4)
-        matrix[:3, :3] = camera.rotation.T @ np.diag([1.0, -1.0, -1.0])
-        matrix[:3, 3] = camera.centre
-        frames.append({"file_path": f"r_{number}.png", "transform_matrix": matrix.tolist()})
-    shared = {"w": size, "h": size, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
-    (folder / "transforms.json").write_text(json.dumps({**shared, "frames": frames}))
-    return folder
 
 
 def run(folder: Path, out: Path, *flags: str) -> int:
@@ -126,7 +105,7 @@ def test_without_any_photo_an_earlier_result_stays(tmp_path: Path, capsys: pytes
         photo.unlink()
     out = tmp_path / "ball.ply"
     out.write_bytes(b"precious")
-    assert run(posed, out) == 2
+    assert run(posed, out, "--overwrite") == 2
     assert "none of its 9 photos can be used; the first: r_0.png: the photo is not beside" in capsys.readouterr().err
     assert out.read_bytes() == b"precious"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply", "posed"]

@@ -1,0 +1,102 @@
+"""``egs-warp train --resume``, and what belongs to an earlier training."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from egs_warp.cli import main
+from tests.support.posed import posed_folder
+
+pytest.importorskip("torch")
+
+MOMENTS = int(os.environ.get("EGS_WARP_MOMENTS", "4"))
+OFTEN = (
+    "import sys; from egs_warp.training import checkpoint; checkpoint.SECONDS = 0.0;"
+    " from egs_warp.cli import main; sys.exit(main(sys.argv[1:]))"
+)
+"""The command, which keeps what it has done as often as it can."""
+
+
+def line(folder: Path, out: Path) -> list[str]:
+    return ["train", str(folder), "--out", str(out), "--iterations", "200", "--gaussians", "300"]
+
+
+def bits(folder: Path) -> dict[str, bytes]:
+    """The report has times."""
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix != ".json"}
+
+
+def test_ctrl_c_tells_how_to_go_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("egs_warp.training.checkpoint.SECONDS", 0.0)
+    posed, whole, out = posed_folder(tmp_path / "posed"), tmp_path / "whole" / "a.ply", tmp_path / "out" / "a.ply"
+    assert main(line(posed, whole)) == 0
+    with monkeypatch.context() as patch:
+
+        def stop(self: object, step: int, loss: float) -> None:
+            if step == 150:
+                raise KeyboardInterrupt
+
+        patch.setattr("egs_warp.commands.train._Progress.step", stop)
+        assert main(line(posed, out)) == 130
+    assert capsys.readouterr().err.splitlines()[-1].endswith("; --resume beside the same flags goes on")
+    assert sorted(os.listdir(out.parent)) == ["a.training.npz"]
+    assert main(line(posed, out)) == 2
+    assert capsys.readouterr().err == (
+        f"egs-warp: --out {out}: a training was cut off here; --resume goes on with it, --overwrite begins again\n"
+    )
+    assert main([*line(posed, out), "--resume"]) == 0
+    assert bits(out.parent) == bits(whole.parent)
+    capsys.readouterr()
+    assert main([*line(posed, out), "--resume"]) == 0
+    assert capsys.readouterr().out == f"{out}: this training has finished\n"
+
+
+def test_an_earlier_training_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its report and sheet, too, which nobody has named."""
+    posed, out = posed_folder(tmp_path / "posed"), tmp_path / "a.ply"
+    (tmp_path / "a.sheet.png").write_bytes(b"sheet")
+    assert main(line(posed, out)) == 2
+    assert capsys.readouterr().err == (
+        f"egs-warp: --out {out}: a.sheet.png is there already; choose another name, or have it moved aside;"
+        " check --overwrite\n"
+    )
+    out.write_bytes(b"cloud")
+    assert main([*line(posed, out), "--overwrite"]) == 0
+    assert (tmp_path / "earlier-1" / "a.ply").read_bytes() == b"cloud"
+    assert (tmp_path / "earlier-1" / "a.sheet.png").read_bytes() == b"sheet"
+    assert sorted(os.listdir(tmp_path)) == ["a.ply", "a.report.json", "a.sheet.png", "earlier-1", "posed"]
+
+
+@pytest.mark.slow
+def test_random_moments(tmp_path: Path) -> None:
+    """SIGKILL at any time; a training that had not yet kept anything is begun again."""
+    posed, whole = posed_folder(tmp_path / "posed"), tmp_path / "whole" / "a.ply"
+    command = [sys.executable, "-c", OFTEN]
+    began = time.monotonic()
+    subprocess.run([*command, *line(posed, whole)], check=True, capture_output=True)
+    length = time.monotonic() - began
+    moments = random.Random(18)
+    went_on = 0
+    for number in range(MOMENTS):
+        out = tmp_path / str(number) / "a.ply"
+        run = subprocess.Popen([*command, *line(posed, out)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        time.sleep(length * moments.random())
+        run.send_signal(signal.SIGKILL)
+        run.wait()
+        kept = out.with_name("a.training.npz").exists()
+        went_on += kept
+        if kept or not out.exists():
+            again = [*line(posed, out), *(["--resume"] if kept else [])]
+            subprocess.run([*command, *again], check=True, capture_output=True)
+        assert bits(out.parent) == bits(whole.parent), number
+    assert went_on

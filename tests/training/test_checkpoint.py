@@ -1,0 +1,107 @@
+"""Training that was cut off goes on to the bits of one that was not."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.gaussians import GaussianCloud
+from tests.support.training_views import ball, ring
+
+torch = pytest.importorskip("torch")
+from egs_warp.training.checkpoint import Checkpoint  # noqa: E402
+from egs_warp.training.finetune import (  # noqa: E402
+    Densification,
+    FinetuneOptions,
+    FinetuneResult,
+    TrainingView,
+    finetune,
+    views_of_capture,
+)
+
+OPTIONS = FinetuneOptions(
+    iterations=230,
+    background=(0.2, 0.3, 0.4),
+    densification=Densification.RELOCATION,
+    max_gaussians=90,
+    sh_steps=60,
+    tones=True,
+    leave_out_misfits=True,
+    seed=3,
+)
+CUTS = (17, 104, 209)
+"""Before and after Gaussians are moved and added, and once a view is left out."""
+
+
+@pytest.fixture(autouse=True)
+def one_thread(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("egs_warp.training.checkpoint.SECONDS", 0.0)
+    monkeypatch.setattr("egs_warp.training.checkpoint._SHARE", 1e9)
+    # One view in ten is left out early, whichever it is.
+    monkeypatch.setattr("egs_warp.training.misfits._TIMES_MEDIAN", 1.0)
+    monkeypatch.setattr("egs_warp.training.misfits._SPREADS", 0.1)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="module")
+def views() -> list[TrainingView]:
+    """Ten of a ball."""
+    return views_of_capture(GaussianCloud.from_numpy(**ball(60), device="cpu"), ring(10, 24))
+
+
+def start() -> GaussianCloud:
+    return GaussianCloud.from_numpy(**ball(60, seed=5), device="cpu")
+
+
+def bits(result: FinetuneResult) -> list[bytes]:
+    arrays = [getattr(result.cloud, one.name).numpy() for one in fields(result.cloud)]
+    return [array.tobytes() for array in (*arrays, result.losses, result.tones)]
+
+
+def cut_off(views: list[TrainingView], path: Path, at: int, *, resume: bool) -> None:
+    def stop(step: int, _: float) -> None:
+        if step == at:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        finetune(start(), views, options=OPTIONS, checkpoint=Checkpoint(path, resume=resume), progress=stop)
+
+
+def test_cut_off_three_times_it_has_the_same_bits(views: list[TrainingView], tmp_path: Path) -> None:
+    whole = finetune(start(), views, options=OPTIONS)
+    assert len(whole.misfits) == 1 and whole.cloud.count == 90
+    path = tmp_path / "training.npz"
+    for at in CUTS:
+        cut_off(views, path, at, resume=path.exists())
+    seen: list[int] = []
+    again = finetune(
+        *(start(), views),
+        options=OPTIONS,
+        checkpoint=Checkpoint(path, resume=True),
+        progress=lambda step, _: seen.append(step),
+    )
+    assert seen == list(range(CUTS[-1], OPTIONS.iterations)), "steps that were done are not done again"
+    assert bits(again) == bits(whole) and again.misfits == whole.misfits
+
+
+def test_what_cannot_go_on_is_told(views: list[TrainingView], tmp_path: Path) -> None:
+    path = tmp_path / "training.npz"
+
+    def told(views: list[TrainingView]) -> str:
+        with pytest.raises(UserError) as error:
+            finetune(start(), views, options=OPTIONS, checkpoint=Checkpoint(path, resume=True))
+        return str(error.value)
+
+    assert told(views) == f"{path}: no training was cut off here; begin it"
+    cut_off(views, path, 3, resume=False)
+    assert told(views[:9]) == (
+        f"{path}: is of other photos, other flags or another version of egs-warp; begin the training again"
+    )
+    path.write_bytes(path.read_bytes()[:300])
+    assert told(views) == f"{path}: is damaged; begin the training again"
