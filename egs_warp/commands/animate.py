@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 FALLEN = 3
 """Exit status of a run that has written its files, but whose body has fallen or could not be simulated on."""
+_WRITES = (NAME, "trajectory.npz", "plots.png", "cage.vtu", "sheet.png", "creature.npz", "report.json")
+"""Among others, whose names hang on the motion."""
 EXAMPLES = (
     "pawn.ply --up z --out out/jump",
     'scan.spz --motion "hop x3, twist 180" --camera follow --size 1280x720 --out out/hop',
@@ -97,7 +99,7 @@ def add_parser(commands: Commands) -> None:
 def _animate(chosen: argparse.Namespace) -> int:
     from egs_warp.io.run_folder import check_run_folder
 
-    check_run_folder(chosen.out, overwrite=chosen.overwrite)
+    check_run_folder(chosen.out, overwrite=chosen.overwrite, writes=_WRITES)
     if chosen.config is not None and changed_capture(chosen.config, chosen.capture):
         say(f"{chosen.capture} is not the file that the run of {chosen.config} had; the result will be another")
     return animated(chosen)

@@ -21,6 +21,11 @@ def add_parser(commands: Commands) -> None:
     plane.set_defaults(run=_plane)
 
 
+def _writes(chosen: argparse.Namespace) -> tuple[str, ...]:
+    ring = () if chosen.cameras else ("images", "cameras.json")
+    return ("plane.json", "plane.png", *ring)
+
+
 def _plane(chosen: argparse.Namespace) -> int:
     from egs_warp.commands.scene_input import read_scene
     from egs_warp.commands.scene_planes import planes_of_scene, write_ring
@@ -33,7 +38,7 @@ def _plane(chosen: argparse.Namespace) -> int:
         raise UserError("plane: give --object, or --plane-mask with --cameras")
     if chosen.count < 1:
         raise UserError(f"--count {chosen.count}: give a whole number of at least 1")
-    check_run_folder(chosen.out, overwrite=chosen.overwrite)
+    check_run_folder(chosen.out, overwrite=chosen.overwrite, writes=_writes(chosen))
     given = read_scene(chosen)
     with run_folder(chosen.out, command="plane", overwrite=chosen.overwrite) as run:
         found = planes_of_scene(given, plane_mask=chosen.plane_mask, view=chosen.view, count=chosen.count)

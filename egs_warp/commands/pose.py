@@ -7,6 +7,7 @@ import sys
 import time
 
 from egs_warp.commands.flags import Commands, named_path
+from egs_warp.commands.scene_flags import add_overwrite_flag
 from egs_warp.errors import UserError
 
 _NAMED = 5
@@ -26,6 +27,7 @@ def add_parser(commands: Commands) -> None:
     pose.add_argument(
         "--out", required=True, type=named_path, help="new folder for images and sparse/0, which train reads"
     )
+    add_overwrite_flag(pose, "--out")
     pose.add_argument("--frames", type=int, default=150, help="of a video, the sharpest evenly in time (150)")
     pose.add_argument("--max-side", type=int, default=1600, help="pixels at which features are found (1600)")
     pose.add_argument("--seed", type=int, default=0, help="of the reconstruction (0)")
@@ -33,13 +35,13 @@ def add_parser(commands: Commands) -> None:
 
 
 def _pose(chosen: argparse.Namespace) -> int:
-    from egs_warp.io.run_folder import check_out
+    from egs_warp.io.run_folder import check_run_folder
     from egs_warp.pipelines.pose_photos import pose_photos
 
     for flag, value, least in (("--frames", chosen.frames, 3), ("--max-side", chosen.max_side, 64)):
         if value < least:
             raise UserError(f"{flag} {value}: give a whole number of at least {least}")
-    check_out(chosen.out)
+    check_run_folder(chosen.out, overwrite=chosen.overwrite)
     shown = _Progress()
     result = pose_photos(
         chosen.photos,
@@ -47,6 +49,7 @@ def _pose(chosen: argparse.Namespace) -> int:
         frames=chosen.frames,
         max_side=chosen.max_side,
         seed=chosen.seed,
+        overwrite=chosen.overwrite,
         stage=shown.say,
         progress=shown.step,
     )

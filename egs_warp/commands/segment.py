@@ -12,6 +12,7 @@ from egs_warp.commands.scene_flags import add_flat_flag, add_scene_flags, say
 if TYPE_CHECKING:
     from egs_warp.segmentation.clearance import Clearing
 
+_WRITES = ("object.ply", "background.ply", "plane.json", "segment.png")
 EXAMPLES = (
     "room.ply --object 0,0,0.5 --out out/segment",
     "room.ply --object masks --cameras cameras.json --out out/segment",
@@ -54,7 +55,7 @@ def _segment(chosen: argparse.Namespace) -> int:
 
     if not chosen.object:
         raise UserError("segment: give --object: a mask, a point, a box or a pixel")
-    check_run_folder(chosen.out, overwrite=chosen.overwrite)
+    check_run_folder(chosen.out, overwrite=chosen.overwrite, writes=_WRITES)
     given = read_scene(chosen)
     known = read_planes(chosen.plane) if chosen.plane and Path(chosen.plane).is_file() else []
     with run_folder(chosen.out, command="segment", overwrite=chosen.overwrite) as run:

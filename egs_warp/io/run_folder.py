@@ -173,11 +173,18 @@ def has_finished(out: Path | str) -> bool:
     return False
 
 
-def check_run_folder(out: Path | str, *, overwrite: bool = False) -> None:
-    """Raise the ``UserError`` of ``run_folder`` as far as it can be known, and make nothing: before any long work."""
+def check_run_folder(out: Path | str, *, overwrite: bool = False, writes: Sequence[str] = ()) -> None:
+    """Raise the ``UserError`` of ``run_folder``, and of the files that the run ``writes``, as far as it can be known,
+    and make nothing: before any long work.
+    """
     check_out(out)
-    if not overwrite and (Path(out) / MANIFEST).is_file():
+    if overwrite:
+        return
+    if (Path(out) / MANIFEST).is_file():
         raise _occupied(out, "it has an earlier run")
+    for name in writes:
+        if (Path(out) / name).exists():
+            raise _occupied(out, f"it has {name}")
 
 
 def check_out(out: Path | str) -> None:

@@ -7,7 +7,8 @@ import shutil
 import sqlite3
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,9 @@ import cv2
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.io.atomic import writable_folder
 from egs_warp.io.frames import VIDEO_SUFFIXES, sharp_frames
 from egs_warp.io.photos import decoded, orientation, turned
+from egs_warp.io.run_folder import check_run_folder, run_folder
 
 _PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 _MAX_EXHAUSTIVE = 400
@@ -26,6 +27,8 @@ _MAX_EXHAUSTIVE = 400
 _NEIGHBOURS = 20
 _LEAST_PHOTOS = 3
 _CAMERA_MODEL = "SIMPLE_RADIAL"
+_WRITES = ("images", "sparse")
+_WORKPLACE = ".egs-pose-"
 _LOOKS_EACH_SECOND = 2.0
 
 
@@ -53,15 +56,17 @@ def pose_photos(
     frames: int = 150,
     max_side: int = 1600,
     seed: int = 0,
+    overwrite: bool = False,
     stage: Callable[[str], None] | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> PoseResult:
     """Find the poses of the photos in the folder ``source``, or of ``frames`` sharp frames of the video ``source``.
 
     ``out`` then holds ``images`` (upright: EXIF's turn is done) and COLMAP's ``sparse/0``: what ``train`` reads.
-    Features are found at no more than ``max_side`` pixels. ``stage`` is called with what begins, ``progress`` with a
+    Features are found at no more than ``max_side`` pixels. The folder belongs to one run (``egs_warp.io.run_folder``);
+    an earlier one is moved aside with ``overwrite``. ``stage`` is called with what begins, ``progress`` with a
     stage's name, how much of it is done, and of how much. Raises ``UserError`` where pycolmap is not installed, where
-    ``out`` has photos already, and where fewer than three photos can be posed.
+    ``out`` has an earlier run or photos already, and where fewer than three photos can be posed.
     """
     try:
         import pycolmap  # type: ignore[import-not-found]
@@ -72,13 +77,8 @@ def pose_photos(
     is_video = source.is_file() and source.suffix.lower() in VIDEO_SUFFIXES
     if not source.is_dir() and not is_video:
         raise UserError(f"{source}: neither a folder of photos nor a video ({', '.join(VIDEO_SUFFIXES)})")
-    out = Path(out)
-    for place in (out / "images", out / "sparse"):
-        if place.exists():
-            raise UserError(f"{place}: is there already; give a new folder")
-    out = writable_folder(out)
-    with tempfile.TemporaryDirectory(dir=out, prefix=".pose") as temporary:
-        work = Path(temporary)
+    check_run_folder(out, overwrite=overwrite, writes=_WRITES)
+    with run_folder(out, command="pose", overwrite=overwrite) as run, _workplace(run.path) as work:
         images = work / "images"
         images.mkdir()
         say(f"choosing {frames} frames of {source}" if is_video else f"reading {source}")
@@ -96,8 +96,9 @@ def pose_photos(
         )
         (work / "sparse" / "0").mkdir(parents=True)
         model.write_binary(str(work / "sparse" / "0"))
-        for part in ("images", "sparse"):
-            os.replace(work / part, out / part)
+        for part in _WRITES:
+            os.replace(work / part, run.folder(part))
+        run.finish()
     posed = {image.name for image in model.images.values() if image.has_pose}
     return PoseResult(
         photos=len(names),
@@ -107,6 +108,15 @@ def pose_photos(
         points=model.num_points3D(),
         error=float(model.compute_mean_reprojection_error()),
     )
+
+
+@contextmanager
+def _workplace(folder: Path) -> Iterator[Path]:
+    """A folder for what is not finished, in the locked ``folder``; of killed runs it is taken away."""
+    for left in folder.glob(f"{_WORKPLACE}*"):
+        shutil.rmtree(left, ignore_errors=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=_WORKPLACE) as work:
+        yield Path(work)
 
 
 def _copied(source: Path, images: Path) -> tuple[str, ...]:

@@ -19,6 +19,7 @@ from egs_warp.inpainting.inpainters import inpainter_by_name
 from egs_warp.io import read_capture, write_ply
 from egs_warp.io.cameras import write_cameras
 from egs_warp.io.planes import KnownPlane, read_planes, write_planes
+from egs_warp.io.run_folder import MANIFEST
 from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene
 from egs_warp.segmentation.clearance import Clearing
 from egs_warp.segmentation.object_mask import ObjectSpec, masks_from_selection
@@ -46,7 +47,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_plane_then_segment_take_each_others_files(folder: Path, tmp_path: Path) -> None:
+def test_plane_then_segment_take_each_others_files(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     scene, cameras, mask = str(folder / "scene.ply"), str(folder / "cameras.json"), str(folder / "photo1.png")
     shared = ["--object", mask, "--cameras", cameras, "--up", "z"]
     assert main(["plane", scene, *shared, "--out", str(tmp_path / "plane")]) == 0
@@ -60,8 +63,11 @@ def test_plane_then_segment_take_each_others_files(folder: Path, tmp_path: Path)
     (tmp_path / "parts").mkdir()
     path = tmp_path / "parts" / "plane.json"
     write_planes(path, [found, other])
-    flags = ["--plane", str(path), "--straddling", "split"]
-    assert main(["segment", scene, *shared, *flags, "--out", str(tmp_path / "parts")]) == 0
+    flags = ["--plane", str(path), "--straddling", "split", "--out", str(tmp_path / "parts")]
+    assert main(["segment", scene, *shared, *flags]) == 2
+    assert "parts: it has plane.json, which would be mixed with this one; choose" in capsys.readouterr().err
+    assert main(["segment", scene, *shared, *flags, "--overwrite"]) == 0
+    assert (tmp_path / "parts" / "earlier-1" / "plane.json").is_file()
     first, second = read_planes(path)
     assert first.to_json().keys() == found.to_json().keys() | {"hole"} and first.noise == found.noise
     assert second.to_json() == other.to_json()
@@ -73,10 +79,24 @@ def test_plane_then_segment_take_each_others_files(folder: Path, tmp_path: Path)
     assert (tmp_path / "parts" / "segment.png").is_file()
 
 
-def test_without_cameras_a_ring_is_used_and_written(folder: Path, tmp_path: Path) -> None:
+def test_without_cameras_a_ring_is_used_and_written(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "plane"
     assert main(["plane", str(folder / "scene.ply"), "--object", "0,-0.5,0.5", "--out", str(out)]) == 0
     assert len(list((out / "images").glob("*.png"))) == 12
+    manifest = json.loads((out / MANIFEST).read_text())
+    assert manifest["command"] == "plane" and manifest["finished"]
+    pictures = {f"images/ring{number:02d}.png" for number in range(12)}
+    assert set(manifest["files"]) == {"plane.json", "plane.png", "cameras.json", *pictures}
+    assert all(len(facts["sha256"]) == 64 for facts in manifest["files"].values())
+    again = ["plane", str(folder / "scene.ply"), "--object", "0,-0.5,0.5", "--out", str(out)]
+    assert main(again) == 2
+    assert "plane: it has an earlier run, which would be mixed with this one" in capsys.readouterr().err
+    assert main(["resume", str(out)]) == 2
+    assert f"{out}: egs-warp plane wrote here, which cannot go on; begin it again" in capsys.readouterr().err
+    assert main([*again, "--overwrite"]) == 0
+    assert (out / "earlier-1" / "images" / "ring11.png").is_file() and len(list((out / "images").iterdir())) == 12
     # What was written can be clicked on.
     flags = ["--object", "256,256", "--cameras", str(out / "cameras.json"), "--view", "0", "--straddling", "none"]
     assert main(["segment", str(folder / "scene.ply"), *flags, "--out", str(tmp_path / "parts")]) == 0
@@ -136,14 +156,15 @@ def test_inpaint_fills_the_hole_that_animate_fills(folder: Path, tmp_path: Path)
     ).cloud.means.numpy()
     files = [str(tmp_path / "background.ply"), "--plane", str(tmp_path / "plane.json"), "--steps", "0"]
     filled = tmp_path / "filled.ply"
-    for thing in ([], ["--object", str(tmp_path / "object.ply")]):
+    for thing in ([], ["--object", str(tmp_path / "object.ply"), "--overwrite"]):
         assert main(["inpaint", *files, *thing, "--inpainter", "ns", "--out", str(filled)]) == 0
         np.testing.assert_allclose(read_capture(filled).cloud.means.numpy(), expected, atol=1e-5)
     thing = read_capture(tmp_path / "object.ply").cloud
     fields = (getattr(thing, name).numpy() for name in ("rotations", "log_scales", "opacity_logits", "sh"))
     away = GaussianCloud.from_numpy(thing.means.numpy() + [1.2, 0.0, 0.0], *fields)
     write_ply(tmp_path / "away.ply", away)
-    picture = ["--inpainter", "ns", "--out", str(filled), "--object", str(tmp_path / "away.ply")]
+    assert (tmp_path / "earlier-1" / "filled.ply").is_file() and (tmp_path / "earlier-1" / "filled.png").is_file()
+    picture = ["--inpainter", "ns", "--out", str(filled), "--object", str(tmp_path / "away.ply"), "--overwrite"]
     assert main(["inpaint", *files, *picture]) == 0
     assert not np.array_equal(read_capture(filled).cloud.means.numpy(), expected)
     entry = json.loads((tmp_path / "plane.json").read_text())["planes"][0]

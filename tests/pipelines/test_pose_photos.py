@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import sys
 from pathlib import Path
+from types import ModuleType
+from typing import ClassVar
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from egs_warp.cli import main
+from egs_warp.errors import UserError
 from egs_warp.io import read_cameras
 from egs_warp.io.cameras import read_points
+from egs_warp.io.run_folder import MANIFEST
 
 
 def fails(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -44,7 +49,55 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, capsys: pytest
     assert "no photo could be posed; take more photos" in fails(capsys, str(tmp_path / "photos"), "--out", str(out))
     assert not list(out.iterdir())
     (out / "images").mkdir()
-    assert "images: is there already; give a new folder" in fails(capsys, str(tmp_path / "photos"), "--out", str(out))
+    assert "it has images, which would be mixed with this one; choose another folder" in fails(
+        capsys, str(tmp_path / "photos"), "--out", str(out)
+    )
+
+
+class _Model:
+    """Stands for COLMAP's reconstruction."""
+
+    images: ClassVar[dict] = {}
+
+    def write_binary(self, folder: str) -> None:
+        (Path(folder) / "cameras.bin").write_bytes(b"model")
+
+    def num_points3D(self) -> int:
+        return 5
+
+    def compute_mean_reprojection_error(self) -> float:
+        return 0.5
+
+
+def test_a_folder_belongs_to_one_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a killed one left goes; an earlier one is refused or moved aside; what is not finished has no final name."""
+    monkeypatch.setitem(sys.modules, "pycolmap", ModuleType("pycolmap"))
+    photos, out = tmp_path / "photos", tmp_path / "out"
+    photos.mkdir()
+    for number in range(3):
+        Image.new("RGB", (64, 48), (0, 0, 90 * number)).save(photos / f"{number}.png")
+    left = out / ".egs-pose-left"
+    left.mkdir(parents=True)
+    (left / "0.png").write_bytes(b"half")
+
+    def fails_late(*_: object, **__: object) -> _Model:
+        assert not left.exists()
+        raise UserError("pose: no photo could be posed")
+
+    monkeypatch.setattr("egs_warp.pipelines.pose_photos._reconstructed", fails_late)
+    assert "no photo could be posed" in fails(capsys, str(photos), "--out", str(out))
+    assert not list(out.iterdir())
+    monkeypatch.setattr("egs_warp.pipelines.pose_photos._reconstructed", lambda *_, **__: _Model())
+    assert main(["pose", str(photos), "--out", str(out)]) == 0
+    manifest = json.loads((out / MANIFEST).read_text())
+    assert manifest["finished"] and manifest["command"] == "pose"
+    assert set(manifest["files"]) == {*(f"images/{number}.png" for number in range(3)), "sparse/0/cameras.bin"}
+    assert "it has an earlier run" in fails(capsys, str(photos), "--out", str(out))
+    assert main(["pose", str(photos), "--out", str(out), "--overwrite"]) == 0
+    assert sorted(path.name for path in out.iterdir()) == ["earlier-1", "images", MANIFEST, "sparse"]
+    assert (out / "earlier-1" / "sparse" / "0" / "cameras.bin").is_file()
 
 
 @pytest.mark.data

@@ -1,0 +1,76 @@
+"""Files that a user names: nothing is mixed, nothing of an earlier run is lost."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from pathlib import Path
+
+import pytest
+
+from egs_warp.errors import UserError
+from egs_warp.io.named_files import check_named_files, named_files
+
+
+def write(*paths: Path, text: str, overwrite: bool = False) -> None:
+    with named_files(*paths, overwrite=overwrite) as files:
+        files.begin()
+        for path in paths:
+            path.write_text(text)
+
+
+def test_what_is_there_is_refused_or_kept_aside(tmp_path: Path) -> None:
+    first, second = tmp_path / "made" / "a.ply", tmp_path / "made" / "a.png"
+    write(first, second, text="1")
+    first.unlink()
+    with pytest.raises(UserError, match=r"out .*a\.ply: a\.png is there already; .*; check overwrite"):
+        write(first, second, text="2")
+    write(first, second, text="2", overwrite=True)
+    write(first, second, text="3", overwrite=True)
+    assert sorted(os.listdir(first.parent)) == ["a.ply", "a.png", "earlier-1", "earlier-2"]
+    assert os.listdir(first.parent / "earlier-1") == ["a.png"]
+    assert (first.parent / "earlier-2" / "a.ply").read_text() == "2"
+    assert first.read_text() == second.read_text() == "3"
+
+
+def test_a_run_that_fails_before_its_first_file_leaves_the_earlier_one(tmp_path: Path) -> None:
+    path = tmp_path / "a.ply"
+    write(path, text="1")
+    with pytest.raises(KeyboardInterrupt), named_files(path, overwrite=True):
+        raise KeyboardInterrupt
+    assert path.read_text() == "1" and os.listdir(tmp_path) == ["a.ply"]
+
+
+def _try(path: Path, said: multiprocessing.Queue) -> None:
+    try:
+        with named_files(path):
+            said.put("free")
+    except UserError as error:
+        said.put(str(error))
+
+
+def test_two_runs_at_once(tmp_path: Path) -> None:
+    """One name at a time; another name in the same folder is free."""
+    context = multiprocessing.get_context("spawn")
+    said = context.Queue()
+    with named_files(tmp_path / "a.ply"):
+        for name in ("a.ply", "b.ply"):
+            other = context.Process(target=_try, args=(tmp_path / name, said))
+            other.start()
+            other.join(60)
+        assert said.get(timeout=5) == (
+            f"{tmp_path / 'a.ply'}: another run is writing this file; wait for it, or choose another name"
+        )
+        assert said.get(timeout=5) == "free"
+    assert os.listdir(tmp_path) == []
+
+
+def test_places_are_checked_before_the_work_and_not_made(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder.ply").mkdir()
+    with pytest.raises(UserError, match=r"folder\.ply: is a folder; give the name of a file"):
+        check_named_files(tmp_path / "folder.ply")
+    with pytest.raises(UserError, match=r"cannot write into this folder \(.*file is a file\)"):
+        check_named_files(tmp_path / "file" / "a.ply")
+    check_named_files(tmp_path / "new" / "a.ply")
+    assert sorted(os.listdir(tmp_path)) == ["file", "folder.ply"]
