@@ -6,8 +6,7 @@ import json
 import shutil
 import sys
 from pathlib import Path
-from types import ModuleType
-from typing import ClassVar
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -54,19 +53,14 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, capsys: pytest
     )
 
 
-class _Model:
+def model() -> SimpleNamespace:
     """Stands for COLMAP's reconstruction."""
-
-    images: ClassVar[dict] = {}
-
-    def write_binary(self, folder: str) -> None:
-        (Path(folder) / "cameras.bin").write_bytes(b"model")
-
-    def num_points3D(self) -> int:
-        return 5
-
-    def compute_mean_reprojection_error(self) -> float:
-        return 0.5
+    return SimpleNamespace(
+        images={},
+        write_binary=lambda folder: (Path(folder) / "cameras.bin").write_bytes(b"model"),
+        num_points3D=lambda: 5,
+        compute_mean_reprojection_error=lambda: 0.5,
+    )
 
 
 def test_a_folder_belongs_to_one_run(
@@ -82,14 +76,14 @@ def test_a_folder_belongs_to_one_run(
     left.mkdir(parents=True)
     (left / "0.png").write_bytes(b"half")
 
-    def fails_late(*_: object, **__: object) -> _Model:
+    def fails_late(*_: object, **__: object) -> None:
         assert not left.exists()
         raise UserError("pose: no photo could be posed")
 
     monkeypatch.setattr("egs_warp.pipelines.pose_photos._reconstructed", fails_late)
     assert "no photo could be posed" in fails(capsys, str(photos), "--out", str(out))
     assert not list(out.iterdir())
-    monkeypatch.setattr("egs_warp.pipelines.pose_photos._reconstructed", lambda *_, **__: _Model())
+    monkeypatch.setattr("egs_warp.pipelines.pose_photos._reconstructed", lambda *_, **__: model())
     assert main(["pose", str(photos), "--out", str(out)]) == 0
     manifest = json.loads((out / MANIFEST).read_text())
     assert manifest["finished"] and manifest["command"] == "pose"
