@@ -16,7 +16,7 @@ from egs_warp.assets import pawn
 from egs_warp.cli import _parsers, main
 from egs_warp.commands.camera_flags import TRANSPARENT
 from egs_warp.commands.config import _WORDS
-from egs_warp.commands.flags import parse_plane, parse_up
+from egs_warp.commands.flags import named_path, parse_plane, parse_up
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.inpainting.inpainters import OpenCvMethod
@@ -130,6 +130,28 @@ def test_a_plot_needs_the_name_of_a_picture(tmp_path: Path, name: str, capsys: p
     assert main(["muscles", str(tmp_path / "nothing.ply"), "--plot", str(tmp_path / name)]) == 2
     error = capsys.readouterr().err
     assert f"{name}: not the name of a picture; let it end in one of .png, .jpg" in error and error.count("\n") == 1
+
+
+def test_a_plot_goes_where_there_is_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Told before the capture is read."""
+    assert main(["muscles", str(tmp_path / "nothing.ply"), "--plot", str(tmp_path / "gone" / "a.png")]) == 2
+    assert f"a.png: its folder does not exist; create {tmp_path / 'gone'} first" in capsys.readouterr().err
+
+
+def test_no_flag_takes_an_empty_path() -> None:
+    """As of an unset variable: it would be the folder where one stands."""
+    taken = [action.type for command in _parsers()[1].values() for action in command._actions]
+    assert named_path in taken and Path not in taken
+
+
+@pytest.mark.parametrize("number", ["-1", "4294967296", "many"])
+@pytest.mark.parametrize("line", ["inpaint a.ply --plane 0,0,1,0 --out b.ply", "pose a --out b", "train a --out b.ply"])
+def test_seeds_are_checked(line: str, number: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        main([*line.split(), "--seed", number])
+    assert end.value.code == 2
+    error = capsys.readouterr().err
+    assert "argument --seed: " in error and number in error and error.count("\n") == 1
 
 
 def test_choices_of_flags_are_those_of_the_library() -> None:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-from egs_warp.commands.flags import SPLAT_FILES, Commands
+from egs_warp.commands.flags import SPLAT_FILES, Commands, named_path
 from egs_warp.errors import UserError
 
 EXAMPLES = (
@@ -19,7 +18,7 @@ EXAMPLES = (
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     export = commands.add_parser("export", help="write a run for other tools: splat files, glTF, USD")
-    export.add_argument("folder", metavar="run", type=Path, help="folder that animate wrote")
+    export.add_argument("folder", metavar="run", type=named_path, help="folder that animate wrote")
     export.add_argument(
         "--to",
         required=True,
@@ -27,7 +26,7 @@ def add_parser(commands: Commands) -> None:
         help="numbered splat files, one USD stage, or one .npz",
     )
     export.add_argument(
-        "--out", required=True, type=Path, help="folder of numbered files; .usdc or .usda of usd, .npz of bundle"
+        "--out", required=True, type=named_path, help="folder of numbered files; .usdc or .usda of usd, .npz of bundle"
     )
     export.add_argument("--every", type=int, default=1, help="so many frames at 60 Hz one is written (1)")
     export.add_argument("--frame", type=int, help="this one alone, from 0; -1 is the last; not of usd and bundle")

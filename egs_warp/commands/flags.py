@@ -38,6 +38,14 @@ def named_path(text: str) -> Path:
     return Path(text)
 
 
+def seed(text: str) -> int:
+    """The number that a flag gives, as generators of random numbers take it."""
+    number = int(text)
+    if not 0 <= number < 1 << 32:
+        raise argparse.ArgumentTypeError(f"{text} is not from 0 to {(1 << 32) - 1}")
+    return number
+
+
 def add_inpainter_flags(parser: argparse._ActionsContainer, *, default: str | None) -> None:
     """Add the flags that ``chosen_inpainter`` reads."""
     parser.add_argument("--inpainter", default=default, help="patch (default), telea, ns, or LaMa's ONNX file")

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from egs_warp.commands.flags import Commands, add_inpainter_flags, chosen_inpainter, named_path, parse_plane
+from egs_warp.commands.flags import Commands, add_inpainter_flags, chosen_inpainter, named_path, parse_plane, seed
 from egs_warp.commands.scene_flags import add_overwrite_flag, start
 from egs_warp.errors import UserError
 
@@ -39,7 +39,7 @@ def add_parser(commands: Commands) -> None:
     add_inpainter_flags(inpaint, default="patch")
     inpaint.add_argument("--steps", type=int, help="of training against the inpainted picture (100); 0: no PyTorch")
     inpaint.add_argument("--margin", type=float, help="by how much the hole is made larger, of its side (0.01)")
-    inpaint.add_argument("--seed", type=int, default=0, help="of the patch search (0)")
+    inpaint.add_argument("--seed", type=seed, default=0, help="of the patch search (0)")
     inpaint.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
     inpaint.set_defaults(run=_inpaint)
 

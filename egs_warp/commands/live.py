@@ -40,7 +40,7 @@ def add_parser(commands: Commands) -> None:
     body.add_argument("--muscles", type=named_path, help="JSON with fibres (docs/motions/muscles.md)")
     body.add_argument("--front", help="x,y,z or an axis: the way it faces and moves, as --front=-x; else it is guessed")
     page = live.add_argument_group("page")
-    page.add_argument("--background", type=Path, help="capture behind the creature, as background.ply of a run")
+    page.add_argument("--background", type=named_path, help="capture behind the creature, as background.ply of a run")
     page.add_argument("--port", type=int, default=0, help="of this machine's own address (any that is free)")
     page.add_argument("--no-browser", action="store_true", help="only print the address")
     live.set_defaults(run=_live)

@@ -23,22 +23,28 @@ _HELP = "give a mask.png, a folder of masks, x,y,z on it, a box x0,y0,z0,x1,y1,z
 
 
 def read_object(
-    text: str, cloud: GaussianCloud, posed: Sequence[PosedImage] | None, *, view: str | None = None
+    text: str,
+    cloud: GaussianCloud,
+    posed: Sequence[PosedImage] | None,
+    *,
+    view: str | None = None,
+    flag: str = "--object",
 ) -> ObjectSpec:
-    """What ``--object text`` means: a mask's file, a folder of masks, a point, a box, or a pixel of the view ``view``.
+    """What ``--object text`` means, or that of another ``flag``: a mask's file, a folder of masks, a point, a box, or a
+    pixel of the view ``view``.
 
     Masks belong to the camera whose photo has the same name. Raises ``UserError`` with one line for anything else.
     """
     if not text.strip():
-        raise UserError(f"--object: nothing is given; {_HELP}")
+        raise UserError(f"{flag}: nothing is given; {_HELP}")
     if Path(text).exists():
         return ObjectSpec(masks=tuple(_read_masks(Path(text), posed, view)))
     try:
         numbers = np.array([float(part) for part in text.split(",")])
     except ValueError:
-        raise UserError(f"--object {text}: no such file, nor numbers; {_HELP}") from None
+        raise UserError(f"{flag} {text}: no such file, nor numbers; {_HELP}") from None
     if not np.isfinite(numbers).all() or len(numbers) not in (2, 3, 6):
-        raise UserError(f"--object {text}: {len(numbers)} numbers; {_HELP}")
+        raise UserError(f"{flag} {text}: {len(numbers)} numbers; {_HELP}")
     if len(numbers) == 3:
         return ObjectSpec(point=numbers)
     if len(numbers) == 6:

@@ -6,7 +6,7 @@ import argparse
 import sys
 import time
 
-from egs_warp.commands.flags import Commands, named_path
+from egs_warp.commands.flags import Commands, named_path, seed
 from egs_warp.commands.scene_flags import add_overwrite_flag
 from egs_warp.errors import UserError
 
@@ -30,7 +30,7 @@ def add_parser(commands: Commands) -> None:
     add_overwrite_flag(pose, "--out")
     pose.add_argument("--frames", type=int, default=150, help="of a video, the sharpest evenly in time (150)")
     pose.add_argument("--max-side", type=int, default=1600, help="pixels at which features are found (1600)")
-    pose.add_argument("--seed", type=int, default=0, help="of the reconstruction (0)")
+    pose.add_argument("--seed", type=seed, default=0, help="of the reconstruction (0)")
     pose.set_defaults(run=_pose)
 
 

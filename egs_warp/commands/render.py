@@ -19,7 +19,7 @@ EXAMPLES = (
 def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     render = commands.add_parser("render", help="film a finished run again: any camera, any size, depth, alpha")
-    render.add_argument("folder", metavar="run", type=Path, help="folder that animate wrote")
+    render.add_argument("folder", metavar="run", type=named_path, help="folder that animate wrote")
     render.add_argument(
         "--out",
         required=True,

@@ -56,7 +56,7 @@ def planes_of_scene(given: SceneInput, *, plane_mask: str | None, view: str | No
         located = locate_plane(given.cloud, given.spec, cameras=given.cameras, up=given.up, plane=given.plane)
         first, centre, size, notes = located.known(), located.centre, located.size, located.notes
     else:
-        masks = read_object(plane_mask, given.cloud, given.posed, view=view).masks
+        masks = read_object(plane_mask, given.cloud, given.posed, view=view, flag="--plane-mask").masks
         if not masks:
             raise UserError(f"--plane-mask {plane_mask}: give a mask.png or a folder of masks")
         views = [

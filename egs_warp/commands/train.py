@@ -8,7 +8,7 @@ import time
 from typing import TYPE_CHECKING
 
 from egs_warp.commands.camera_flags import COLOURS, parse_colour
-from egs_warp.commands.flags import Commands, named_path
+from egs_warp.commands.flags import Commands, named_path, seed
 from egs_warp.commands.scene_flags import add_overwrite_flag
 from egs_warp.errors import UserError
 
@@ -52,7 +52,7 @@ def add_parser(commands: Commands) -> None:
         "--background",
         help="r,g,b from 0 to 1 or #rrggbb behind the capture (white for photos with alpha, else their border's)",
     )
-    train.add_argument("--seed", type=int, default=0, help="of the first cloud and the order of photos (0)")
+    train.add_argument("--seed", type=seed, default=0, help="of the first cloud and the order of photos (0)")
     train.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
     train.set_defaults(run=_train)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from egs_warp.commands.flags import Commands
+from egs_warp.commands.flags import Commands, named_path
 from egs_warp.errors import UserError
 
 EXAMPLES = (
@@ -19,10 +19,12 @@ def add_parser(commands: Commands) -> None:
     """Add the command to the subparsers ``commands``."""
     view = commands.add_parser("view", help="see a run in the browser, from any side")
     view.add_argument(
-        "runs", metavar="run", type=Path, nargs="+", help="folder that animate wrote; two are shown side by side"
+        "runs", metavar="run", type=named_path, nargs="+", help="folder that animate wrote; two are shown side by side"
     )
-    view.add_argument("--export", type=Path, help="write one HTML file that opens without a server, and end")
-    view.add_argument("--background", type=Path, help="capture behind the creature; else background.ply of the run")
+    view.add_argument("--export", type=named_path, help="write one HTML file that opens without a server, and end")
+    view.add_argument(
+        "--background", type=named_path, help="capture behind the creature; else background.ply of the run"
+    )
     view.add_argument("--port", type=int, default=0, help="of this machine's own address (any that is free)")
     view.add_argument("--no-browser", action="store_true", help="only print the address")
     view.set_defaults(run=_view)

@@ -75,6 +75,8 @@ class InpaintOptions:
             raise ArgumentError("steps", "give a whole number of at least 0", value=self.steps)
         if not 0.0 <= self.margin <= 1.0:
             raise ArgumentError("margin", "give a number from 0 to 1, of the hole's side", value=self.margin)
+        if self.seed < 0:
+            raise ArgumentError("seed", "give a whole number of at least 0", value=self.seed)
 
 
 @dataclass(frozen=True)

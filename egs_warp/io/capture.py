@@ -18,7 +18,7 @@ from egs_warp.io.outliers import without_outliers
 from egs_warp.io.ply import decode_ply, read_header
 from egs_warp.io.raw import EXTREME_LOGIT, RawCapture, check_finite
 from egs_warp.io.sog import SogFiles, decode_sog
-from egs_warp.io.splat import decode_splat
+from egs_warp.io.splat import SPLAT_ROW, decode_splat
 from egs_warp.io.spz import decode_spz
 from egs_warp.io.streamed_sog import decode_streamed_sog
 
@@ -80,6 +80,8 @@ def _decode(source: Path) -> RawCapture:
     if data[:4] in (b"ply\n", b"ply\r"):
         header = read_header(data, source)
         return (decode_compressed_ply if is_compressed(header) else decode_ply)(data, header, source)
+    if _may_be_splat(data, source):
+        return decode_splat(data, source)
     if data[:2] == b"\x1f\x8b" or data[:4] == b"NGSP":
         return decode_spz(data, source)
     if data[:2] == b"PK":
@@ -98,6 +100,19 @@ def _decode(source: Path) -> RawCapture:
     raise UserError(
         f"{source}: unknown format (starts with {data[:8]!r}); give a .ply, .spz, .splat, .sog, .glb or a SOG folder"
     )
+
+
+_LONG = (b"NGSP", b"glTF", b"PK\x03\x04", b"\x1f\x8b\x08")
+"""First bytes that are no coordinate but by a very rare chance."""
+
+
+def _may_be_splat(data: bytes, source: Path) -> bool:
+    """Whether a file that is called .splat, which has no magic number, may be one: its first bytes are a coordinate,
+    and may be those by which zip, gzip or JSON are told.
+    """
+    whole = len(data) > 0 and len(data) % SPLAT_ROW == 0
+    text = data[:1] == b"{" and data[:SPLAT_ROW].isascii() and b"\0" not in data[:SPLAT_ROW]
+    return source.suffix.lower() == ".splat" and whole and not text and not data.startswith(_LONG)
 
 
 def _decode_folder(folder: Path) -> RawCapture:

@@ -11,6 +11,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.atomic import writable_folder
 from egs_warp.io.compressed_ply import write_compressed_ply
 from egs_warp.io.ply import write_ply
+from egs_warp.io.run_folder import MANIFEST
 
 
 def write_ply_sequence(
@@ -38,6 +39,8 @@ def frame_paths(folder: Path | str, numbers: Iterable[int], ending: str, *, alon
 
     ``alone``: raises ``UserError`` where it holds other frames of this ending, which players would show between them.
     """
+    if (Path(folder) / MANIFEST).is_file():
+        raise UserError(f"{folder}: it is the folder of a run, which these would be mixed with; choose another folder")
     paths = [Path(folder) / f"frame{number:04d}{ending}" for number in numbers]
     writable_folder(folder)
     there = {path for path in Path(folder).iterdir() if re.fullmatch(rf"frame\d{{4,}}{re.escape(ending)}", path.name)}

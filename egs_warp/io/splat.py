@@ -16,6 +16,8 @@ from egs_warp.io.atomic import atomic_write
 from egs_warp.io.raw import RawCapture, byte, bytes_from_logits, logits_from_bytes
 
 _ROW = np.dtype([("position", "<f4", 3), ("scale", "<f4", 3), ("colour", "u1", 4), ("rotation", "u1", 4)])
+SPLAT_ROW = _ROW.itemsize
+"""Bytes of one Gaussian."""
 _LEAST_SCALE = float(np.finfo(np.float32).tiny)
 
 

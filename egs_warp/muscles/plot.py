@@ -31,9 +31,11 @@ _SUBPIXEL_BITS = 4
 
 
 def check_picture_name(path: Path) -> None:
-    """Raises ``UserError`` where the ending is not that of a picture."""
+    """Raises ``UserError`` where the ending is not that of a picture, or its folder is missing."""
     if path.suffix.lower() not in _ENDINGS:
         raise UserError(f"{path}: not the name of a picture; let it end in one of {', '.join(_ENDINGS)}")
+    if not path.parent.is_dir():
+        raise UserError(f"{path}: its folder does not exist; create {path.parent} first")
 
 
 def plot_muscles(mesh: TetMesh, muscles: MuscleSet, path: Path, *, up: np.ndarray) -> None:

@@ -11,11 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from egs_warp.errors import UserError
+from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.cameras import read_points
 from egs_warp.render import render_gaussians
-from egs_warp.training.checkpoint import Checkpoint
 from egs_warp.training.finetune import Densification, FinetuneOptions, TrainingView, finetune
 from egs_warp.training.likeness import in_tone_of, psnr, ssim_of
 from egs_warp.training.misfits import misfitting
@@ -117,6 +116,8 @@ def train(
             f"train: {iterations} iterations, {max_gaussians} Gaussians and SH degree {sh_degree};"
             " give at least 1, at least 100, and 0 to 3"
         )
+    if seed < 0:
+        raise ArgumentError("seed", "give a whole number of at least 0", value=seed)
     say = stage or (lambda _text: None)
     say(f"reading {posed}")
     photos = read_views(posed, max_side=max_side)
@@ -141,8 +142,7 @@ def train(
         threads=threads,
     )
     say(f"training on {len(chosen)} photos (the first run compiles kernels: up to a minute)")
-    kept = None if checkpoint is None else Checkpoint(Path(checkpoint), resume=resume)
-    result = finetune(start, chosen, options=options, checkpoint=kept, progress=progress)
+    result = finetune(start, chosen, options=options, checkpoint=checkpoint, resume=resume, progress=progress)
     say("judging every photo")
     scores = [
         score_photo(result.cloud, view, background, held_out=out, threads=threads)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -133,16 +134,17 @@ def finetune(
     options: FinetuneOptions | None = None,
     extra_loss: ExtraLoss | None = None,
     trainable: np.ndarray | None = None,
-    checkpoint: Checkpoint | None = None,
+    checkpoint: Path | None = None,
+    resume: bool = False,
     progress: Callable[[int, float], None] | None = None,
 ) -> FinetuneResult:
     """Fit ``cloud`` to ``views`` by Adam, one view a step in shuffled rounds; a new cloud on the same device.
 
     ``extra_loss`` adds to the loss from the parameters themselves (``L_seg`` of Eq. 21, for one). ``trainable`` (n,)
-    bool picks the Gaussians that may change; it cannot be combined with relocation. ``checkpoint`` is written now and
-    then, and gone on from if it is told to, on a CPU to the bits of a run that was not cut off. ``progress`` is called
-    with the step's number and loss. Raises ``UserError`` for views that do not fit their cameras and for a loss that is
-    not finite.
+    bool picks the Gaussians that may change; it cannot be combined with relocation. ``checkpoint`` (.npz) is written
+    every half a minute, and gone on from with ``resume``, on a CPU to the bits of a run that was not cut off.
+    ``progress`` is called with the step's number and loss. Raises ``UserError`` for views that do not fit their
+    cameras, for a loss that is not finite and for a checkpoint of anything else.
     """
     options = options or FinetuneOptions()
     _check(cloud, views, options, trainable)
@@ -165,7 +167,8 @@ def finetune(
     patience = 1 if device == "cpu" else _UNSEEN_STEPS
     queue: list[int] = []
     lasting = {"population": population, "misfits": misfits, "growth": growth} | ({"tones": tones} if tones else {})
-    saved = None if checkpoint is None else checkpoint.begin(_digest(cloud, views, options))
+    kept = None if checkpoint is None else Checkpoint(Path(checkpoint), resume=resume)
+    saved = None if kept is None else kept.begin(_digest(cloud, views, options))
     if saved is not None:
         order.bit_generator.state, queue = saved["order"], list(saved["queue"])
         losses[: saved["step"]] = saved["losses"]
@@ -173,8 +176,8 @@ def finetune(
             part.restore(_below(saved, name))
     for step in range(0 if saved is None else int(saved["step"]), options.iterations):
         if not queue:
-            kept = [number for number in range(len(views)) if number not in misfits.found]
-            queue = [kept[i] for i in order.permutation(len(kept))]
+            fitting = [number for number in range(len(views)) if number not in misfits.found]
+            queue = [fitting[i] for i in order.permutation(len(fitting))]
         number = queue.pop()
         target = targets[number]
         background = options.background
@@ -229,11 +232,11 @@ def finetune(
                 misfits.judge(step / options.iterations)
         if relocating:
             population.evolve(step, options.iterations, growth)
-        if checkpoint is not None and not pending and checkpoint.due():
+        if kept is not None and not pending and kept.due():
             state = {"step": step + 1, "losses": losses[: step + 1], "order": order.bit_generator.state, "queue": queue}
             for name, part in lasting.items():
                 state |= {f"{name}/{key}": value for key, value in part.state().items()}
-            checkpoint.write(state)
+            kept.write(state)
     return FinetuneResult(
         _cloud(population.tensors), losses, None if tones is None else tones.matrices(), tuple(misfits.found)
     )

@@ -102,6 +102,14 @@ def test_without_cameras_a_ring_is_used_and_written(
     assert main(["segment", str(folder / "scene.ply"), *flags, "--out", str(tmp_path / "parts")]) == 0
 
 
+def test_a_mask_of_the_plane_is_called_by_its_flag(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--plane-mask", "gone.png", "--cameras", str(folder / "cameras.json"), "--out", str(tmp_path / "out")]
+    assert main(["plane", str(folder / "scene.ply"), *flags]) == 2
+    assert "--plane-mask gone.png: no such file, nor numbers; give a mask.png" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("flags", "message"),
     [

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
+from egs_warp.assets import pawn
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.io import (
     read_capture,
@@ -212,3 +213,13 @@ def test_sequence_names(tmp_path: Path) -> None:
     packed = write_ply_sequence(tmp_path, clouds, prefix="jump", compressed=True)
     assert re.fullmatch(r"jump0003\.compressed\.ply", packed[-1].name)
     assert read_capture(packed[-1], device="cpu").format == "compressed .ply"
+
+
+@pytest.mark.parametrize("first", [b"{", b"PK", b"\x1f\x8b"])
+def test_a_splat_may_begin_with_any_coordinate(tmp_path: Path, first: bytes) -> None:
+    """It has no magic number: in one of 256 the first byte is that of JSON."""
+    write_splat(tmp_path / "a.splat", pawn(gaussian_count=50, device="cpu").cloud)
+    data = (tmp_path / "a.splat").read_bytes()
+    (tmp_path / "a.splat").write_bytes(first + data[len(first) :])
+    capture = read_capture(tmp_path / "a.splat", device="cpu")
+    assert capture.format == ".splat" and capture.cloud.count == len(data) // 32

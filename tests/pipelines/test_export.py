@@ -170,6 +170,16 @@ def test_bad_input_is_one_line(
     assert said in error and error.count("\n") == 1
 
 
+def test_frames_are_not_put_among_the_files_of_a_run(
+    run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    before = sorted(run_folder.iterdir())
+    for command in (["export", str(run_folder), "--to", "ply"], ["render", str(run_folder), "--size", "32"]):
+        assert main([*command, "--out", str(run_folder)]) == 2
+        assert f"{run_folder}: it is the folder of a run, which these would be mixed with" in capsys.readouterr().err
+    assert sorted(run_folder.iterdir()) == before
+
+
 def test_nvidias_rule_for_splats_finds_nothing(run: FinishedRun, tmp_path: Path):
     """VG.035 of the Omniverse asset requirements."""
     validator = pytest.importorskip("omni.asset_validator")

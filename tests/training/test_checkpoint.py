@@ -12,7 +12,6 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from tests.support.training_views import ball, ring
 
 torch = pytest.importorskip("torch")
-from egs_warp.training.checkpoint import Checkpoint  # noqa: E402
 from egs_warp.training.finetune import (  # noqa: E402
     Densification,
     FinetuneOptions,
@@ -70,7 +69,7 @@ def cut_off(views: list[TrainingView], path: Path, at: int, *, resume: bool) -> 
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        finetune(start(), views, options=OPTIONS, checkpoint=Checkpoint(path, resume=resume), progress=stop)
+        finetune(start(), views, options=OPTIONS, checkpoint=path, resume=resume, progress=stop)
 
 
 def test_cut_off_three_times_it_has_the_same_bits(views: list[TrainingView], tmp_path: Path) -> None:
@@ -83,7 +82,8 @@ def test_cut_off_three_times_it_has_the_same_bits(views: list[TrainingView], tmp
     again = finetune(
         *(start(), views),
         options=OPTIONS,
-        checkpoint=Checkpoint(path, resume=True),
+        checkpoint=path,
+        resume=True,
         progress=lambda step, _: seen.append(step),
     )
     assert seen == list(range(CUTS[-1], OPTIONS.iterations)), "steps that were done are not done again"
@@ -95,7 +95,7 @@ def test_what_cannot_go_on_is_told(views: list[TrainingView], tmp_path: Path) ->
 
     def told(views: list[TrainingView]) -> str:
         with pytest.raises(UserError) as error:
-            finetune(start(), views, options=OPTIONS, checkpoint=Checkpoint(path, resume=True))
+            finetune(start(), views, options=OPTIONS, checkpoint=path, resume=True)
         return str(error.value)
 
     assert told(views) == f"{path}: no training was cut off here; begin it"
