@@ -14,10 +14,6 @@ more apart.
 """
 _FINEST = 0.4
 """Edges of the cage across the smallest cells: small feet stand on several."""
-_PARTS = 5
-"""Of an edge of the cage, at whose ends seeds of cells may lie: those of the cage alone, which is the same for other
-roundings of a file's numbers.
-"""
 _WIDER = 1.1
 """Growth of the cells until they are few enough."""
 
@@ -40,7 +36,7 @@ class ContactPoints:
         heights = geometry.ground_heights(places)
         sole = np.flatnonzero(heights < heights.min() + 2.0 * near)
         spacing = _FINEST * mean_edge_length(geometry.mesh)
-        self.cell_from_point = _few_cells(places, sole, _surface(geometry), spacing, MOST_AT_REST)
+        self.cell_from_point = _few_cells(places, heights, sole, spacing, MOST_AT_REST)
 
     def choose(self, previous: np.ndarray, loaded: np.ndarray, gaps: np.ndarray) -> np.ndarray:
         """(n,) points of the next step in ascending order; ``previous`` (m,) were the last's, ``loaded`` (m,) bool
@@ -78,26 +74,14 @@ class ContactPoints:
         return matched
 
 
-def _surface(geometry: ContactGeometry) -> np.ndarray:
-    """(S, 3) metres: points all over the surface of the cage, those of a face an edge over ``_PARTS`` apart, the lowest
-    first.
+def _few_cells(places: np.ndarray, heights: np.ndarray, sole: np.ndarray, spacing: float, most: int) -> np.ndarray:
+    """(P,) nearest seed of each of ``places`` (P, 3); as many seeds as are ``spacing`` metres apart, or fewer, until at
+    most ``most`` of them are nearest to points of the ``sole``.
     """
-    mesh = geometry.mesh
-    shares = np.array(
-        [(i, j, _PARTS - i - j) for i in range(_PARTS + 1) for j in range(_PARTS + 1 - i)], dtype=np.float64
-    )
-    places = np.einsum("sc,fci->fsi", shares / _PARTS, mesh.nodes[mesh.boundary_faces()]).reshape(-1, 3)
-    return np.roll(places, -int(np.argmin(geometry.ground_heights(places))), axis=0)
-
-
-def _few_cells(places: np.ndarray, sole: np.ndarray, surface: np.ndarray, spacing: float, most: int) -> np.ndarray:
-    """(P,) nearest seed of each of ``places`` (P, 3); as many seeds of the ``surface`` (S, 3) as are ``spacing`` metres
-    apart, or fewer, until at most ``most`` of them are nearest to points of the ``sole``.
-    """
-    seeds, apart = _spread(surface, 0, spacing)
+    seeds, apart = _spread(places, int(np.argmin(heights)), spacing)
     while True:
         first = seeds[: np.count_nonzero(apart >= spacing)]
-        nearest = np.asarray(KDTree(surface[first]).query(places)[1], dtype=int)
+        nearest = np.asarray(KDTree(places[first]).query(places)[1], dtype=int)
         if len(np.unique(nearest[sole])) <= most:
             return nearest
         spacing *= _WIDER

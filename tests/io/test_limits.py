@@ -20,11 +20,13 @@ from PIL import Image
 from egs_warp.commands.object_flag import read_mask
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io import read_cameras, read_capture
 from egs_warp.io.cameras import PosedImage
 from egs_warp.io.limits import LARGEST_TEXT, read_bytes
 from egs_warp.io.photos import read_photo
 from egs_warp.io.planes import read_planes
+from egs_warp.io.writing import WRITERS, writer_of
 from tests.support.captures import good_bytes, message, written
 
 HUGE = (13_300, 13_300)
@@ -52,18 +54,20 @@ def large_png(path: Path, size: tuple[int, int] = HUGE) -> Path:
 def peak_megabytes(code: str, *arguments: str) -> float:
     """Memory that ``code`` takes beyond its imports, in a process of its own; it must end in ``UserError``."""
     program = f"""
-        import resource, sys
+        import sys
         import numpy, warp, cv2, PIL.Image, PIL.WebPImagePlugin, PIL.PngImagePlugin
         from egs_warp.errors import UserError
         from egs_warp.io import read_capture
         from egs_warp.commands.object_flag import read_mask
         warp.config.log_level = warp.LOG_ERROR
         warp.init()
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        from tests.support.memory import peak_bytes, reset_peak
+        reset_peak()
+        before = peak_bytes()
         try:
             {code}
         except UserError as error:
-            print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
+            print((peak_bytes() - before) / 2**20)
     """
     run = [sys.executable, "-c", textwrap.dedent(program), *arguments]
     return float(subprocess.run(run, capture_output=True, text=True, check=True).stdout)
@@ -254,6 +258,26 @@ def test_a_text_ply_takes_little_more_than_its_numbers(tmp_path: Path) -> None:
     path = written(tmp_path / "a.ply", header + b"1\n" * 2_000_000)
     assert message(path).startswith("truncated: element vertex needs 1 lines, found 0")
     assert peak_megabytes("read_capture(sys.argv[1], device='cpu')", str(path)) < 4 * 4 + 16
+
+
+@pytest.mark.parametrize("ending", [ending for ending, _ in WRITERS.values()])
+def test_a_valid_capture_takes_four_times_its_file_and_six_times_what_it_becomes(tmp_path: Path, ending: str) -> None:
+    """Packed formats are unpacked in double precision. The object is 14 numbers a Gaussian, in single precision."""
+    count = 200_000
+    random = np.random.default_rng(0)
+    cloud = GaussianCloud.from_numpy(
+        random.normal(size=(count, 3)),
+        random.normal(size=(count, 4)),
+        random.uniform(-6.0, -3.0, (count, 3)),
+        random.normal(size=count),
+        random.normal(size=(count, 1, 3)),
+        device="cpu",
+    )
+    path = tmp_path / f"a{ending}"
+    writer_of(path)(path, cloud)
+    code = "read_capture(sys.argv[1], device='cpu'); raise UserError('read')"
+    room = (4 * path.stat().st_size + 6 * count * 14 * 4) / 2**20
+    assert 2.0 < peak_megabytes(code, str(path)) < room
 
 
 def test_two_elements_of_one_name(tmp_path: Path) -> None:
