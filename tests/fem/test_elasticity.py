@@ -143,3 +143,12 @@ def test_pattern_is_the_meshs(device: str) -> None:
         (np.ones(16 * len(mesh.tets)), (np.repeat(mesh.tets, 4, 1).ravel(), np.tile(mesh.tets, (1, 4)).ravel()))
     ).tocsr()
     assert full(assembly, np.ones(assembly.upper_pattern.nnz)).astype(bool).sum() == 9 * pairs.nnz
+
+
+def test_moduli_of_a_material() -> None:
+    """Lame's parameters: E = mu (3 lambda + 2 mu) / (lambda + mu), nu = lambda / (2 (lambda + mu))."""
+    for nu in (0.1, 0.25, 0.45):
+        material = Material(young_modulus=3.0, poisson_ratio=nu, density=1.0, damping_time=0.0)
+        mu, lam = material.mu, material.lam
+        assert mu * (3.0 * lam + 2.0 * mu) / (lam + mu) == pytest.approx(3.0)
+        assert lam / (2.0 * (lam + mu)) == pytest.approx(nu)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,14 @@ from egs_warp.assets import pawn
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io import read_capture
-from egs_warp.segmentation.base_plane import find_base_plane, guess_up
+from egs_warp.meshing.body_gaussians import centred
+from egs_warp.segmentation.base_plane import (
+    _support_level,
+    _support_shape,
+    _Underside,
+    find_base_plane,
+    guess_up,
+)
 
 _OBJECTS = [("monkey.ply", (0, 1, 0)), ("plush_dog.ply", (0, -1, 0)), ("robot.spz", (0, 1, 0))]
 
@@ -104,3 +112,46 @@ def test_no_height() -> None:
     )
     with pytest.raises(UserError, match="have no height along up, so no plane can be found; check up"):
         find_base_plane(flat, np.array([0.0, 0.0, 1.0]))
+
+
+def test_a_bevel_above_the_sole_is_not_the_support() -> None:
+    """Of two levels of the underside the lower one is, though more columns end at the other."""
+    random = np.random.default_rng(0)
+    bottoms = np.concatenate([random.normal(0.0, 0.001, 60), random.normal(0.08, 0.001, 100)])
+    heights = np.concatenate([bottoms, random.uniform(0.1, 1.0, 2000)])
+    columns = np.stack(np.divmod(np.arange(160), 16), axis=1)
+    seen = _Underside(heights, np.ones(len(heights)), 0.0, 1.0, bottoms, columns, 0.01, np.array([8.0, 5.0]))
+    assert abs(_support_level(seen)) < 0.004
+    few = replace(seen, bottoms=np.concatenate([bottoms[:20], bottoms[60:]]))
+    assert abs(_support_level(few) - 0.08) < 0.004, "too few to hold their own"
+
+
+def test_the_reason_for_up_is_what_was_weighed() -> None:
+    """Scores of the best axis and of the next, and whether they are far apart: a pawn has one base, a cube six."""
+    cube = np.random.default_rng(0).uniform(-0.5, 0.5, (4000, 3))
+    cube[np.arange(4000), np.arange(4000) % 3] = np.sign(cube[np.arange(4000), np.arange(4000) % 3]) * 0.5
+    block = GaussianCloud.from_numpy(
+        cube, np.tile([1.0, 0, 0, 0], (4000, 1)), np.full((4000, 3), -5.0), np.full(4000, 4.0), np.zeros((4000, 1, 3))
+    )
+    for cloud, sure in ((pawn(gaussian_count=3000).cloud, "clearly"), (block, "narrowly")):
+        near, _ = centred(cloud)
+        totals = []
+        for axis, habit in enumerate((0.0, 0.10, 0.05)):
+            for sign in (1.0, -1.0):
+                shape = _support_shape(near, sign * np.eye(3)[axis])
+                totals.append(
+                    (shape.polygon + shape.level + shape.depth + habit, f"{'+' if sign > 0 else '-'}{'xyz'[axis]}")
+                )
+        (best, name), (second, other) = sorted(totals, key=lambda total: -total[0])[:2]
+        up, reason = guess_up(cloud)
+        assert up["xyz".index(name[1])] == (1.0 if name[0] == "+" else -1.0)
+        assert reason.endswith(f"{sure} ahead of {other}, score {best:.2f} to {second:.2f}")
+
+
+def test_what_is_flat_along_an_axis_is_not_supported_there() -> None:
+    sheet = np.random.default_rng(0).uniform(-0.5, 0.5, (400, 3)) * [1.0, 1.0, 0.0]
+    cloud = GaussianCloud.from_numpy(
+        sheet, np.tile([1.0, 0, 0, 0], (400, 1)), np.full((400, 3), -5.0), np.full(400, 4.0), np.zeros((400, 1, 3))
+    )
+    shape = _support_shape(cloud, np.array([0.0, 0.0, 1.0]))
+    assert (shape.polygon, shape.level, shape.depth) == (0.0, 0.0, 0.0)

@@ -161,3 +161,21 @@ def test_what_the_object_hid_is_not_taken_for_ground() -> None:
     camera = Camera.look_at(np.array([0.3, -0.3, 4.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]), width=64, height=64)
     seen = module._seen_points(joined(bare, ball()), bare, camera)
     assert len(seen) > 1000 and np.abs(seen[:, 2]).max() < 0.05
+
+
+def test_medians_of_what_is_nearest_to_each_node() -> None:
+    """Of odd and even numbers of points; none of those off the grid."""
+    random = np.random.default_rng(0)
+    count, spacing, origin = 5, 0.25, np.array([0.3, -0.2, 0.1])
+    axes = np.linalg.qr(random.standard_normal((3, 3)))[0]
+    local = np.column_stack([random.uniform(-1.0, 2.2, (400, 2)), random.standard_normal(400)])
+    medians = module._medians(origin + local @ axes, axes, origin, spacing, count)
+    nodes = np.rint(local[:, :2] / spacing)
+    sizes = set()
+    for row in range(count):
+        for column in range(count):
+            heights = local[(nodes == [column, row]).all(axis=1), 2]
+            sizes.add(len(heights) % 2)
+            expected = np.median(heights) if len(heights) else np.nan
+            np.testing.assert_allclose(medians[row, column], expected, atol=1e-12)
+    assert sizes == {0, 1}

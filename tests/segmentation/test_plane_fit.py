@@ -8,7 +8,7 @@ import pytest
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.plane import Plane
-from egs_warp.segmentation.plane_fit import PlaneView, fit_plane, plane_depth
+from egs_warp.segmentation.plane_fit import PlaneView, _tukey, fit_plane, plane_depth
 
 TRUTH = Plane.from_coefficients(0.2, -0.9, 0.3, 0.4)
 
@@ -98,5 +98,16 @@ def test_what_cannot_be_fitted_is_said() -> None:
     with pytest.raises(UserError, match="there are no views"):
         fit_plane([])
     noise = np.random.default_rng(0).uniform(0.5, 20.0, depth.shape)
-    with pytest.raises(UserError, match="plane: none in sight"):
+    with pytest.raises(UserError, match=r"plane: none in sight: the best one leaves depth errors of [3-9]\d %"):
         fit_plane([PlaneView(camera, noise, np.ones_like(depth, bool))])
+
+
+def test_the_loss_of_outliers_has_its_derivatives() -> None:
+    """Tukey's biweight: value, first and second derivative by z, inside and beyond where it is flat; finite
+    differences.
+    """
+    z, step = np.array([0.05, 0.3, 0.6, 0.9, 1.2, 5.0]), 1e-5
+    low, at, high = _tukey(z - step), _tukey(z), _tukey(z + step)
+    np.testing.assert_allclose((high[0] - low[0]) / (2.0 * step), at[1], atol=1e-8)
+    np.testing.assert_allclose((high[1] - low[1]) / (2.0 * step), at[2], atol=1e-8)
+    assert at[0, -1] == pytest.approx(1.0 / 3.0) and at[0, 0] == pytest.approx(0.05, rel=0.06)

@@ -74,3 +74,15 @@ def test_a_mask_of_another_size_is_refused() -> None:
     view = MaskedView(camera(), np.ones((10, 10), bool), "photo7.png")
     with pytest.raises(UserError, match=r"photo7\.png: the mask is 10 x 10 pixels, its camera 56 x 40"):
         blending_votes(random_cloud("cpu"), [view])
+
+
+def test_what_no_pixel_could_show_has_no_weight() -> None:
+    """Behind the camera and far aside: nothing, whatever stands in the way; a first one of a single tile counts."""
+    means = np.array([[0.0, 0.0, 0.0], [0.0, -9.0, 0.0], [40.0, 0.0, 0.0]])
+    cloud = GaussianCloud.from_numpy(
+        means, np.tile([1.0, 0, 0, 0], (3, 1)), np.full((3, 3), -4.0), np.full(3, 2.0), np.zeros((3, 1, 3))
+    )
+    view = camera()
+    votes = blending_votes(cloud, [MaskedView(view, np.ones((view.height, view.width), bool))])
+    assert votes.unhidden[0] > 0.0 and votes.unhidden[1] == votes.unhidden[2] == 0.0
+    assert votes.unhidden[0] == pytest.approx(votes.inside[0], rel=0.05), "alone, nothing hides it"
