@@ -75,7 +75,7 @@ class Checkpoint:
         others = {name: value for name, value in state.items() if name not in arrays}
         facts = json.dumps({"digest": self._digest, "state": others})
         with atomic_write(self.path) as temporary, open(temporary, "wb") as file:
-            np.savez(file, facts=np.array(facts), **arrays)
+            np.savez(file, facts=np.array(facts), **arrays)  # pyright: ignore[reportArgumentType]
         self._last = time.monotonic()
         self._pause = max(SECONDS, (self._last - began) / _SHARE)
 
