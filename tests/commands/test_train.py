@@ -79,7 +79,7 @@ def test_an_earlier_training_is_kept(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 @pytest.mark.slow
 def test_random_moments(tmp_path: Path) -> None:
-    """SIGKILL at any time; a training that had not yet kept anything is begun again."""
+    """SIGKILL at any time, every other one once there is something to go on from; else the training is begun again."""
     posed, whole = posed_folder(tmp_path / "posed"), tmp_path / "whole" / "a.ply"
     command = [sys.executable, "-c", OFTEN]
     began = time.monotonic()
@@ -89,11 +89,17 @@ def test_random_moments(tmp_path: Path) -> None:
     went_on = 0
     for number in range(MOMENTS):
         out = tmp_path / str(number) / "a.ply"
+        checkpoint = out.with_name("a.training.npz")
         run = subprocess.Popen([*command, *line(posed, out)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        time.sleep(length * moments.random())
+        if number % 2:
+            time.sleep(length * moments.random())
+        else:
+            while run.poll() is None and not checkpoint.exists():
+                time.sleep(0.01)
+            time.sleep(0.3 * length * moments.random())
         run.send_signal(signal.SIGKILL)
         run.wait()
-        kept = out.with_name("a.training.npz").exists()
+        kept = checkpoint.exists()
         went_on += kept
         if kept or not out.exists():
             again = [*line(posed, out), *(["--resume"] if kept else [])]
