@@ -13,6 +13,7 @@ from egs_warp.errors import UserError
 EXAMPLES = (
     "scan.ply scan.spz",
     "scan.ply flat.splat --degree 0",
+    "scan.ply scan.spz --to spz4",
     "frames spz_frames --to spz",
 )
 
@@ -27,9 +28,11 @@ def add_parser(commands: Commands) -> None:
         help=".ply, compressed .ply, .spz, .splat, .sog, .glb, a SOG folder, or with --to a folder of numbered files",
     )
     convert.add_argument(
-        "out", type=named_path, help="by its ending .ply, .compressed.ply, .spz, .sog, .splat, .glb; with --to a folder"
+        "out",
+        type=named_path,
+        help="by its ending .ply, .compressed.ply, .spz (version 3), .sog, .splat, .glb; of numbered files a folder",
     )
-    convert.add_argument("--to", choices=SPLAT_FILES, help="write each of the numbered captures as this")
+    convert.add_argument("--to", choices=SPLAT_FILES, help="write this: spz4 is .spz of version 4; for numbered files")
     convert.add_argument("--degree", type=int, choices=(0, 1, 2, 3), help="bands of colour to keep (all)")
     convert.set_defaults(run=_convert)
 
@@ -44,8 +47,8 @@ def _convert(chosen: argparse.Namespace) -> int:
     from egs_warp.io.writing import WRITERS, writer_of
     from egs_warp.launching import use_device
 
-    if chosen.to is None:
-        write = writer_of(chosen.out)
+    if chosen.to is None or chosen.capture.is_file():
+        write = writer_of(chosen.out, kind=chosen.to)
         # A long reading must not end in vain.
         if not chosen.out.absolute().parent.is_dir():
             raise UserError(f"{chosen.out}: its folder does not exist; create {chosen.out.parent} first")

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 Commands: TypeAlias = "argparse._SubParsersAction[Any]"
 """What a command adds its parser to."""
 
-SPLAT_FILES = ("ply", "compressed-ply", "spz", "sog", "splat", "glb")
+SPLAT_FILES = ("ply", "compressed-ply", "spz", "spz4", "sog", "splat", "glb")
 """Names of ``egs_warp.io.writing.WRITERS``, which is slow to import."""
 _AXES = {"x": 0, "y": 1, "z": 2}
 _FLAGS = {"muscles_file": "--muscles", "solids": "--terrain"}

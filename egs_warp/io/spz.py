@@ -2,7 +2,7 @@
 
 Public description: README of https://github.com/nianticlabs/spz. Versions 1 (half-float positions), 2 (24-bit
 fixed-point positions), 3 (smallest-three rotations) and 4 (the blocks of 3, each a Zstandard stream: ``spz_streams``)
-are read; 2 and 3 are written. The format defines its axes as right, up, back: +y is up; version 4 may say otherwise.
+are read; 2 to 4 are written. The format defines its axes as right, up, back: +y is up; version 4 may say otherwise.
 The axes are kept as they are in the file.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,7 +28,7 @@ from egs_warp.io.raw import (
     largest_restored,
     logits_from_bytes,
 )
-from egs_warp.io.spz_streams import declared_up, inflate_streams
+from egs_warp.io.spz_streams import declared_up, deflate_streams, inflate_streams
 
 _MAGIC = 0x5053474E
 _HEADER = struct.Struct("<IIIBBBB")
@@ -172,13 +173,15 @@ def _quaternions(packed: np.ndarray, version: int) -> np.ndarray:
 
 
 def write_spz(path: Path | str, cloud: GaussianCloud, *, version: int = 3) -> None:
-    """Write ``cloud`` as a .spz of version 2 or 3. Axes are written as they are: the format's viewers take +y as up.
+    """Write ``cloud`` as a .spz of version 2 to 4. Axes are written as they are: the format's viewers take +y as up.
+
+    Versions 3 and 4 hold the same numbers; files of 4 are smaller, and fewer programs read them.
 
     Lossy: positions to 2^-13 (fewer bits where the capture is so large that they do not fit), log scales to 1/32 within
     -10 ... 5.9, opacity and colour to 1/255. Raises ``UserError`` if the file cannot be written.
     """
-    if version not in (2, 3):
-        raise UserError(f"{path}: .spz version {version} cannot be written; choose 2 or 3")
+    if version not in (2, 3, 4):
+        raise UserError(f"{path}: .spz version {version} cannot be written; choose 2, 3 or 4")
     means = cloud.means.numpy().astype(np.float64)
     reach = float(np.abs(means).max())
     bits = int(np.clip(np.floor(np.log2((2**23 - 1) / reach)), 0, _FRACTIONAL_BITS)) if reach > 0 else _FRACTIONAL_BITS
@@ -188,7 +191,7 @@ def write_spz(path: Path | str, cloud: GaussianCloud, *, version: int = 3) -> No
     sh = cloud.sh.numpy()
     header = _HEADER.pack(_MAGIC, version, cloud.count, cloud.sh_degree, bits, 0, 0)
     quaternions = cloud.rotations.numpy()
-    if version == 3:
+    if version >= 3:
         three, largest = largest_dropped(quaternions[:, [1, 2, 3, 0]])
         sizes = np.rint(np.abs(three) / np.sqrt(0.5) * 511.0).clip(0, 511).astype(np.uint32)
         fields = sizes | np.where(three < 0, np.uint32(512), np.uint32(0))
@@ -205,11 +208,18 @@ def write_spz(path: Path | str, cloud: GaussianCloud, *, version: int = 3) -> No
         packed_rotations,
         _packed_rest(sh[:, 1:]).tobytes(),
     )
-    deflate = zlib.compressobj(wbits=zlib.MAX_WBITS | 16)
+    packed = deflate_streams(header, blocks) if version == 4 else _deflated((header, *blocks))
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
-        for block in (header, *blocks):
-            file.write(deflate.compress(block))
-        file.write(deflate.flush())
+        for part in packed:
+            file.write(part)
+
+
+def _deflated(blocks: tuple[bytes, ...]) -> Iterator[bytes]:
+    """``blocks`` in one gzip stream."""
+    deflate = zlib.compressobj(wbits=zlib.MAX_WBITS | 16)
+    for block in blocks:
+        yield deflate.compress(block)
+    yield deflate.flush()
 
 
 def _packed_rest(rest: np.ndarray) -> np.ndarray:

@@ -20,6 +20,10 @@ from egs_warp.errors import UserError
 _HEADER = struct.Struct("<IIIBBBBI12x")
 _ROW = struct.Struct("<QQ")
 _RECORD = struct.Struct("<II")
+_COMMON = 15
+"""Bytes that the header shares with those of versions 1 to 3."""
+_LEVEL = 12
+"""Of Zstandard's 22; 19 takes eight times as long for files that are 4 to 6 % smaller."""
 _LARGEST_WINDOW = 1 << 27
 """Bytes of memory that a stream may ask for beside its output: what the usual tools write by default."""
 _COORDINATES = 0xADBE0003
@@ -59,6 +63,18 @@ def inflate_streams(data: bytes, sizes: Sequence[int], source: Path) -> bytes:
         blocks.append(block)
         end += packed
     return b"".join(blocks)
+
+
+def deflate_streams(header: bytes, blocks: Sequence[bytes]) -> list[bytes]:
+    """The parts of a file of ``blocks``, of which an empty one is left out, as the format has it.
+
+    ``header`` is that of version 3, with another version; what follows its flags is written anew.
+    """
+    kept = [block for block in blocks if block]
+    # The size of what is packed and a checksum go along: a damaged file is told.
+    streams = [zstandard.ZstdCompressor(level=_LEVEL, write_checksum=True).compress(block) for block in kept]
+    table = b"".join(_ROW.pack(len(packed), len(block)) for packed, block in zip(streams, kept, strict=True))
+    return [header[:_COMMON] + struct.pack("<BI12x", len(kept), _HEADER.size), table, *streams]
 
 
 def declared_up(data: bytes, source: Path) -> np.ndarray | None:

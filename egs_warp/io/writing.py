@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from egs_warp.errors import UserError
@@ -19,18 +20,28 @@ WRITERS: dict[str, tuple[str, CaptureWriter]] = {
     "compressed-ply": (".compressed.ply", write_compressed_ply),
     "ply": (".ply", write_ply),
     "spz": (".spz", write_spz),
+    "spz4": (".spz", partial(write_spz, version=4)),
     "sog": (".sog", write_sog),
     "splat": (".splat", write_splat),
     "glb": (".glb", write_glb),
 }
-"""Ending and writer of each kind of splat file; an ending comes before those that it ends in."""
+"""Ending and writer of each kind of splat file; an ending comes before those that it ends in. Of two kinds with one
+ending the first is what a name alone asks for."""
 
 
-def writer_of(path: Path) -> CaptureWriter:
-    """What writes a capture to ``path``. Raises ``UserError`` for a folder, or a name without a known ending."""
-    for ending, write in WRITERS.values():
-        if path.name.lower().endswith(ending) and path.name.lower() != ending:
-            if path.is_dir():
-                raise UserError(f"{path}: is a folder; give the name of a file")
-            return write
-    raise UserError(f"{path}: give a name that ends in {', '.join(ending for ending, _ in WRITERS.values())}")
+def writer_of(path: Path, *, kind: str | None = None) -> CaptureWriter:
+    """What writes a capture to ``path``, as one ``kind`` of ``WRITERS`` or as its ending says.
+
+    Raises ``UserError`` for a folder, or a name without a known ending, or with that of another kind.
+    """
+    endings = dict.fromkeys(ending for ending, _ in WRITERS.values())
+    name = path.name.lower()
+    ending = next((ending for ending in endings if name.endswith(ending) and name != ending), None)
+    wanted = list(endings) if kind is None else [WRITERS[kind][0]]
+    if ending not in wanted:
+        raise UserError(f"{path}: give a name that ends in {', '.join(wanted)}")
+    if path.is_dir():
+        raise UserError(f"{path}: is a folder; give the name of a file")
+    if kind is not None:
+        return WRITERS[kind][1]
+    return next(write for known, write in WRITERS.values() if known == ending)

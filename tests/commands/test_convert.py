@@ -21,13 +21,16 @@ from tests.support.captures import assert_same_bits, make_cloud
 def test_a_capture_becomes_another(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_ply(tmp_path / "a.ply", make_cloud(400, 2))
     out = tmp_path / f"b{WRITERS[kind][0]}"
-    assert main(["convert", str(tmp_path / "a.ply"), str(out)]) == 0
+    assert main(["convert", str(tmp_path / "a.ply"), str(out), *(["--to", kind] if kind == "spz4" else [])]) == 0
     said = capsys.readouterr().out
     assert said.startswith(f"wrote {out} (")
     assert ("nothing is lost: every bit is the same" in said) == (kind == "ply")
     assert ("degree 2 are now of degree 0; colours no longer change" in said) == (kind == "splat")
-    assert ("viewers take +y as up" in said) == (kind in ("spz", "glb"))
-    assert read_capture(out).cloud.count == 400
+    assert ("viewers take +y as up" in said) == (kind in ("spz", "spz4", "glb"))
+    read = read_capture(out)
+    assert read.cloud.count == 400
+    if WRITERS[kind][0] == ".spz":
+        assert read.format == f".spz version {4 if kind == 'spz4' else 3}"
 
 
 def test_what_is_said_is_what_was_done(tmp_path: Path) -> None:
@@ -78,7 +81,10 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
         (["a.ply", "a.ply"], "a.ply: is what is read; give another name"),
         (["a.ply", "no/b.ply"], "its folder does not exist"),
         (["none.ply", "b.ply"], "none.ply: no such file"),
-        (["a.ply", "out", "--to", "ply"], "a.ply: is no folder"),
+        (["a.ply", "out", "--to", "spz4"], "out: give a name that ends in .spz"),
+        (["a.ply", "b.ply", "--to", "compressed-ply"], "b.ply: give a name that ends in .compressed.ply"),
+        (["a.ply", "b.compressed.ply", "--to", "ply"], "b.compressed.ply: give a name that ends in .ply"),
+        (["no", "out", "--to", "ply"], "no: is no folder"),
         ([".", "out", "--to", "ply"], "it has no numbered captures such as frame0001.ply"),
         (["two", "out", "--to", "ply"], "it has two sequences (a0001.ply and b0001.ply)"),
         (["same", "out", "--to", "ply"], "two of its captures have one number"),

@@ -58,6 +58,25 @@ def test_spz_of_streams_holds_what_version_3_does(degree: int, tmp_path: Path) -
     assert_same_bits(capture.cloud, read_capture(tmp_path / "3.spz", device="cpu").cloud)
 
 
+@pytest.mark.parametrize("degree", [0, 2])
+def test_spz_of_streams_is_written_as_its_description_says(degree: int, tmp_path: Path) -> None:
+    """Header, table and streams of https://github.com/nianticlabs/spz, byte by byte; the blocks are those of 3."""
+    write_spz(tmp_path / "3.spz", make_cloud(900, degree))
+    write_spz(tmp_path / "4.spz", make_cloud(900, degree), version=4)
+    plain, data = gzip.decompress((tmp_path / "3.spz").read_bytes()), (tmp_path / "4.spz").read_bytes()
+    count = 6 if degree else 5
+    assert data[:4] == b"NGSP" and struct.unpack("<II", data[4:12]) == (4, 900)
+    assert data[12:15] == plain[12:15] and data[15] == count and data[16:32] == struct.pack("<I12x", 32)
+    rows = [struct.unpack_from("<QQ", data, 32 + 16 * k) for k in range(count)]
+    assert [size for _, size in rows] == [900 * w for w in (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1))][:count]
+    place, blocks = 32 + 16 * count, []
+    for packed, size in rows:
+        blocks.append(zstandard.ZstdDecompressor().decompress(data[place : place + packed]))
+        assert zstandard.frame_content_size(data[place : place + packed]) == size == len(blocks[-1])
+        place += packed
+    assert place == len(data) and b"".join(blocks) == plain[16:]
+
+
 def _one_spz(tmp_path: Path) -> bytes:
     write_spz(tmp_path / "3.spz", make_cloud(1))
     return gzip.decompress((tmp_path / "3.spz").read_bytes())

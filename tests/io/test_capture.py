@@ -143,6 +143,7 @@ WRITERS: dict[str, Callable[..., None]] = {
     "a.compressed.ply": lambda path, cloud: write_compressed_ply(path, cloud, keep_order=True),
     "a2.spz": lambda path, cloud: write_spz(path, cloud, version=2),
     "a3.spz": write_spz,
+    "a4.spz": lambda path, cloud: write_spz(path, cloud, version=4),
     "a.splat": write_splat,
     "a.sog": lambda path, cloud: write_sog(path, cloud, keep_order=True),
 }
@@ -151,6 +152,7 @@ TOLERANCES = {
     "a.compressed.ply": (0.5 * 4.0 / 1023.0, 0.5 * 7.0 / 1023.0, 0.25, 0.5 * 1.8 / 255.0, 1.0 / 64.0),
     "a2.spz": (2.0**-13, 1.0 / 32.0, 12.0, 0.5 / 255.0 / 0.15, 0.0625),
     "a3.spz": (2.0**-13, 1.0 / 32.0, 0.25, 0.5 / 255.0 / 0.15, 0.0625),
+    "a4.spz": (2.0**-13, 1.0 / 32.0, 0.25, 0.5 / 255.0 / 0.15, 0.0625),
     "a.splat": (0.0, 1e-6, 1.0, 0.5 / 255.0 / SH_BAND_0, np.inf),
     "a.sog": (0.5 * 2.0 * np.log(3.0) / 65535.0 * 3.0, 0.03, 1.0, 0.01, 0.01),
 }

@@ -34,7 +34,9 @@ def _in_capture(run: FinishedRun, frame: int) -> np.ndarray:
     return t.body_origin + (means / t.metres_per_unit) @ t.body_axes
 
 
-@pytest.mark.parametrize(("kind", "tolerance"), [("ply", 1e-5), ("splat", 1e-5), ("spz", 1e-3), ("sog", 2e-3)])
+@pytest.mark.parametrize(
+    ("kind", "tolerance"), [("ply", 1e-5), ("splat", 1e-5), ("spz", 1e-3), ("spz4", 1e-3), ("sog", 2e-3)]
+)
 def test_splat_files_lie_in_the_frame_of_the_capture(run: FinishedRun, tmp_path: Path, kind: str, tolerance: float):
     (path,) = export_splats(run, tmp_path, kind, frame=-1, quiet=True)
     assert path.name == f"frame0012{WRITERS[kind][0]}"
