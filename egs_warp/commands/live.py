@@ -74,13 +74,12 @@ def _live(chosen: argparse.Namespace) -> int:
 
 
 def _session(chosen: argparse.Namespace) -> Session:
-    from tqdm import tqdm
-
     from egs_warp.commands.scene_input import ground_of, plane_of
     from egs_warp.io import read_capture
     from egs_warp.io.run_folder import check_out
     from egs_warp.pipelines.animate import AnimateOptions
     from egs_warp.pipelines.creature import make_creature
+    from egs_warp.pipelines.progress import preparation_bar
     from egs_warp.web.feed import drawn_creature
     from egs_warp.web.rehearsal import split_for_life
     from egs_warp.web.session import Session, SessionOptions
@@ -94,7 +93,7 @@ def _session(chosen: argparse.Namespace) -> Session:
     if plane is None and up is None:
         up, note = guessed_up(capture)
         say(note)
-    with tqdm(desc="prepare", bar_format="{desc}, {elapsed}") as bar:
+    with preparation_bar() as begins:
         creature = make_creature(
             capture.cloud,
             up=up,
@@ -105,11 +104,10 @@ def _session(chosen: argparse.Namespace) -> Session:
             front=front,
             muscles_file=chosen.muscles,
             nodes=chosen.nodes,
-            progress=lambda stage: bar.set_description_str(f"prepare: {stage}"),
+            progress=begins,
         )
-        bar.set_description_str("prepare: split")
+        begins("split")
         drawn_as = drawn_creature(creature, split_for_life(creature))
-        bar.set_description_str("prepare: done")
     if front is None:
         say(creature.front.told(creature.frame))
     made = SessionOptions(source=Path(chosen.capture).name, takes=chosen.out, muscles_file=chosen.muscles)

@@ -34,6 +34,8 @@ MISSED = 0.1
 """Of the largest value of its channel: a key missed by more is noted."""
 LONGEST_HOLD = 9.0
 """Of sqrt(H / g): at most for how long, after the last key, the body is waited for to be calm."""
+USUAL_HOLD = 1.5
+"""The same, as it usually takes."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,11 @@ class Follow:
         self._restless = False
         self._reached: dict[int, np.ndarray] = {}
         self._turned = {name: np.zeros(3) for name in self.parts}
+
+    @property
+    def expected_time(self) -> float:
+        """Seconds: the keys, and what a body usually takes to be calm after them."""
+        return self._end + USUAL_HOLD * float(np.sqrt(self.body.height / self._gravity))
 
     @property
     def resting(self) -> bool:

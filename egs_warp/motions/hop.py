@@ -42,6 +42,11 @@ class Hop:
         self._feet = sole_shares(place.body, place.ground, place.standing)
 
     @property
+    def expected_time(self) -> float:
+        """That of the jump."""
+        return self.jump.expected_time
+
+    @property
     def resting(self) -> bool:
         """Whether the jump is at rest."""
         return self.jump.resting

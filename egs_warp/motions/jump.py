@@ -42,6 +42,8 @@ TOUCH_DOWN = 0.06
 foot."""
 LONGEST_LANDING = 9.0
 """Of sqrt(H / g): a body that is not calm by then counts as at rest."""
+USUAL_LANDING = 1.3
+"""The same, as it usually takes."""
 TOUCHING_DOWN = 0.5
 """Of sqrt(H / g): the time from touch-down until balance and upright are asked for in full."""
 FLAT = 0.7
@@ -128,6 +130,12 @@ class Jump:
     def left_ground(self) -> bool:
         """Whether the motion is told in the frame of the landing."""
         return self.pose is self._landing
+
+    @property
+    def expected_time(self) -> float:
+        """Seconds until it is at rest."""
+        plan = self.plan
+        return plan.crouch_time + plan.thrust_time + plan.flight_time + (SETTLING + USUAL_LANDING) * self._time_unit
 
     @property
     def resting(self) -> bool:

@@ -46,11 +46,12 @@ class Script:
         """The motions in their order, for a body of ``height`` metres."""
         return [part for request in self.requests for part in REPERTOIRE[request.name].parts(request, height)]
 
-    def check(self, place: Place) -> None:
-        """Raises the ``UserError`` that a later motion would raise when its turn comes, for a body that stands at
-        ``place``."""
-        for part in self.parts(place.body.height):
-            part.begin(place)
+    def check(self, place: Place) -> list[float]:
+        """Seconds that each motion is expected to take, for a body that stands at ``place``.
+
+        Raises the ``UserError`` that a later motion would raise when its turn comes.
+        """
+        return [part.begin(place).expected_time for part in self.parts(place.body.height)]
 
 
 def motion(text: str, **values: float | None) -> Script:

@@ -20,6 +20,9 @@ from egs_warp.motions.stance import Ground, heading_between, sole_shares
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+LATE = 0.03
+"""Of its time so far: what a motion is given that takes longer than expected."""
+
 
 @dataclass(frozen=True)
 class Place:
@@ -79,6 +82,11 @@ class BodyMotion(Protocol):
     @property
     def resting(self) -> bool:
         """Whether it has come to its end."""
+        ...
+
+    @property
+    def expected_time(self) -> float:
+        """Seconds from its first step until it is at rest."""
         ...
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
@@ -148,6 +156,14 @@ class MotionSequence:
             part = self._parts.pop(0)
             self.done.append(Done(part.name, part.asked, part.begin(place), state.time))
         return self.done[-1].motion.objectives(state, report, dt)
+
+    def time_left(self, time: float, expected: Sequence[float]) -> float:
+        """Seconds from ``time`` until the last motion is at rest; ``expected`` is what each of all takes, seconds."""
+        later = sum(expected[len(self.done) :])
+        if not self.done or self._resting:
+            return later
+        past = time - self.done[-1].start_time
+        return later + max(self.done[-1].motion.expected_time - past, LATE * past)
 
     def cut_short(self) -> list[str]:
         """What the last frame kept from its end, for the user."""

@@ -10,7 +10,7 @@ from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.jump import Jump
+from egs_warp.motions.jump import Jump, JumpPhase
 from egs_warp.motions.jump_plan import JumpPlan, JumpTarget
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.twist import AIRBORNE_SHARE, twist
@@ -18,6 +18,8 @@ from egs_warp.motions.twist import AIRBORNE_SHARE, twist
 TOLERANCE = np.radians(8.0)
 """A body that has landed this near to its angle stays."""
 MOST_JUMPS = 5
+USUAL_JUMPS = 1.3
+"""Expected for what one should do: every so many landings are further off than ``TOLERANCE``, which takes another."""
 PYRAMID = 0.79
 """Mean over all directions of what a friction pyramid of four edges gives of Coulomb's cone."""
 RESERVE = 0.8
@@ -38,10 +40,23 @@ class Turn:
         self._place, self._height = place, target.height
         self._goal = place.ground.origin + target.distance * place.ground.axes[0]
         self._left = turn
+        self._missing: float | None = None
+        """Radians that the present jump, once it has landed, leaves of the turn."""
         first = twist(place, target, turn)
         self.most_in_a_jump = RESERVE * largest_turn(first, place)
         self._one_jump = abs(turn) <= self.most_in_a_jump
         self.jumps = [first if self._one_jump else twist(place, target, self._share())]
+
+    @property
+    def expected_time(self) -> float:
+        """Seconds, of the jumps so far and of those that what is left of the turn takes."""
+        before, at_once = len(self.jumps) - 1, self.most_in_a_jump
+        if self._missing is None:
+            # What makes up for a landing is a small turn, and hits.
+            count = before + (1.0 if before else USUAL_JUMPS) * max(abs(self._left) / at_once, 1.0)
+        else:
+            count = before + 1 + (np.ceil(abs(self._missing) / at_once) if abs(self._missing) > TOLERANCE else 0)
+        return float(min(count, MOST_JUMPS)) * self.jumps[0].expected_time
 
     @property
     def resting(self) -> bool:
@@ -72,11 +87,12 @@ class Turn:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
         result = self.jumps[-1].objectives(state, report, dt)
         jump = self.jumps[-1]
-        if jump.resting and len(self.jumps) < MOST_JUMPS:
+        self._missing = None
+        if jump.phase in (JumpPhase.LAND, JumpPhase.REST):
             # The frame of a landed jump is turned by what was asked of it, so its feet tell what it fell short by.
-            left = self._left - jump.facing.turn - jump.pose.sole_heading(state.positions)
-            if abs(left) > TOLERANCE:
-                self._left = left
+            self._missing = self._left - jump.facing.turn - jump.pose.sole_heading(state.positions)
+            if jump.resting and len(self.jumps) < MOST_JUMPS and abs(self._missing) > TOLERANCE:
+                self._left, self._missing = self._missing, None
                 self.jumps.append(self._again(state))
                 result = self.jumps[-1].objectives(state, report, dt)
         return result

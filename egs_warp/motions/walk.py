@@ -172,6 +172,13 @@ class Walk:
                 raise UserError(f"walk: the way leads over a step, {where}: {found}; walk round it, or jump or hop")
 
     @property
+    def expected_time(self) -> float:
+        """Seconds, of swings that end in time."""
+        gait = self.gait
+        swings = gait.swings * (gait.swing_time + gait.double_time) - gait.double_time
+        return self._duration(WalkPhase.SHIFT) + swings + self._duration(WalkPhase.GATHER)
+
+    @property
     def resting(self) -> bool:
         """Whether the body has gathered itself."""
         return self.phase is WalkPhase.REST

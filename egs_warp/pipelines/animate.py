@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from egs_warp.contact.terrain import Solid
 from egs_warp.errors import ArgumentError
@@ -29,6 +28,7 @@ from egs_warp.pipelines.finished_run import PARTS
 from egs_warp.pipelines.oddities import oddities
 from egs_warp.pipelines.performance import check_frames, simulate
 from egs_warp.pipelines.plots import draw_plots
+from egs_warp.pipelines.progress import preparation_bar, simulation_bar
 from egs_warp.pipelines.report import Report, report_of_run
 from egs_warp.pipelines.shot import LARGEST_SIDE, SMALLEST_SIDE, Shot
 
@@ -145,7 +145,7 @@ def animate(
     asked.frames()  # reads the files that it names
     ffmpeg_program()
     with run_folder(out, overwrite=overwrite, resume=resume) as run:
-        with tqdm(desc="prepare", bar_format="{desc}, {elapsed}", disable=quiet) as bar:
+        with preparation_bar(quiet=quiet) as begins:
             creature = make_creature(
                 cloud,
                 up=up,
@@ -159,21 +159,19 @@ def animate(
                 front=front,
                 seen_from=seen_from,
                 settings=settings,
-                progress=lambda stage: bar.set_description_str(f"prepare: {stage}"),
+                progress=begins,
             )
-            bar.set_description_str("prepare: done")
         if front is None:
             notes = (*notes, creature.front.told(creature.frame))
         notes = (*notes, *oddities(creature.cloud, creature.cage.mesh, creature.body.height))
-        total = asked.frames(creature.body.height) if options.frames is None else options.frames - 1
-        with tqdm(total=total, desc="simulate", unit="frame", disable=quiet) as bar:
+        with simulation_bar(quiet=quiet) as told:
             performance = simulate(
                 creature,
                 asked,
                 frames=options.frames,
                 parts=lambda: run.file(PARTS),
                 resume=_recorded(run),
-                progress=lambda _: bar.update(),
+                progress=told,
             )
         # Whatever becomes of the film, the simulation is not lost.
         performance.trajectory.save(run.file("trajectory.npz"))

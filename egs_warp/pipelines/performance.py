@@ -19,6 +19,7 @@ from egs_warp.motions.script import Script
 from egs_warp.motions.sequence import MotionSequence, Place
 from egs_warp.pipelines.creature import Creature, first_place
 from egs_warp.pipelines.ending import Ending
+from egs_warp.pipelines.outlook import Outlook
 from egs_warp.pipelines.planned import planned_com
 
 FILMED_FROM = (0.6, -1.0, 0.22)
@@ -130,34 +131,40 @@ def simulate(
     step: float | None = None,
     parts: Callable[[], Path] | None = None,
     resume: Path | None = None,
-    progress: Callable[[int], object] = lambda frame: None,
+    progress: Callable[[int, int], object] = lambda done, expected: None,
 ) -> Performance:
     """Run ``motion`` for ``frames`` pictures at 60 Hz, the first of them at rest, or else until the body has come to
     rest or fallen, or the motion is cut off.
 
     ``step``: the seconds of a solver step, if not the usual; ``parts`` tells the folder that takes the steps as they
-    are done, ``resume`` is that of a run that was cut off and goes on. ``progress`` is told each frame done. Raises
-    ``UserError`` for a motion that the body cannot do, and a folder that another run has left.
+    are done, ``resume`` is that of a run that was cut off and goes on. ``progress`` is told after each frame how
+    many are done, and how many are expected in all by now. Raises ``UserError`` for a motion that the body cannot do,
+    and a folder that another run has left.
     """
     check_frames(frames)
     place = first_place(creature, step=step)
-    motion.check(place)
+    expected = motion.check(place)
     sequence = MotionSequence(place, motion.parts(creature.body.height))
     watch = FallWatch(sequence, place)
     # A frame is as long as a step that is longer than it.
-    share = 1.0 if step is None else min(1.0, 1.0 / (FRAME_RATE * step))
+    frame = max(1.0 / FRAME_RATE, step or 0.0)
+    limit = round(motion.frames(creature.body.height) / (FRAME_RATE * frame))
+    most = limit if frames is None else frames - 1
+    outlook = Outlook(sequence, expected, frame=frame, most=most)
     simulation = roll_out(
         creature.stepper,
         creature.geometry,
         creature.start,
         watch,
-        frames=round(share * motion.frames(creature.body.height)) if frames is None else frames - 1,
+        frames=most,
         step=step,
         place=creature.frame,
         parts=parts,
         resume=resume,
         finished=lambda: frames is None and watch.finished,
-        progress=progress,
+        progress=lambda last: progress(
+            last + 1, outlook.frames(last + 1, finished=watch.finished) if frames is None else most
+        ),
     )
     trajectory = simulation.trajectory
     trajectory = trajectory.with_plan(planned_com(sequence, creature.body, trajectory))

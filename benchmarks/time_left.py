@@ -1,0 +1,100 @@
+"""Is the time left true that the progress bar of a simulation tells?
+
+The built-in pawn jumps, hops, twists and walks. Each time that the bar is drawn, what it says is left is compared with
+what turns out to be left, where that is 5 s or more: the bar tells whole seconds.
+
+python benchmarks/time_left.py [--quick] [--device cpu] [--seed 0] [--json PATH] [--plot PATH]
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from egs_warp.assets import pawn
+from egs_warp.motions.script import motion
+from egs_warp.pipelines.creature import Creature, make_creature
+from egs_warp.pipelines.performance import simulate
+from egs_warp.pipelines.progress import simulation_bar
+from harness import Row, Table, flags, report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SCRIPTS = ("jump", "hop x2", "twist", "walk 0.2")
+LEAST = 5.0
+"""Seconds."""
+
+
+class Watched(io.StringIO):
+    """A stream that keeps when the bar was drawn, and the seconds left that it told."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.told: list[tuple[float, float]] = []
+
+    def write(self, text: str, /) -> int:
+        """Reads what the user would see."""
+        if found := re.search(r"<(?:(\d+):)?(\d+):(\d+),", text):
+            hours, minutes, seconds = (float(part or 0) for part in found.groups())
+            self.told.append((time.perf_counter(), 3600.0 * hours + 60.0 * minutes + seconds))
+        return len(text)
+
+
+def measured(creature: Creature, script: str) -> Row:
+    """Of one run."""
+    stream = Watched()
+    began = time.perf_counter()
+    with simulation_bar(file=stream) as told:
+        done = simulate(creature, motion(script), progress=told)
+    ended = time.perf_counter()
+    at, said = np.array(stream.told).T
+    far = ended - at >= LEAST
+    return {
+        "script": script,
+        "frames": len(done.frames) - 1,
+        "seconds": ended - began,
+        "past": list(at[far] - began),
+        "ratios": list(said[far] / (ended - at[far])),
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run, print, write."""
+    parser = flags(__doc__, quick="the jump and the walk alone", device="cpu", seed="not used: nothing here is random")
+    options = parser.parse_args(arguments)
+    made = pawn(device=options.device)
+    creature = make_creature(made.cloud, plane=made.plane)
+    # The first frames compile the kernels.
+    simulate(creature, motion("jump"), frames=2)
+    table = Table(
+        script="<10", frames="6d", seconds="7.0f", told="5d", least=".2f", median=".2f", most=".2f", within=".0%"
+    )
+    rows = []
+    for script in SCRIPTS[::3] if options.quick else SCRIPTS:
+        row = measured(creature, script)
+        rows.append(row)
+        ratios = np.array(row["ratios"])
+        within = float(np.mean((ratios >= 0.5) & (ratios <= 2.0)))
+        numbers = (ratios.min(), float(np.median(ratios)), ratios.max())
+        table.row(script, row["frames"], row["seconds"], len(ratios), *numbers, within)
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        for row in rows:
+            axes.plot(np.array(row["past"]) / row["seconds"], row["ratios"], label=row["script"])
+        axes.axhspan(0.5, 2.0, alpha=0.1)
+        axes.set(xlabel="of the run", ylabel="time left, told over true")
+        axes.legend()
+
+    every = np.concatenate([row["ratios"] for row in rows])
+    report(options, rows, aims={"within_two": bool(((every >= 0.5) & (every <= 2.0)).mean() >= 0.95)}, draw=draw)
+
+
+if __name__ == "__main__":
+    main()
