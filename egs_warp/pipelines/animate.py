@@ -190,7 +190,8 @@ def animate(
             shadow=options.shadow,
             quiet=quiet,
         )
-        DrawnCreature.of(film.splats, film.camera, creature.muscles).save(run.file(drawn.FILE))
+        made = DrawnCreature.of(film.splats, film.camera, creature.muscles, performance.place.feet())
+        made.save(run.file(drawn.FILE))
         asked_for = Asked(
             options,
             shot,

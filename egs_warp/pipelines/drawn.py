@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.io.atomic import atomic_write
+from egs_warp.motions.feet import Foot
 from egs_warp.muscles.muscle_set import MuscleSet
 
 FILE = "creature.npz"
@@ -41,10 +43,15 @@ class DrawnCreature:
     """(F,)"""
     fibre_kinds: tuple[str, ...]
     """(F,)"""
+    foot_from_node: np.ndarray
+    """(N,) int32: the foot whose sole a node belongs to, -1 for the rest."""
 
     @classmethod
-    def of(cls, splats: GaussianCloud, camera: Camera, muscles: MuscleSet) -> DrawnCreature:
-        """From what a film was drawn with."""
+    def of(cls, splats: GaussianCloud, camera: Camera, muscles: MuscleSet, feet: Sequence[Foot] = ()) -> DrawnCreature:
+        """From what a film was drawn with, and what the body stands on."""
+        foot_from_node = np.full(muscles.end_rows.shape[1], -1, np.int32)
+        for index, foot in enumerate(feet):
+            foot_from_node[foot.sole] = index
         return cls(
             splats,
             camera,
@@ -54,6 +61,7 @@ class DrawnCreature:
             muscles.fibre_from_segment,
             muscles.fibre_names,
             tuple(kind.value for kind in muscles.fibre_kinds),
+            foot_from_node,
         )
 
     def save(self, path: Path) -> None:
@@ -69,6 +77,7 @@ class DrawnCreature:
             "fibre_from_segment": self.fibre_from_segment,
             "fibre_names": np.array(self.fibre_names, dtype=np.str_),
             "fibre_kinds": np.array(self.fibre_kinds, dtype=np.str_),
+            "foot_from_node": self.foot_from_node,
         }
         with atomic_write(path) as temporary, temporary.open("wb") as stream:
             np.savez(stream, **arrays)
@@ -93,6 +102,8 @@ class DrawnCreature:
                 arrays["fibre_from_segment"],
                 tuple(map(str, arrays["fibre_names"])),
                 tuple(map(str, arrays["fibre_kinds"])),
+                # Earlier runs did not say.
+                arrays.get("foot_from_node", np.full(node_count, -1, np.int32)),
             )
         except FileNotFoundError as error:
             raise UserError(f"{path}: is missing; run egs-warp animate again, which writes it") from error

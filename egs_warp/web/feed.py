@@ -105,4 +105,4 @@ def live_camera(creature: Creature, *, size: int = 512) -> Camera:
 
 def drawn_creature(creature: Creature, splats: GaussianCloud) -> DrawnCreature:
     """``creature`` as the page draws it, of ``splats`` that were split at rest."""
-    return DrawnCreature.of(splats, live_camera(creature), creature.muscles)
+    return DrawnCreature.of(splats, live_camera(creature), creature.muscles, first_place(creature).feet())

@@ -46,7 +46,9 @@ class Recording(FinishedRun):
             "motion": report.get("motion", []),
             "notes": report.get("notes", []),
         }
-        return creature_header(facts, self.creature, self.mesh, t.node_mass, t.planes, self.deformer(), self.scene)
+        plan = {"plan": t.planned_com[self.steps].astype(np.float32)} if len(t.planned_com) else {}
+        made = (self.creature, self.mesh, t.node_mass, t.planes, self.deformer(), self.scene)
+        return creature_header(facts, *made, more=plan)
 
     def frames(self) -> Iterator[Frame]:
         """At 60 Hz."""
@@ -80,10 +82,13 @@ def creature_header(
     planes: np.ndarray,
     deformer: Deformer,
     scene: GaussianCloud | None,
+    *,
+    more: Mapping[str, np.ndarray] | None = None,
 ) -> bytes:
     """The header of a creature that is drawn as ``made``: its ``facts`` with those of muscles and camera.
 
-    ``mesh`` is the rest cage; ``planes`` (P, 4) are rows n, d; ``deformer`` carries the splats; ``scene`` is behind.
+    ``mesh`` is the rest cage; ``planes`` (P, 4) are rows n, d; ``deformer`` carries the splats; ``scene`` is behind;
+    ``more``: further arrays.
     """
     camera = made.camera
     facts = {
@@ -108,9 +113,11 @@ def creature_header(
         "muscle_end_weights": made.muscle_ends.data.astype(np.float32),
         "muscle_segments": made.muscle_segments.astype(np.int32),
         "fibre_from_segment": made.fibre_from_segment.astype(np.int32),
+        "foot_from_node": made.foot_from_node.astype(np.int32),
         "mean_tets": deformer.plan.mean_tets.numpy(),
         "arms": _arms(deformer),
         **_splat_arrays("splats", made.splats),
+        **(more or {}),
     }
     if scene is not None:
         arrays |= _splat_arrays("scene", scene)

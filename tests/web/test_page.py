@@ -144,11 +144,33 @@ def test_each_layer_shows(chromium: Any, file: str):
     page.evaluate("egs.player.seek(8)")
     page.click("[title=Layers]")
     before = _picture(page)
-    for layer in ("cage", "muscles", "contacts", "path", "ground", "splats"):
+    for layer in ("cage", "muscles", "contacts", "path", "feet", "ground", "splats"):
         page.click(f"#layer-{layer}")
         after = _picture(page)
         assert (np.abs(after - before).max(axis=-1) > 0.05).mean() > 2e-4, layer
         before = after
+    assert complaints == []
+    page.close()
+
+
+def test_a_foot_is_bright_while_the_ground_bears_it(chromium: Any, file: str):
+    page, complaints = opened(chromium, file)
+    page.evaluate("egs.setLayer('splats', false); egs.setLayer('ground', false); egs.setLayer('feet', true)")
+    green = {}
+    for carried in (True, False):
+        if not carried:
+            page.evaluate(
+                "for (const frame of egs.stages[0].source.frames)"
+                " Object.defineProperty(frame, 'contacts', { value: new Float32Array(0) })"
+            )
+        # The first state has no step before it, and so no forces.
+        page.evaluate("egs.player.seek(0); egs.player.seek(4)")
+        picture = _picture(page)
+        shown = np.abs(picture - np.array(_BACKGROUND)).max(axis=-1) > 0.05
+        assert shown.mean() > 2e-3
+        green[carried] = float((picture[..., 1] - picture[..., 2])[shown].mean())
+    # Mint against grey.
+    assert green[True] > 0.04 > green[False]
     assert complaints == []
     page.close()
 

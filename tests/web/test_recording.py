@@ -72,6 +72,15 @@ def test_what_is_written_is_read_back_by_the_documented_layout(run_folder: Path)
         np.testing.assert_allclose(force, t.contact_force[t.contact_step == step - 1].sum(axis=0), atol=1e-3)
         assert len(frame["curves"]) == len(CURVES)
     np.testing.assert_array_equal(arrays["splats_means"], recording.creature.splats.means.numpy())
+    # The plan of a jump is known from its first frame on; its one foot is what stands on the ground.
+    plan, centre = arrays["plan"], t.node_mass @ t.positions[0] / t.node_mass.sum()
+    assert plan.shape == (13, 3)
+    np.testing.assert_allclose(plan[0], centre, atol=1e-3 * t.height)
+    up = -t.gravity / np.linalg.norm(t.gravity)
+    heights = t.positions[0] @ up
+    sole = arrays["foot_from_node"] == 0
+    assert sole.sum() >= 3 and (arrays["foot_from_node"][~sole] == -1).all()
+    assert heights[sole].max() < heights.min() + 0.03 * t.height
     assert facts["title"] == "pawn \u00b7 jump"
 
 

@@ -46,7 +46,8 @@ export class Curves {
 
 function said(value: number): string {
   const size = Math.abs(value);
-  return size !== 0 && size < 1e-3 ? value.toExponential(0) : value.toFixed(size < 10 ? 2 : 0);
+  if (size !== 0 && size < 1e-3) return value.toExponential(0);
+  return value.toFixed(size < 10 ? 2 : 0).replace(/^-(0\.00)$/, "$1");
 }
 
 function plot(canvas: HTMLCanvasElement, values: number[], share: number, colour: string): void {

@@ -21,6 +21,7 @@ const LAYERS: { name: Tick; title: string; on: boolean; key: string }[] = [
   { name: "muscles", title: "Muscles", on: false, key: "5" },
   { name: "contacts", title: "Contacts and forces", on: false, key: "6" },
   { name: "path", title: "Centre of mass", on: false, key: "7" },
+  { name: "feet", title: "Feet", on: false, key: "8" },
 ];
 const PRESETS: { name: Preset; title: string }[] = [
   { name: "film", title: "Film" },

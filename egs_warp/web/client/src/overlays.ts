@@ -1,10 +1,11 @@
-// What the mechanics knows, drawn over the splats: cage, muscles, contacts, centre of mass.
+// What the mechanics knows, drawn over the splats: cage, muscles, feet, contacts, centre of mass.
 
 import * as THREE from "three";
+import { Feet } from "./feet";
 import { floatsOf, indicesOf, type Frame, type Header } from "./packets";
 import { Strokes } from "./strokes";
 
-export type Layer = "cage" | "muscles" | "contacts" | "path";
+export type Layer = "cage" | "muscles" | "feet" | "contacts" | "path";
 
 /** Three mixes in linear light. */
 const linear = (hex: number): number[] => new THREE.Color(hex).toArray();
@@ -18,6 +19,7 @@ const COLOURS = {
   cone: linear(0x7fd1b8),
   past: linear(0xc3a6ff),
   future: linear(0x6f6390),
+  plan: linear(0xf4f1e8),
   plumb: linear(0x6f7a8a),
 };
 const CONE_SIDES = 14;
@@ -26,7 +28,7 @@ const WEIGHT_LENGTH = 0.5;
 
 export class Overlays {
   readonly group = new THREE.Group();
-  private readonly strokes: Record<Layer, Strokes> = {
+  private readonly strokes: Record<Exclude<Layer, "feet">, Strokes> = {
     cage: new Strokes(1, 0.4, 10),
     muscles: new Strokes(2.5, 0.9, 11),
     contacts: new Strokes(3, 1, 14),
@@ -34,7 +36,8 @@ export class Overlays {
   };
   private readonly cones = new Strokes(1, 0.4, 13);
   private readonly middle: THREE.Mesh;
-  private readonly feet: THREE.Points;
+  private readonly points: THREE.Points;
+  private readonly feet: Feet;
   private readonly visible = new Set<Layer>();
   private readonly ends: Float32Array;
   /** Centre of mass of each frame. */
@@ -51,7 +54,7 @@ export class Overlays {
       new THREE.MeshBasicMaterial({ color: 0xf4f6fa, depthTest: false, transparent: true }),
     );
     this.middle.renderOrder = 14;
-    this.feet = new THREE.Points(
+    this.points = new THREE.Points(
       new THREE.BufferGeometry(),
       new THREE.PointsMaterial({
         color: 0x7fd1b8,
@@ -62,9 +65,10 @@ export class Overlays {
         transparent: true,
       }),
     );
-    this.feet.renderOrder = 15;
-    this.feet.frustumCulled = false;
-    this.group.add(this.middle, this.feet);
+    this.points.renderOrder = 15;
+    this.points.frustumCulled = false;
+    this.feet = new Feet(header);
+    this.group.add(this.middle, this.points, this.feet.group);
     this.ends = new Float32Array(3 * (indicesOf(header, "muscle_end_starts").length - 1));
     this.apply();
   }
@@ -79,6 +83,7 @@ export class Overlays {
   update(frame: Frame, positions: Float32Array, frames: Frame[]): void {
     if (this.visible.has("cage")) this.drawCage(positions);
     if (this.visible.has("muscles")) this.drawMuscles(frame, positions);
+    if (this.visible.has("feet")) this.feet.update(frame, positions);
     if (this.visible.has("contacts")) this.drawContacts(frame);
     if (this.visible.has("path")) this.drawPath(frame, frames);
   }
@@ -88,7 +93,8 @@ export class Overlays {
       strokes.object.visible = this.visible.has(layer as Layer);
     }
     this.middle.visible = this.visible.has("path");
-    this.feet.visible = this.cones.object.visible = this.visible.has("contacts");
+    this.feet.group.visible = this.visible.has("feet");
+    this.points.visible = this.cones.object.visible = this.visible.has("contacts");
   }
 
   private drawCage(positions: Float32Array): void {
@@ -159,7 +165,7 @@ export class Overlays {
     }
     this.strokes.contacts.set(arrows.points, arrows.colours);
     this.cones.set(cones.points, cones.colours);
-    this.feet.geometry.setAttribute("position", new THREE.Float32BufferAttribute(points, 3));
+    this.points.geometry.setAttribute("position", new THREE.Float32BufferAttribute(points, 3));
   }
 
   private drawPath(frame: Frame, frames: Frame[]): void {
@@ -168,9 +174,20 @@ export class Overlays {
     for (let k = 0; k + 1 < every.length; k++) {
       lines.add(every[k]!, every[k + 1]!, frames[k]!.time < frame.time ? COLOURS.past : COLOURS.future);
     }
+    this.addPlan(lines);
     const now = this.middle.position.copy(this.centres(frame));
     lines.add(now, now.clone().setZ(0), COLOURS.plumb);
     this.strokes.path.set(lines.points, lines.colours);
+  }
+
+  /** Dashed, where the motion had planned it. */
+  private addPlan(lines: Lines): void {
+    if (!this.header.arrays.has("plan")) return;
+    const plan = floatsOf(this.header, "plan");
+    const at = (k: number): THREE.Vector3 => new THREE.Vector3().fromArray(plan, 3 * k);
+    for (let k = 0; 3 * k + 5 < plan.length; k += 2) {
+      if (Number.isFinite(plan[3 * k]) && Number.isFinite(plan[3 * k + 3])) lines.add(at(k), at(k + 1), COLOURS.plan);
+    }
   }
 
   private remembered(frame: Frame): THREE.Vector3 {
