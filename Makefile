@@ -65,7 +65,7 @@ types: setup
 docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-# What docs/assets holds, from the built-in captures; half an hour on two cores.
+# What docs/assets holds, from the built-in captures, and the pages of the gallery, which are not in git; half an hour on two cores.
 pictures: setup
 	$(BIN)/python docs/make_pictures.py
 

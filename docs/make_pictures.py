@@ -10,14 +10,30 @@ import argparse
 import shlex
 import subprocess
 import sys
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 from imageio_ffmpeg import get_ffmpeg_exe
 from PIL import Image
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from tests.support.chromium import opened, started
+
 ROOT = Path(__file__).parents[1]
 ASSETS = ROOT / "docs" / "assets"
+RECORDED, RECORDED_RATE = (720, 360), 20
+"""Pixels of the window in which a page is recorded, and pictures a second of its run."""
+BESIDE = """() => {
+    const [stage] = egs.stages, { middle } = stage.bounds;
+    egs.player.seek(0);
+    const from = stage.middle;
+    egs.player.seek(1e6);
+    const ahead = stage.middle.sub(from).setZ(0).normalize();
+    const way = middle.clone().set(ahead.y + 0.35 * ahead.x, 0.35 * ahead.y - ahead.x, 0.3).normalize();
+    stage.look(middle.clone().addScaledVector(way, 1.0 * stage.bounds.size), middle);
+    egs.setLayer("path", true);
+}"""
 CAPTURES = "python examples/captures.py --out out/captures"
 HOP = "python examples/hop.py --hops 3 --out out/hop"
 TWIST = "python examples/twist.py --out out/twist"
@@ -45,9 +61,20 @@ class Picture:
     """Share of the height that is cut off above."""
 
 
+@dataclass(frozen=True)
+class Page:
+    """A page of docs/assets/pages, which is not in git: ``egs-warp view RUN --export``."""
+
+    run: str
+    """Folder in ``out``, and its name."""
+    command: str
+    """That makes the run."""
+
+
+PAGES = (Page("hop", HOP), Page("jump", JUMP), Page("twist", TWIST), Page("stool", WALK), Page("figurine", SCENE))
 PICTURES = (
     Picture("hop.mp4", HOP, "hop/hop.mp4", 512, sky=0.16),
-    Picture("hop_loop.webp", HOP, "hop/hop.mp4", 360, sky=0.16),
+    Picture("hop_loop.webp", HOP, "hop/page.mp4", 400),
     Picture("hop.webp", HOP, "hop/hop.mp4", 512, at=0.18, sky=0.16),
     Picture("hop_sheet.webp", HOP, "hop/sheet.png", 1200),
     Picture("jump.mp4", JUMP, "jump/jump.mp4", 400),
@@ -87,10 +114,39 @@ def seconds(film: Path) -> float:
     return 3600 * int(hours) + 60 * int(minutes) + float(rest)
 
 
+def exported(page: Page) -> Path:
+    """The ``page``, written if it is not there, and its run."""
+    folder, path = ROOT / "out" / page.run, ASSETS / "pages" / f"{page.run}.html"
+    if not (folder / "creature.npz").is_file():
+        run(page.command)
+    if not path.is_file():
+        path.parent.mkdir(exist_ok=True)
+        run(f"egs-warp view {folder} --export {path}")
+        print(f"pages/{path.name}: {path.stat().st_size / 1e6:.1f} MB")
+    return path
+
+
+def record(page: Path, film: Path) -> None:
+    """A film of what a ``page`` shows in the system's Chromium, from the side: the way of the centre of mass, too."""
+    with started() as browser, tempfile.TemporaryDirectory() as folder:
+        shown, _ = opened(browser, page.as_uri(), *RECORDED)
+        bare = "for (const part of document.querySelectorAll('.tools, .dock, figcaption')) part.style.display = 'none'"
+        shown.evaluate(f"() => {{ {bare} }}")
+        shown.evaluate(BESIDE)
+        count = shown.evaluate("egs.stages[0].source.frames.length")
+        for number, frame in enumerate(range(0, count, 60 // RECORDED_RATE)):
+            shown.evaluate("async (frame) => { egs.player.seek(frame); await egs.stages[0].settle(); }", frame)
+            shown.screenshot(path=f"{folder}/{number:04d}.png")
+        lossless = ("-c:v", "libx264", "-qp", "0", "-pix_fmt", "yuv444p")
+        ffmpeg("-framerate", str(RECORDED_RATE), "-i", f"{folder}/%04d.png", *lossless, str(film))
+
+
 def make(picture: Picture) -> None:
     """Write ``picture`` into docs/assets, running its command if its source is not there."""
     source, target = ROOT / "out" / picture.source, ASSETS / picture.name
-    if not source.is_file():
+    if source.name == "page.mp4" and not source.is_file():
+        record(exported(next(page for page in PAGES if page.command == picture.command)), source)
+    elif not source.is_file():
         run(picture.command)
     if target.suffix == ".mp4" or target.stem.endswith("_loop"):
         # The last frame is held, so that the loop has a rest.
@@ -128,10 +184,13 @@ def make(picture: Picture) -> None:
 def main() -> None:
     """Make the pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("names", nargs="*", help="of docs/assets; all without any")
+    parser.add_argument("names", nargs="*", help="of docs/assets, or NAME.html of a page; all without any")
     chosen = parser.parse_args()
     if not (ROOT / "out" / "captures").is_dir():
         run(CAPTURES)
+    for page in PAGES:
+        if not chosen.names or f"{page.run}.html" in chosen.names:
+            exported(page)
     for picture in PICTURES:
         if not chosen.names or picture.name in chosen.names:
             make(picture)

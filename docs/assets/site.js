@@ -40,3 +40,21 @@ function textsOf(element) {
   while (walker.nextNode()) texts.push(walker.currentNode);
   return texts;
 }
+
+// A page of a run takes the place of its film, unless it is asked for in a tab of its own.
+document$.subscribe(({ body }) => {
+  for (const link of body.querySelectorAll("a.in-3d")) {
+    const film = link.closest("figure")?.querySelector("video");
+    if (!film) continue;
+    link.addEventListener("click", (event) => {
+      if (event.ctrlKey || event.metaKey || event.shiftKey) return;
+      event.preventDefault();
+      const page = document.createElement("iframe");
+      page.src = link.href;
+      page.title = film.getAttribute("aria-label");
+      page.className = "in-3d";
+      film.replaceWith(page);
+      link.remove();
+    });
+  }
+});

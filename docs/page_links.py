@@ -1,0 +1,13 @@
+"""For mkdocs: links to pages that ``make pictures`` has not made are left out, so that no site has dead ones."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+_LINK = re.compile(r"^\[[^]]*\]\((assets/pages/[\w-]+\.html)\).*\n", re.MULTILINE)
+
+
+def on_page_markdown(markdown: str, files: Any, **_: Any) -> str:
+    """Called by mkdocs with the text of each page; ``files`` are those of the site."""
+    return _LINK.sub(lambda link: link[0] if files.get_file_from_path(link[1]) else "", markdown)
