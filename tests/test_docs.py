@@ -23,10 +23,11 @@ TEXTS = sorted(
     + [path for path in DOCS.rglob("*.md") if path.parent.name != "vendor"]
 )
 CITED = re.compile(r"\bdocs/[\w/]+\.md\b")
-SHOWN = re.compile(r'(?:\(|src="|poster=")((?:\.\./)?assets/[\w.]+)')
+SHOWN = re.compile(r'(?:\(|src="|poster=")((?:\.\./)?assets/[\w.]+)(?![\w./])')
 
 
-PICTURES = {picture.name: picture for picture in runpy.run_path(str(DOCS / "make_pictures.py"))["PICTURES"]}
+SCRIPT = runpy.run_path(str(DOCS / "make_pictures.py"))
+PICTURES = {picture.name: picture for picture in SCRIPT["PICTURES"]}
 
 
 def test_cited_pages_exist() -> None:
@@ -54,6 +55,24 @@ def test_every_picture_has_its_command_on_its_page(page: Path) -> None:
     for shown in SHOWN.findall(text):
         picture = PICTURES[Path(shown).name]
         assert picture.command in text, f"{page.name} shows {picture.name}, not how it is made: {picture.command}"
+
+
+def test_the_gallery_opens_the_pages_that_the_script_makes_and_has_no_dead_link() -> None:
+    text = (DOCS / "index.md").read_text()
+    linked = set(re.findall(r"assets/pages/(\w+)\.html", text))
+    assert linked == {page.run for page in SCRIPT["PAGES"]}
+    assert all(page.command in text for page in SCRIPT["PAGES"])
+    hook = runpy.run_path(str(DOCS / "page_links.py"))["on_page_markdown"]
+
+    class Files:
+        """Of a site that has one of them."""
+
+        def get_file_from_path(self, path: str) -> str | None:
+            return path if path == "assets/pages/jump.html" else None
+
+    shown = hook(text, files=Files())
+    assert re.findall(r"assets/pages/(\w+)\.html", shown) == ["jump"]
+    assert len(shown.splitlines()) == len(text.splitlines()) - len(linked) + 1
 
 
 def test_every_page_of_concepts_says_where_its_code_is() -> None:
