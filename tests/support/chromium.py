@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -45,10 +46,9 @@ def opened(chromium: Any, address: str, width: int = 480, height: int = 480) -> 
     return page, complaints
 
 
-def wait_until(page: Any, condition: str) -> None:
+def wait_until(page: Any, condition: str, *, seconds: float = 60.0) -> None:
     """Until the JavaScript ``condition`` holds; Playwright's own waiting is what the page's security policy forbids."""
-    for _ in range(1200):
-        if page.evaluate(condition):
-            return
+    end = time.monotonic() + seconds
+    while not page.evaluate(condition):
+        assert time.monotonic() < end, condition
         page.wait_for_timeout(50)
-    raise AssertionError(condition)

@@ -239,7 +239,8 @@ def test_a_click_on_the_ground_sends_it_there(chromium: Any, session: Session):
         goal = np.array(page.evaluate("egs.live.state?.goal"))
         start = np.array(page.evaluate("egs.stages[0].middle.toArray()"))[:2]
         assert np.linalg.norm(goal - start) > 0.25
-        wait_until(page, "egs.live.state?.goal === null")
+        # Some hundred steps of a walk, beside a page that is drawn on the same cores.
+        wait_until(page, "egs.live.state?.goal === null", seconds=600.0)
         assert not [line for line in page.evaluate("egs.live.told") if line.startswith("go")]
         place = session.steering.place
         feet = sole_shares(place.body, place.ground, place.standing) @ session.state.positions
