@@ -209,6 +209,23 @@ def test_a_key_makes_it_jump_and_the_take_says_so(chromium: Any, session: Sessio
 
 
 @in_browser
+@pytest.mark.parametrize(
+    ("pressed", "axes", "doing"), [([0], [0, 0], "jump"), ([], [-1, 0.2], "turn")], ids=["button", "stick"]
+)
+def test_a_gamepad_steers_it(chromium: Any, session: Session, pressed: list[int], axes: list[float], doing: str):
+    with _watched(chromium, session) as page:
+        page.evaluate(
+            """([pressed, axes]) => {
+                const buttons = Array.from({ length: 17 }, (_, k) => ({ pressed: pressed.includes(k) }));
+                const held = { mapping: "standard", buttons, axes };
+                Object.defineProperty(navigator, "getGamepads", { value: () => [null, held] });
+            }""",
+            [pressed, axes],
+        )
+        wait_until(page, f"egs.live.state?.doing === '{doing}'")
+
+
+@in_browser
 def test_what_is_shown_goes_evenly_and_never_back(chromium: Any, session: Session):
     with _watched(chromium, session) as page:
         page.keyboard.press(" ")
