@@ -49,7 +49,7 @@ class DrawnCreature:
     @classmethod
     def of(cls, splats: GaussianCloud, camera: Camera, muscles: MuscleSet, feet: Sequence[Foot] = ()) -> DrawnCreature:
         """From what a film was drawn with, and what the body stands on."""
-        foot_from_node = np.full(muscles.end_rows.shape[1], -1, np.int32)
+        foot_from_node = np.full(muscles.node_count, -1, np.int32)
         for index, foot in enumerate(feet):
             foot_from_node[foot.sole] = index
         return cls(
