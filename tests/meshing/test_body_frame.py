@@ -136,6 +136,47 @@ def test_round_bodies_face_along_what_they_have_most_of(sides: int) -> None:
     assert (facing[1] - facing[0] - 0.3 + 0.5 * step) % step - 0.5 * step == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.parametrize("sides", [3, 4, 5, 6])
+@pytest.mark.parametrize("turned", [0.0, 0.1])
+def test_a_star_is_faced_through_a_tip(sides: int, turned: float) -> None:
+    tips = turned + 2.0 * np.pi * np.arange(sides) / sides
+    star = np.concatenate([r * np.stack([np.cos(tips), np.sin(tips), 0.0 * tips], axis=1) for r in (0.5, 1.0)])
+    x = upright_frame(star, np.ones(len(star)), GROUND).axes[0]
+    step = 2.0 * np.pi / sides
+    assert (np.arctan2(x[1], x[0]) - turned + 0.5 * step) % step - 0.5 * step == pytest.approx(0.0, abs=1e-9)
+
+
+def test_corners_do_not_outweigh_a_long_side() -> None:
+    """Of a rectangle's four corners most is at its diagonals, in the fourth moment."""
+    corners = np.array([[x, y, 0.3] for x in (-0.5, 0.5) for y in (-0.6, 0.6)])
+    frame = upright_frame(corners, np.ones(4), GROUND)
+    assert np.abs(frame.axes[0]) == pytest.approx(np.array([0.0, 1.0, 0.0]), abs=1e-9)
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_long_body_is_faced_along_its_length_the_way_its_tail_points(way: float) -> None:
+    """Denser towards its other end: the third moments about its middle are those of the tail."""
+    along = way * np.linspace(0.0, 1.0, 201) ** 1.5
+    aside = np.resize([0.05, -0.05], 201)
+    points = np.column_stack([0.6 * along - 0.8 * aside, 0.8 * along + 0.6 * aside, np.full(201, 0.3)])
+    frame = upright_frame(points, np.ones(201), GROUND)
+    assert frame.axes == pytest.approx(way * np.array([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0, 0, way]]), abs=0.02)
+
+
+def test_the_origin_is_under_the_middle_and_the_unit_the_median_distance() -> None:
+    """Of points all over a sphere, whose plane lies under it and is not level."""
+    random = np.random.default_rng(0)
+    half = random.normal(size=(500, 3))
+    points = 2.0 * np.concatenate([half, -half]) / np.linalg.norm(np.concatenate([half, half]), axis=1)[:, None]
+    plane = Plane.from_coefficients(0.0, 0.6, 0.8, 5.0)
+    middle = np.array([1.0, 2.0, 3.0])
+    frame = upright_frame(points + middle, np.ones(1000), plane)
+    assert frame.scale == pytest.approx(0.5)
+    assert frame.axes[2] == pytest.approx(np.array([0.0, 0.6, 0.8]))
+    assert plane.heights(frame.origin) == pytest.approx(0.0, abs=1e-12)
+    assert np.cross(middle - frame.origin, plane.normal) == pytest.approx(np.zeros(3), abs=1e-9)
+
+
 def test_strays_do_not_turn_the_frame() -> None:
     random = np.random.default_rng(0)
     points = random.normal(size=(2000, 3)) * [1.0, 0.5, 0.8]
