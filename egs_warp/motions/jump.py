@@ -42,8 +42,8 @@ TOUCH_DOWN = 0.06
 foot."""
 LONGEST_LANDING = 9.0
 """Of sqrt(H / g): a body that is not calm by then counts as at rest."""
-USUAL_LANDING = 1.3
-"""The same, as it usually takes."""
+USUAL_LANDING, USUAL_LANDING_AHEAD = 0.7, 1.0
+"""The same, as it usually takes, and more for each body height ahead (measured on the pawn)."""
 TOUCHING_DOWN = 0.5
 """Of sqrt(H / g): the time from touch-down until balance and upright are asked for in full."""
 FLAT = 0.7
@@ -134,8 +134,9 @@ class Jump:
     @property
     def expected_time(self) -> float:
         """Seconds until it is at rest."""
-        plan = self.plan
-        return plan.crouch_time + plan.thrust_time + plan.flight_time + (SETTLING + USUAL_LANDING) * self._time_unit
+        plan, ahead = self.plan, abs(self.target.distance) / self.body.height
+        landing = USUAL_LANDING + USUAL_LANDING_AHEAD * ahead
+        return plan.crouch_time + plan.thrust_time + plan.flight_time + (SETTLING + landing) * self._time_unit
 
     @property
     def resting(self) -> bool:

@@ -18,8 +18,8 @@ from egs_warp.motions.twist import AIRBORNE_SHARE, twist
 TOLERANCE = np.radians(8.0)
 """A body that has landed this near to its angle stays."""
 MOST_JUMPS = 5
-USUAL_JUMPS = 1.3
-"""Expected for what one should do: every so many landings are further off than ``TOLERANCE``, which takes another."""
+USUAL_JUMPS = 4.0 / 3.0
+"""Expected for what one should do: so often is a landing further off than ``TOLERANCE``, which takes another."""
 PYRAMID = 0.79
 """Mean over all directions of what a friction pyramid of four edges gives of Coulomb's cone."""
 RESERVE = 0.8
