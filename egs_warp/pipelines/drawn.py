@@ -102,8 +102,7 @@ class DrawnCreature:
                 arrays["fibre_from_segment"],
                 tuple(map(str, arrays["fibre_names"])),
                 tuple(map(str, arrays["fibre_kinds"])),
-                # Earlier runs did not say.
-                arrays.get("foot_from_node", np.full(node_count, -1, np.int32)),
+                arrays["foot_from_node"],
             )
         except FileNotFoundError as error:
             raise UserError(f"{path}: is missing; run egs-warp animate again, which writes it") from error
