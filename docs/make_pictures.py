@@ -31,7 +31,7 @@ BESIDE = """() => {
     egs.player.seek(1e6);
     const ahead = stage.middle.sub(from).setZ(0).normalize();
     const way = middle.clone().set(ahead.y + 0.35 * ahead.x, 0.35 * ahead.y - ahead.x, 0.3).normalize();
-    stage.look(middle.clone().addScaledVector(way, 1.0 * stage.bounds.size), middle);
+    stage.look(middle.clone().addScaledVector(way, 1.25 * stage.bounds.size), middle);
     egs.setLayer("path", true);
 }"""
 CAPTURES = "python examples/captures.py --out out/captures"
