@@ -48,6 +48,10 @@ class Waits:
     def resting(self) -> bool:
         return self.steps >= 3
 
+    @property
+    def expected_time(self) -> float:
+        return 3.0 * DT
+
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
         self.steps += 1
         return []

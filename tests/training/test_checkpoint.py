@@ -59,6 +59,7 @@ def start() -> GaussianCloud:
 
 
 def bits(result: FinetuneResult) -> list[bytes]:
+    assert result.tones is not None
     arrays = [getattr(result.cloud, one.name).numpy() for one in fields(result.cloud)]
     return [array.tobytes() for array in (*arrays, result.losses, result.tones)]
 
