@@ -43,10 +43,7 @@ def test_it_lives_in_its_thread_while_it_is_watched(tmp_path: Path):
         _wait(session, woken, seen, lambda: any(isinstance(one, dict) and one.get("doing") == "jump" for one in seen))
         # Nobody watches: it waits where it is, and goes on from there.
         session.unwatch()
-        time.sleep(0.3)
-        held = session.state.time
-        time.sleep(0.3)
-        assert session.state.time == held
+        held = _held(session)
         session.watch(woken.set)
         seen = session.waiting()
         assert isinstance(seen[0], Frame) and seen[0].time == held
@@ -54,6 +51,7 @@ def test_it_lives_in_its_thread_while_it_is_watched(tmp_path: Path):
         _wait(session, woken, seen, rested)
         assert [entry.name for entry in session.steering.begun] == ["jump"]
         end = session.state.time
+        assert end > held, "it went on to the end with nobody watching"
         time.sleep(0.2)
         assert session.state.time == end, "a body at rest is stepped"
     finally:
@@ -61,6 +59,16 @@ def test_it_lives_in_its_thread_while_it_is_watched(tmp_path: Path):
     assert not [one for one in threading.enumerate() if one.name == "session"]
     times = [one.time for one in seen if isinstance(one, Frame)]
     assert np.diff(times).min() >= 0.0 and max(np.diff(times)) == pytest.approx(1.0 / 60.0)
+
+
+def _held(session: Session) -> float:
+    """Seconds of its state, once the step that was under way is done: a busy core takes its time over one."""
+    for _ in range(30):
+        before = session.state.time
+        time.sleep(1.0)
+        if session.state.time == before:
+            return before
+    raise AssertionError("it goes on with nobody watching")
 
 
 def test_a_pause_holds_it_and_a_step_is_one_step(tmp_path: Path):
