@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import pytest
 
 from egs_warp.errors import UserError
 from egs_warp.io.named_files import check_named_files, named_files
+from tests.support.two_runs import told_elsewhere
 
 
 def write(*paths: Path, text: str, overwrite: bool = False) -> None:
@@ -41,27 +41,13 @@ def test_a_run_that_fails_before_its_first_file_leaves_the_earlier_one(tmp_path:
     assert path.read_text() == "1" and os.listdir(tmp_path) == ["a.ply"]
 
 
-def _try(path: Path, said: multiprocessing.Queue) -> None:
-    try:
-        with named_files(path):
-            said.put("free")
-    except UserError as error:
-        said.put(str(error))
-
-
 def test_two_runs_at_once(tmp_path: Path) -> None:
     """One name at a time; another name in the same folder is free."""
-    context = multiprocessing.get_context("spawn")
-    said = context.Queue()
     with named_files(tmp_path / "a.ply"):
-        for name in ("a.ply", "b.ply"):
-            other = context.Process(target=_try, args=(tmp_path / name, said))
-            other.start()
-            other.join(60)
-        assert said.get(timeout=5) == (
+        assert told_elsewhere(named_files, tmp_path / "a.ply") == (
             f"{tmp_path / 'a.ply'}: another run is writing this file; wait for it, or choose another name"
         )
-        assert said.get(timeout=5) == "free"
+        assert told_elsewhere(named_files, tmp_path / "b.ply") is None
     assert os.listdir(tmp_path) == []
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import multiprocessing
 import os
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import pytest
 
 from egs_warp.errors import UserError
 from egs_warp.io.run_folder import MANIFEST, check_run_folder, run_folder
+from tests.support.two_runs import told_elsewhere
 
 
 def finished(folder: Path, **files: str) -> None:
@@ -104,22 +104,9 @@ def test_files_of_nobody_are_not_overwritten(tmp_path: Path) -> None:
     assert (tmp_path / "earlier-1" / "a.txt").read_text() == "precious"
 
 
-def _try(folder: Path, said: multiprocessing.Queue) -> None:
-    try:
-        with run_folder(folder):
-            said.put("free")
-    except UserError as error:
-        said.put(str(error))
-
-
 def test_two_runs_at_once(tmp_path: Path) -> None:
-    context = multiprocessing.get_context("spawn")
-    said = context.Queue()
     with run_folder(tmp_path):
-        other = context.Process(target=_try, args=(tmp_path, said))
-        other.start()
-        other.join(60)
-        assert said.get(timeout=5) == (
+        assert told_elsewhere(run_folder, tmp_path) == (
             f"{tmp_path}: another run is writing into this folder; wait for it, or choose another folder"
         )
     with run_folder(tmp_path):
