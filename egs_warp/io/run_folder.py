@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -128,8 +128,7 @@ def run_folder(
     (``overwrite``); of a run that goes on (``resume``), where there is none, or none that was cut off.
     """
     if isinstance(out, RunFolder):
-        with nullcontext():
-            yield out
+        yield out
         return
     _check(out, overwrite=overwrite, resume=resume)
     folder = writable_folder(out)
