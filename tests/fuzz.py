@@ -12,7 +12,6 @@ import json
 import math
 import os
 import random
-import resource
 import subprocess
 import sys
 import tempfile
@@ -22,6 +21,8 @@ from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+
+from tests.support.memory import peak_bytes
 
 CORPUS = Path(__file__).parent / "corpus"
 _MEMORY = 256
@@ -188,7 +189,7 @@ def _keep(name: str, data: bytes) -> None:
 
 def _peak() -> int:
     """MiB that this process has held at most."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+    return peak_bytes() // 2**20
 
 
 if __name__ == "__main__":

@@ -137,11 +137,18 @@ class _Asset:
             )
         attributes = primitive["attributes"]
 
-        def of(name: str) -> np.ndarray:
-            return self._accessor(attributes[name])
+        count = len(self._accessor(attributes["POSITION"]))
 
-        means = of("POSITION")
-        opacity = of(f"{EXTENSION}:OPACITY")[:, 0].astype(np.float64)
+        def of(name: str, width: int = 3) -> np.ndarray:
+            values = self._accessor(attributes[name])
+            if values.shape != (count, width):
+                rows, columns = values.shape
+                raise UserError(
+                    f"{self.source}: {name} is {rows} x {columns} numbers, not {count} x {width}; export it again"
+                )
+            return values
+
+        opacity = of(f"{EXTENSION}:OPACITY", 1)[:, 0].astype(np.float64)
         scales = of(f"{EXTENSION}:SCALE").astype(np.float64)
         sh = [of(f"{EXTENSION}:SH_DEGREE_0_COEF_0")]
         for degree in (1, 2, 3):
@@ -153,8 +160,8 @@ class _Asset:
             logits = np.clip(np.log(opacity) - np.log1p(-opacity), -EXTREME_LOGIT, EXTREME_LOGIT)
             log_scales = np.log(np.maximum(scales, np.finfo(np.float32).tiny))
         return {
-            "means": means,
-            "rotations": of(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]],
+            "means": of("POSITION"),
+            "rotations": of(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]],
             "log_scales": log_scales.astype(np.float32),
             "opacity_logits": logits.astype(np.float32),
             "sh": np.stack(sh, axis=1),

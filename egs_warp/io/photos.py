@@ -156,11 +156,13 @@ def _pixels(image: Path, how: int) -> np.ndarray | None:
     with open(image, "rb") as file:
         left = os.fstat(file.fileno()).st_size - len(_PNG)
         if file.read(len(_PNG)) == _PNG:
-            while (start := file.read(8)) and len(start) == 8 and start[4:] != b"IEND":
+            while len(start := file.read(8)) == 8:
                 length = int.from_bytes(start[:4], "big")
                 left -= _CHUNK + length
                 if left < 0:
                     raise UserError(f"{image}: the picture is cut short; copy it again")
+                if start[4:] == b"IEND":
+                    break
                 file.seek(length + 4, os.SEEK_CUR)
     return cv2.imread(str(image), how)
 

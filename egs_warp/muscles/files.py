@@ -190,7 +190,7 @@ def _check(path: Path, fibres: list[Fibre], mesh: TetMesh, frame: BodyFrame) -> 
         names.add(fibre.name)
         distances = np.linalg.norm(fibre.points[:, None] - mesh.nodes[None], axis=2).min(axis=1)
         worst = int(np.argmax(distances))
-        if distances[worst] > reach:
+        if not distances[worst] <= reach:
             x, y, z = frame.capture_points(fibre.points[worst])
             raise UserError(
                 f"{where}: the point [{x:g}, {y:g}, {z:g}] is {distances[worst] / frame.scale:.3g} units away"
@@ -223,10 +223,12 @@ def _point(where: str, entry: dict[str, Any], key: str) -> np.ndarray:
 
 def _direction(where: str, entry: dict[str, Any], key: str) -> np.ndarray:
     value = _point(where, entry, key)
-    length = float(np.linalg.norm(value))
-    if length == 0.0:
+    largest = np.abs(value).max()
+    if largest == 0.0:
         raise UserError(f'{where}: "{key}" is zero; give a direction [x, y, z]')
-    return value / length
+    # The square of a large number has no double.
+    value = value / largest
+    return value / np.linalg.norm(value)
 
 
 def _positive(where: str, entry: dict[str, Any], key: str, default: float | None) -> float:
