@@ -83,6 +83,7 @@ def ended_by(arguments: Sequence[str], number: int, ready: Path, after: float) -
     return run.returncode, said
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_again_and_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Before it has a part, between parts, in the film; by SIGKILL and by Ctrl-C. What nothing ends runs in this
     process.

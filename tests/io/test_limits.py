@@ -7,10 +7,8 @@ import io
 import json
 import os
 import struct
-import subprocess
-import sys
-import textwrap
 import zipfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +26,13 @@ from egs_warp.io.photos import read_photo
 from egs_warp.io.planes import read_planes
 from egs_warp.io.writing import WRITERS, writer_of
 from tests.support.captures import good_bytes, message, written
+from tests.support.memory import megabytes_of
 
 HUGE = (13_300, 13_300)
 """177 megapixels, just below Pillow's own bound."""
+
+
+read_on_cpu = partial(read_capture, device="cpu")
 
 
 def members(name: str = "a.sog") -> dict[str, bytes]:
@@ -51,28 +53,6 @@ def large_png(path: Path, size: tuple[int, int] = HUGE) -> Path:
     return path
 
 
-def peak_megabytes(code: str, *arguments: str) -> float:
-    """Memory that ``code`` takes beyond its imports, in a process of its own; it must end in ``UserError``."""
-    program = f"""
-        import sys
-        import numpy, warp, cv2, PIL.Image, PIL.WebPImagePlugin, PIL.PngImagePlugin
-        from egs_warp.errors import UserError
-        from egs_warp.io import read_capture
-        from egs_warp.commands.object_flag import read_mask
-        warp.config.log_level = warp.LOG_ERROR
-        warp.init()
-        from tests.support.memory import peak_bytes, reset_peak
-        reset_peak()
-        before = peak_bytes()
-        try:
-            {code}
-        except UserError as error:
-            print((peak_bytes() - before) / 2**20)
-    """
-    run = [sys.executable, "-c", textwrap.dedent(program), *arguments]
-    return float(subprocess.run(run, capture_output=True, text=True, check=True).stdout)
-
-
 def test_pictures_larger_than_the_gaussians_need(tmp_path: Path) -> None:
     """A .sog of 1.6 kB whose pictures hold 177 megapixels each."""
     data = io.BytesIO()
@@ -81,7 +61,7 @@ def test_pictures_larger_than_the_gaussians_need(tmp_path: Path) -> None:
     files |= {name: data.getvalue() for name in files if name.endswith(".webp")}
     path = written(tmp_path / "a.sog", zipped(files))
     assert message(path) == ("means_l.webp has 8192 x 4096 pixels; at most 32768 a side and 4110 in all are read")
-    assert peak_megabytes("read_capture(sys.argv[1], device='cpu')", str(path)) < 16
+    assert megabytes_of(read_on_cpu, path) < 16
 
 
 def test_more_gaussians_than_the_pictures_can_hold(tmp_path: Path) -> None:
@@ -102,7 +82,7 @@ def test_what_a_zip_does_not_name_is_not_inflated(tmp_path: Path) -> None:
     named["means_l.webp"] += bytes(64 << 20)
     path = written(tmp_path / "b.sog", zipped(named))
     assert "means_l.webp inflates from" in message(path)
-    assert peak_megabytes("read_capture(sys.argv[1], device='cpu')", str(path)) < 16
+    assert megabytes_of(read_on_cpu, path) < 16
     path = written(tmp_path / "c.sog", zipped(members() | {"meta.json": bytes(LARGEST_TEXT + 1)}))
     assert "meta.json inflates from" in message(path)
 
@@ -112,7 +92,7 @@ def test_a_small_spz_of_many_gaussians(tmp_path: Path) -> None:
     header = struct.pack("<IIIBBBB", 0x5053474E, 2, count, 0, 12, 0, 0)
     path = written(tmp_path / "a.spz", gzip.compress(header + bytes(20 << 20)))
     assert message(path).startswith(f"it says that it has {count} Gaussians, in ")
-    assert peak_megabytes("read_capture(sys.argv[1], device='cpu')", str(path)) < 16
+    assert megabytes_of(read_on_cpu, path) < 16
 
 
 def test_positions_without_a_whole_part(tmp_path: Path) -> None:
@@ -158,7 +138,7 @@ def test_masks_are_measured_before_they_are_decoded(tmp_path: Path) -> None:
     path = large_png(tmp_path / "mask.png", (14_000, 14_000))
     with pytest.raises(UserError, match=r"mask\.png: it has more than 178956970 pixels; make it smaller"):
         read_mask(path)
-    assert peak_megabytes("read_mask(sys.argv[1])", str(path)) < 16
+    assert megabytes_of(read_mask, path) < 16
 
 
 def test_a_mask_of_a_photo_is_measured_first(tmp_path: Path) -> None:
@@ -257,7 +237,7 @@ def test_a_text_ply_takes_little_more_than_its_numbers(tmp_path: Path) -> None:
     header += "".join(f"property float {name}\n" for name in names).encode() + b"end_header\n"
     path = written(tmp_path / "a.ply", header + b"1\n" * 2_000_000)
     assert message(path).startswith("truncated: element vertex needs 1 lines, found 0")
-    assert peak_megabytes("read_capture(sys.argv[1], device='cpu')", str(path)) < 4 * 4 + 16
+    assert megabytes_of(read_on_cpu, path) < 4 * 4 + 16
 
 
 @pytest.mark.parametrize("ending", [ending for ending, _ in WRITERS.values()])
@@ -275,9 +255,8 @@ def test_a_valid_capture_takes_four_times_its_file_and_six_times_what_it_becomes
     )
     path = tmp_path / f"a{ending}"
     writer_of(path)(path, cloud)
-    code = "read_capture(sys.argv[1], device='cpu'); raise UserError('read')"
     room = (4 * path.stat().st_size + 6 * count * 14 * 4) / 2**20
-    assert 2.0 < peak_megabytes(code, str(path)) < room
+    assert 2.0 < megabytes_of(read_on_cpu, path) < room
 
 
 def test_two_elements_of_one_name(tmp_path: Path) -> None:

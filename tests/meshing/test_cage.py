@@ -228,8 +228,8 @@ def test_where_tetwild_fails_the_lattice_stands_in(monkeypatch: pytest.MonkeyPat
 @example(306295, 0.09375)
 @given(st.integers(0, 10**6), st.floats(0.08, 0.16))
 def test_stuffing_quality(seed: int, cell: float) -> None:
-    """Any smooth solid: closed surface, flat floor, no angle below 10.7 degrees as in the paper (7 at the floor, where halves of
-    lattice tetrahedra lie; of 6,400 solids one had less than 9.9), volume that of the level set.
+    """Any smooth solid: closed surface, flat floor, volume of the level set, no angle below the paper's 10.7 degrees;
+    at the floor, where halves of lattice tetrahedra lie, none below 7 (of 6,400 solids one had less than 9.9).
     """
     random = np.random.default_rng(seed)
     axes, centre = random.uniform(0.3, 0.5, 3), np.array([0.0, 0.0, 0.31]) + random.uniform(-0.05, 0.05, 3)

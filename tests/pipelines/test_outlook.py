@@ -26,7 +26,7 @@ def _told(text: str, frames: int | None = None) -> np.ndarray:
     "text",
     [
         "jump",
-        "hop x2 0.4 0.2",
+        pytest.param("hop x2 0.4 0.2", marks=pytest.mark.slow),
         pytest.param("twist 60", marks=pytest.mark.slow),
         pytest.param("twist 180", marks=pytest.mark.slow),
         pytest.param("walk 0.2", marks=pytest.mark.slow),

@@ -123,6 +123,7 @@ def test_the_parts_of_earlier_steps_are_animated(
     np.testing.assert_allclose(told["plane"].normal, prepared.plane.normal, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_ground_that_is_not_flat_goes_along_with_the_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Measured, told, written beside the plane, read again and handed to the animation; ``--flat`` keeps to the plane;
     and the object settles on it where it stood.

@@ -90,6 +90,7 @@ def test_a_body_with_feet_walks_there():
     assert steering.queued == "walk"
 
 
+@pytest.mark.slow
 def test_a_click_sends_it_there(tmp_path: Path):
     played = Played(coarse_pawn(), tmp_path)
     body = played.session.creature.body
