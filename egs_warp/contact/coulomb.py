@@ -8,6 +8,9 @@ import warp as wp
 
 from egs_warp.kernels.contact.coulomb import gauss_seidel_kernel
 
+_LENGTHS = 0.5 ** np.arange(10.0)[:, None, None]
+"""Shares of a Newton step that are tried."""
+
 
 def coulomb_forces(
     delassus: np.ndarray,
@@ -29,42 +32,44 @@ def coulomb_forces(
     count = len(shift)
     if count == 0:
         return start, 0.0
-    blocks = delassus.reshape(count, 3, count, 3)[np.arange(count), :, np.arange(count), :]
-    rate = 1.0 / np.einsum("nii->n", blocks) * 3.0
+    rate = 3.0 / delassus.diagonal().reshape(count, 3).sum(axis=1)[:, None]
     force = start.copy()
 
-    def residual(f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def velocity_of(f: np.ndarray) -> np.ndarray:
         velocity = (free_velocity + delassus @ f.ravel()).reshape(count, 3)
         velocity[:, 0] += shift
-        return f - _project(f - rate[:, None] * velocity, f[:, 0], friction), velocity
+        return velocity
 
-    def size(value: np.ndarray) -> float:
-        return float(np.abs(value / rate[:, None]).max(initial=0.0))
+    def residual(f: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        return f - _project(f - rate * velocity, f[..., 0], friction)
 
     best, best_size = force, np.inf
     for attempt in range(4):
         force = _swept(delassus, free_velocity, shift, friction, force, sweeps=3 + 60 * attempt)
-        value, velocity = residual(force)
+        velocity = velocity_of(force)
+        value = residual(force, velocity)
         for _ in range(iteration_limit):
-            current = size(value)
+            current = float(np.abs(value / rate).max())
             if current < best_size:
                 best, best_size = force, current
             if current < tolerance:
                 break
             jacobian = _projection_jacobian(delassus, rate, force, velocity, friction)
             step = _newton_step(jacobian, -value.ravel()).reshape(count, 3)
-            length = 1.0
-            while length > 1e-3:
-                trial = force + length * step
-                trial_value, trial_velocity = residual(trial)
-                if np.linalg.norm(trial_value / rate[:, None]) < (1.0 - 1e-4 * length) * np.linalg.norm(
-                    value / rate[:, None]
-                ):
+            change = (delassus @ step.ravel()).reshape(count, 3)
+            # All lengths at once where the whole step will not do.
+            for lengths in (_LENGTHS[:1], _LENGTHS[1:]):
+                trials = force + lengths * step
+                velocities = velocity + lengths * change
+                values = residual(trials, velocities)
+                sizes = np.linalg.norm((values / rate).reshape(len(lengths), -1), axis=1)
+                enough = sizes < (1.0 - 1e-4 * lengths.ravel()) * np.linalg.norm(value / rate)
+                if enough.any():
                     break
-                length *= 0.5
             else:
                 break
-            force, value, velocity = trial, trial_value, trial_velocity
+            longest = int(np.argmax(enough))
+            force, value, velocity = trials[longest], values[longest], velocities[longest]
         if best_size < tolerance:
             break
         force = best
@@ -85,11 +90,12 @@ def _newton_step(jacobian: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def _project(force: np.ndarray, normal: np.ndarray, friction: float) -> np.ndarray:
+    """Forces (..., 3) with the normal part at least 0 and the tangential part at most ``friction`` x ``normal``."""
     projected = force.copy()
-    projected[:, 0] = np.maximum(force[:, 0], 0.0)
+    projected[..., 0] = np.maximum(force[..., 0], 0.0)
     radius = friction * np.maximum(normal, 0.0)
-    length = np.linalg.norm(force[:, 1:], axis=1)
-    projected[:, 1:] *= np.where(length > radius, radius / np.where(length > 0, length, 1.0), 1.0)[:, None]
+    length = np.hypot(force[..., 1], force[..., 2])
+    projected[..., 1:] *= np.where(length > radius, radius / np.where(length > 0, length, 1.0), 1.0)[..., None]
     return projected
 
 
@@ -117,7 +123,7 @@ def _projection_jacobian(
 ) -> np.ndarray:
     """Derivative (3n, 3n) of ``force`` - its projection, row by row as each contact separates, sticks or slides."""
     count = len(force)
-    trial = force - rate[:, None] * velocity
+    trial = force - rate * velocity
     moved = np.eye(3 * count) - np.repeat(rate, 3)[:, None] * delassus
     moved = moved.reshape(count, 3, 3 * count)
     length = np.linalg.norm(trial[:, 1:], axis=1)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy.linalg as dense
 from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.body import BodyState, SoftBody
@@ -121,12 +122,11 @@ class StepProblem:
             through = factors.solve(across)
             small = across.T @ through
             small[np.diag_indices_from(small)] += 1.0 / (self.dt**2 * rates)
-            small = 0.5 * (small + small.T)
             # Haynsworth: negative eigenvalues of the sum = those of S + positive ones of the small matrix - pulling
             # directions.
-            positive = int((np.linalg.eigvalsh(small) > 0.0).sum())
+            positive, inverse = _inverse(small)
             if factors.negative_pivots + positive == int((rates > 0.0).sum()):
-                return Tangent(self, factors, across, through, np.linalg.inv(small))
+                return Tangent(self, factors, across, through, inverse)
         if not definite:
             factors.update(self._entries(velocities, projected=True))
         if not factors.ready:
@@ -141,6 +141,21 @@ class StepProblem:
         entries = assembly.hessian_entries(end, self.damping, factor=self.dt**2, projected=projected)
         entries[assembly.diagonal_entries] += (1.0 + self.dt * self.drag) * np.repeat(self.body.node_mass, 3)
         return entries
+
+
+def _inverse(symmetric: np.ndarray) -> tuple[int, np.ndarray]:
+    """How many eigenvalues of the lower triangle's matrix (n, n) are positive, and its inverse, from one
+    Bunch-Kaufman factorisation; not finite where the matrix is singular.
+    """
+    factor, invert = dense.get_lapack_funcs(("sytrf", "sytri"), (symmetric,))
+    factors, pivots, info = factor(symmetric, lower=1)
+    if info > 0:
+        return -1, np.full_like(symmetric, np.nan)
+    # A block of two, marked by negative pivots, has an eigenvalue of each sign.
+    positive = int((factors.diagonal()[pivots > 0] > 0.0).sum()) + int((pivots < 0).sum()) // 2
+    inverse, _ = invert(factors, pivots, lower=1)
+    lower = np.tril(inverse, -1)
+    return positive, lower + lower.T + np.diag(inverse.diagonal())
 
 
 @dataclass(frozen=True)

@@ -93,8 +93,8 @@ EQUATIONS: dict[int, Mutation] = {
         (
             *(11, "Coulomb's limit", "contact/coulomb.py"),
             *(
-                "projected[:, 1:] *= np.where(length > radius, radius / np.where(length > 0, length, 1.0), 1.0)",
-                "projected[:, 1:] *= np.ones(len(length))",
+                "projected[..., 1:] *= np.where(length > radius, radius / np.where(length > 0, length, 1.0), 1.0)",
+                "projected[..., 1:] *= np.ones(length.shape)",
             ),
             "contact/test_coupled_step.py::test_foreseen_forces_press_and_rub_no_more_than_they_may",
         ),

@@ -27,8 +27,8 @@ SURVIVORS: list[Survivor] = [
     ),
     Survivor(
         "contact/coulomb.py",
-        "if np.linalg.norm(trial_value / rate[:, None]) < (1.0 - 1e-4 * length) * np.linalg.norm(",
-        "if np.linalg.norm(trial_value / rate[:, None]) < (1.0 + 1e-4 * length) * np.linalg.norm(",
+        "enough = sizes < (1.0 - 1e-4 * lengths.ravel()) * np.linalg.norm(value / rate)",
+        "enough = sizes < (1.0 + 1e-4 * lengths.ravel()) * np.linalg.norm(value / rate)",
         "a step that is worse by a ten-thousandth is gone on from, but the best forces so far are what comes out",
     ),
     Survivor(
