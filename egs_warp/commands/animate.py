@@ -187,7 +187,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
     )
     with run_folder(chosen.out, overwrite=chosen.overwrite, resume=chosen.resume) as run:
         run.begin_with(lambda: write_config(run.file(NAME), chosen, chosen.parser))
-        scene = given.prepared(options, progress=lambda stage: say(f"{stage} ..."))
+        scene = given.prepared(options)
         # Whatever goes wrong later, the minutes that these took are not lost.
         scene.write(run)
         pictures = _write_pictures(run, given, scene)

@@ -50,6 +50,7 @@ def _inpaint(chosen: argparse.Namespace) -> int:
     from egs_warp.io import read_capture, write_ply
     from egs_warp.io.named_files import check_named_files, named_files
     from egs_warp.io.video import write_png
+    from egs_warp.pipelines.progress import scene_bar
 
     given = {"steps": chosen.steps, "margin": chosen.margin, "seed": chosen.seed}
     options = InpaintOptions(**{name: value for name, value in given.items() if value is not None})
@@ -75,7 +76,9 @@ def _inpaint(chosen: argparse.Namespace) -> int:
     hole = _hole(chosen, plane, recorded, background.cloud)
     assert hole is not None, "one of them was given"
     with named_files(chosen.out, picture, overwrite=chosen.overwrite) as files:
-        result = inpaint(background.cloud, hole, inpainter=inpainter, options=options)
+        with scene_bar({"inpaint": options.steps > 0}) as told:
+            painted = lambda done: told("inpaint", done)  # noqa: E731
+            result = inpaint(background.cloud, hole, inpainter=inpainter, options=options, progress=painted)
         compared = before_and_after(result)
         files.begin()
         write_ply(chosen.out, result.cloud)

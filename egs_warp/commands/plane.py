@@ -33,6 +33,7 @@ def _plane(chosen: argparse.Namespace) -> int:
     from egs_warp.io.run_folder import check_run_folder, run_folder
     from egs_warp.io.video import write_png
     from egs_warp.pipelines.pictures import picture_cameras, plane_picture
+    from egs_warp.pipelines.progress import scene_bar
 
     if not (chosen.object or chosen.plane_mask):
         raise UserError("plane: give --object, or --plane-mask with --cameras")
@@ -41,7 +42,9 @@ def _plane(chosen: argparse.Namespace) -> int:
     check_run_folder(chosen.out, overwrite=chosen.overwrite, writes=_writes(chosen))
     given = read_scene(chosen)
     with run_folder(chosen.out, command="plane", overwrite=chosen.overwrite) as run:
-        found = planes_of_scene(given, plane_mask=chosen.plane_mask, view=chosen.view, count=chosen.count)
+        with scene_bar({"plane": True}) as told:
+            told("plane", 0.0)
+            found = planes_of_scene(given, plane_mask=chosen.plane_mask, view=chosen.view, count=chosen.count)
         for note in (*given.notes, *found.notes):
             say(note)
         cameras = picture_cameras(found.planes[0], found.centre, found.size, given.cameras)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,21 +50,25 @@ class SceneInput:
         """The capture's own."""
         return [one.camera for one in self.posed]
 
-    def prepared(self, options: SceneOptions, *, progress: Callable[[str], None] = lambda stage: None) -> PreparedScene:
-        """Taken apart, fine-tuned against the photos beside the cameras where there are any: ``prepare_scene``."""
+    def prepared(self, options: SceneOptions) -> PreparedScene:
+        """Taken apart, fine-tuned against the photos beside the cameras where there are any: ``prepare_scene``, with a
+        bar.
+        """
         from egs_warp.pipelines.prepare_scene import prepare_scene
+        from egs_warp.pipelines.progress import scene_bar
         from egs_warp.training.photo_colours import photographs_in_colours_of
 
-        return prepare_scene(
-            self.cloud,
-            self.object,
-            cameras=self.cameras,
-            photographs=photographs_in_colours_of(self.cloud, self.posed),
-            up=self.up,
-            plane=self.plane,
-            options=options,
-            progress=progress,
-        )
+        with scene_bar(options.stages) as told:
+            return prepare_scene(
+                self.cloud,
+                self.object,
+                cameras=self.cameras,
+                photographs=photographs_in_colours_of(self.cloud, self.posed),
+                up=self.up,
+                plane=self.plane,
+                options=options,
+                progress=told,
+            )
 
 
 def plane_of(text: str) -> Plane:

@@ -58,6 +58,8 @@ _SHRED = 0.15
 """Of the hole's area: floor that the hole encloses is given up if it is smaller."""
 _LEASH = 4.0
 """Weight of the squared distance of a Gaussian's colour from what was painted there."""
+_PAINTING = 0.5
+"""Share of the time that is over when training begins."""
 
 
 @dataclass(frozen=True)
@@ -109,11 +111,12 @@ def inpaint(
     *,
     inpainter: Inpainter | None = None,
     options: InpaintOptions | None = None,
-    progress: Callable[[int, float], None] | None = None,
+    progress: Callable[[float], None] = lambda done: None,
 ) -> InpaintResult:
     """Close ``hole`` in the floor of ``background`` (scene units); what lies in it or just above and below is replaced.
 
-    Raises ``UserError`` for a hole that is off the floor or that leaves nothing of the floor to learn from.
+    ``progress`` is told about which share of the time is over. Raises ``UserError`` for a hole that is off the floor or
+    that leaves nothing of the floor to learn from.
     """
     options = options or InpaintOptions()
     inpainter = inpainter or PatchSynthesis(seed=options.seed, device=str(background.device))
@@ -143,7 +146,9 @@ def inpaint(
         device=str(background.device),
     )
     if options.steps > 0:
-        new = _trained(kept, new, window, grown, painted, thickness, options, progress)
+        progress(_PAINTING)
+        trained = lambda step, _: progress(_PAINTING + (1.0 - _PAINTING) * (step + 1) / options.steps)  # noqa: E731
+        new = _trained(kept, new, window, grown, painted, thickness, options, trained)
     clock.lap("train")
     floor = near_plane(kept, window.plane, thickness) & (kept.opacities() > _SOLID)
     new = with_gloss(new, kept.subset(floor), window)
@@ -231,7 +236,7 @@ def _trained(
     painted: np.ndarray,
     thickness: float,
     options: InpaintOptions,
-    progress: Callable[[int, float], None] | None,
+    progress: Callable[[int, float], None],
 ) -> GaussianCloud:
     """``new`` after training against the inpainted picture, between what lies around the hole; degree 0."""
     try:

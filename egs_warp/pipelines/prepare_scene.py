@@ -51,6 +51,18 @@ class SceneOptions:
     """None: patch synthesis."""
     clearing_options: ClearingOptions = field(default_factory=ClearingOptions)
 
+    @property
+    def method(self) -> Clearing:
+        """How the object is cleared of the plane."""
+        return self.clearing or (Clearing.FINETUNE if has_torch() else Clearing.SPLIT)
+
+    @property
+    def stages(self) -> dict[str, bool]:
+        """Names of what ``prepare_scene`` will do, in its order, and whether all of it, training included."""
+        asked = {"plane": True, "ground": not self.flat, "segment": True, "inpaint": self.inpaint}
+        whole = {"segment": self.method is Clearing.FINETUNE, "inpaint": has_torch()}
+        return {name: whole.get(name, True) for name, wanted in asked.items() if wanted}
+
 
 @dataclass(frozen=True)
 class PreparedScene:
@@ -97,31 +109,34 @@ def prepare_scene(
     up: np.ndarray | None = None,
     plane: Plane | None = None,
     options: SceneOptions | None = None,
-    progress: Callable[[str], None] = lambda stage: None,
+    progress: Callable[[str, float], None] = lambda stage, done: None,
 ) -> PreparedScene:
     """Everything between a capture and its animation: plane, segmentation, clearing of the plane, inpainting.
 
     ``cameras`` are the capture's own, if known; ``photographs`` of the whole scene take the place of renders in the
     fine-tune at the plane; ``up`` (3,) is roughly up, and guessed if not given; ``progress`` is
-    told the name of each stage. Raises ``UserError`` as the stages do.
+    told the name of each stage and the share of it that is done. Raises ``UserError`` as the stages do.
     """
     options = options or SceneOptions()
-    progress("plane")
+    progress("plane", 0.0)
     located = locate_plane(cloud, spec, cameras=cameras, up=up, plane=plane)
     if not options.flat:
-        progress("ground")
+        progress("ground", 0.0)
         located = on_its_ground(cloud, located, spec, cameras)
-    progress("segment")
-    thing, bare, notes = take_apart(cloud, located, options, photographs)
+    progress("segment", 0.0)
+    thing, bare, notes = take_apart(
+        cloud, located, options, photographs, progress=lambda done: progress("segment", done)
+    )
     filled, hole = None, hole_under(cloud, located.plane, located.segmentation)
     if options.inpaint:
-        progress("inpaint")
+        progress("inpaint", 0.0)
         # torch may be missing, and with it the training that inpainting ends with.
         from egs_warp.inpainting.inpaint import InpaintOptions, inpaint
 
-        steps = {} if has_torch() else {"steps": 0}
+        chosen = InpaintOptions() if has_torch() else InpaintOptions(steps=0)
+        painted = lambda done: progress("inpaint", done)  # noqa: E731
         try:
-            filled = inpaint(bare, hole, inpainter=options.inpainter, options=InpaintOptions(**steps))
+            filled = inpaint(bare, hole, inpainter=options.inpainter, options=chosen, progress=painted)
             notes = (*notes, *filled.notes)
         except UserError as error:
             # A floor with a hole is worth more than no animation.
@@ -135,10 +150,13 @@ def take_apart(
     located: LocatedPlane,
     options: SceneOptions,
     photographs: Sequence[TrainingView] | None = None,
+    *,
+    progress: Callable[[float], None] = lambda done: None,
 ) -> tuple[GaussianCloud, GaussianCloud, tuple[str, ...]]:
-    """Object, clear of the plane; background with a hole; and what there is to say."""
-    found = located.segmentation
-    method = options.clearing or (Clearing.FINETUNE if has_torch() else Clearing.SPLIT)
+    """Object, clear of the plane; background with a hole; and what there is to say. ``progress`` is told the share of
+    the fine-tune that is done.
+    """
+    found, method = located.segmentation, options.method
     untouched, ground = cloud.subset(found.object_mask), located.ground
     if ground is not None:
         # Where the ground is the plane, what stands on it can be cleared of the plane.
@@ -153,6 +171,7 @@ def take_apart(
         views=photographs or None,
         surroundings=cloud.subset(~found.object_mask) if photographs else None,
         options=options.clearing_options,
+        progress=lambda step, _: progress((step + 1) / options.clearing_options.iterations),
     )
     closed = ()
     if ground is not None:

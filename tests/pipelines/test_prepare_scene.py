@@ -200,14 +200,16 @@ def test_an_animation_that_fails_loses_none_of_the_parts(
 
 def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:
     cloud, _ = ball_on_floor()
-    stages: list[str] = []
+    told: list[tuple[str, float]] = []
+    options = SceneOptions(clearing=Clearing.SPLIT, inpaint=False)
     prepared = prepare_scene(
         cloud,
         ObjectSpec(point=np.array([0.0, -0.5, 0.5])),
-        options=SceneOptions(clearing=Clearing.SPLIT, inpaint=False),
-        progress=stages.append,
+        options=options,
+        progress=lambda stage, done: told.append((stage, done)),
     )
-    assert stages == ["plane", "ground", "segment"]
+    assert told == [(stage, 0.0) for stage in options.stages]
+    assert options.stages == {"plane": True, "ground": True, "segment": False}
     assert prepared.background is prepared.bare
     assert any("straddled the plane: split at it" in note for note in prepared.notes)
     cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.9, count=3, elevations=(20.0, 40.0, 60.0))

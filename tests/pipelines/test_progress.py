@@ -1,0 +1,43 @@
+"""Bars whose time left is meant to be believed."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+
+from egs_warp.pipelines.prepare_scene import SceneOptions
+from egs_warp.pipelines.progress import scene_bar
+from egs_warp.segmentation.clearance import Clearing
+
+
+def drawn(options: SceneOptions, monkeypatch: pytest.MonkeyPatch, told: list[tuple[float, str, float]]) -> list[str]:
+    """What stands on the screen after each of ``told``: seconds since the beginning, stage, share of it."""
+    clock = [1000.0]
+    monkeypatch.setattr("tqdm.std.time", lambda: clock[0])
+    file, lines = io.StringIO(), []
+    with scene_bar(options.stages, file=file) as tell:
+        for seconds, stage, done in told:
+            clock[0] = 1000.0 + seconds
+            tell(stage, done)
+            lines.append(file.getvalue().split("\r")[-1].strip())
+    assert file.getvalue().split("\r")[-1].startswith("scene: done, ")
+    return lines
+
+
+def test_a_scene_tells_its_stages_and_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the middle of its longest stage half of the time is over, to a few percent."""
+    told = [(0.0, "plane", 0.0), (12.0, "ground", 0.0), (27.0, "segment", 0.0), (50.0, "segment", 0.5)]
+    assert drawn(SceneOptions(clearing=Clearing.FINETUNE), monkeypatch, told) == [
+        "scene: plane, 00:00<?",
+        "scene: ground, 00:12<01:28",
+        "scene: segment, 00:27<01:13",
+        "scene: segment, 00:50<00:47",
+    ]
+
+
+def test_what_is_not_done_is_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without ground, training and floor there is little behind the plane."""
+    options = SceneOptions(clearing=Clearing.SPLIT, flat=True, inpaint=False)
+    lines = drawn(options, monkeypatch, [(0.0, "plane", 0.0), (12.0, "segment", 0.0)])
+    assert lines[1] == "scene: segment, 00:12<00:02"
