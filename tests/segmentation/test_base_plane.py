@@ -56,6 +56,13 @@ def test_plane_is_scale_free(scale: float) -> None:
     assert scaled.offset == pytest.approx(scale * plane.offset, abs=1e-3 * scale)
 
 
+def test_the_length_of_up_does_not_matter() -> None:
+    cloud, way = pawn(gaussian_count=3000).cloud, np.array([0.1, -0.2, 1.0])
+    plane, longer = find_base_plane(cloud, way), find_base_plane(cloud, 5.0 * way)
+    np.testing.assert_allclose(plane.normal, way / np.linalg.norm(way))
+    assert np.allclose(longer.normal, plane.normal) and longer.offset == pytest.approx(plane.offset)
+
+
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "up"), _OBJECTS)
 def test_planes_of_real_captures(data_dir: Path, name: str, up: tuple[int, int, int]) -> None:

@@ -78,6 +78,10 @@ def test_half_above_has_the_moments_of_the_cut_normal_distribution(device: str) 
         expected = sigma0[k] - hazard * (hazard - t) * np.outer(along, along)
         np.testing.assert_allclose(sigma1[k], expected, atol=3e-5 * np.trace(sigma0[k]) + 1e-9)
         assert PLANE.heights(means1[k]) > 0.0
+        # Seen along the plane, its mass is the share above, unless its peak would be higher than before.
+        mass = half.opacities()[k] * np.sqrt(n @ sigma1[k] @ n)
+        share = min(norm.sf(t), np.sqrt(n @ sigma1[k] @ n) / spread)
+        assert mass == pytest.approx(cloud.opacities()[k] * spread * share, rel=1e-3)
     np.testing.assert_array_equal(means1[~chosen], means0[~chosen])
     assert (half.opacities()[chosen] <= cloud.opacities()[chosen] + 1e-5).all()
 
@@ -98,7 +102,7 @@ def test_far_below_the_plane_the_half_lies_on_it(device: str) -> None:
         cloud.means.numpy(),
         np.sqrt(np.einsum("i,nij,j->n", PLANE.normal, covariances(cloud), PLANE.normal)),
     )
-    t = np.linspace(6.5, 9.0, cloud.count)
+    t = np.linspace(6.5, 30.0, cloud.count)
     sunk = GaussianCloud.from_numpy(
         means - (PLANE.heights(means) + t * spread)[:, None] * PLANE.normal,
         cloud.rotations.numpy(),
@@ -109,6 +113,7 @@ def test_far_below_the_plane_the_half_lies_on_it(device: str) -> None:
     )
     half = half_space(sunk, PLANE, np.ones(cloud.count, bool))
     assert (np.abs(PLANE.heights(half.means.numpy())) < spread / t).all()
+    assert np.isfinite(half.opacity_logits.numpy()).all() and half.opacities().max() < 1e-3
 
 
 def test_what_straddles_is_split_in_three_across_the_plane(device: str) -> None:

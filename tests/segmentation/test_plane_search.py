@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
-from egs_warp.segmentation.plane_search import _is_one_patch, find_planes, lies_along, plane_under, plane_views
+from egs_warp.segmentation.plane_search import (
+    _is_one_patch,
+    find_planes,
+    further_planes,
+    lies_along,
+    plane_under,
+    plane_views,
+)
 from tests.support.grounds import level
 from tests.support.scenes import FLOOR, lying
 
@@ -65,6 +73,16 @@ def test_a_plane_is_one_patch_or_none() -> None:
     above = level((-1.0, -1.0), (7.0, 1.0), 0.4, 0.03)
     assert _is_one_patch(lying(one), FLOOR, 0.1)
     assert not _is_one_patch(lying(np.concatenate([apart, above])), FLOOR, 0.1)
+
+
+@pytest.mark.parametrize("scale", [1.0, 10.0])
+def test_further_planes_are_level_in_one_patch_and_elsewhere(scale: float) -> None:
+    """Of a table, a floor below and shelves apart at one level, the floor, in whatever unit of length."""
+    table, floor = level((-0.6, -0.6), (0.6, 0.6), 0.0, 0.03), level((-2.0, -2.0), (2.0, 2.0), -0.8, 0.03)
+    shelves = [level((x, y), (x + 0.7, y + 0.7), 0.7, 0.03) for x in (-2.0, 1.3) for y in (-2.0, 1.3)]
+    room = lying(np.concatenate([table, floor, *shelves])).scaled(scale)
+    found = further_planes(room, FLOOR, 1.0 * scale, 3)
+    assert [round(one.plane.offset / scale, 3) for one in found] == [0.8]
 
 
 def test_what_lets_half_of_the_light_through_is_no_plane_to_see() -> None:

@@ -253,6 +253,12 @@ SURVIVORS: list[Survivor] = [
         "if len(points) < 2:",
         "two points lie on a line, and the next test finds those",
     ),
+    Survivor(
+        "segmentation/clearance.py",
+        "hidden = (behind > 0.0) & (depth > behind) & (alpha > 0.0)",
+        "hidden = (behind > 0.0) & (depth > behind) & (alpha >= 0.0)",
+        "where alpha is 0 depth is 0, which lies behind nothing",
+    ),
 ]
 
 
