@@ -15,7 +15,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.rows import distinct_rows
 
 _ARM = 1.5
-"""Standard deviations: how far a Gaussian reaches to touch another."""
+"""Standard deviations: how far a Gaussian reaches to touch another, four cells at most."""
 
 
 def connected_parts(

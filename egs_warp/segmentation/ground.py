@@ -127,7 +127,6 @@ def measure_ground(
         warnings.simplefilter("ignore", RuntimeWarning)
         heights, apart = np.nanmedian(seen, axis=0), np.nanstd(seen, axis=0)
     known = (views >= _LEAST_VIEWS) & (apart < _AGREE * size)
-    heights = np.where(known, heights, 0.0)
     known = _one_patch(known & _walkable(heights, known, spacing))
     if not known.any():
         return MeasuredGround(HeightField(axes, origin, spacing, np.zeros((count, count))), known, 0.0, 0.0)

@@ -17,6 +17,7 @@ from egs_warp.segmentation.base_plane import (
     _support_level,
     _support_shape,
     _Underside,
+    _underside,
     find_base_plane,
     guess_up,
 )
@@ -53,6 +54,13 @@ def test_plane_is_scale_free(scale: float) -> None:
     plane = find_base_plane(thing.cloud, thing.up)
     scaled = find_base_plane(thing.cloud.scaled(scale), thing.up)
     assert scaled.offset == pytest.approx(scale * plane.offset, abs=1e-3 * scale)
+
+
+def test_the_length_of_up_does_not_matter() -> None:
+    cloud, way = pawn(gaussian_count=3000).cloud, np.array([0.1, -0.2, 1.0])
+    plane, longer = find_base_plane(cloud, way), find_base_plane(cloud, 5.0 * way)
+    np.testing.assert_allclose(plane.normal, way / np.linalg.norm(way))
+    assert np.allclose(longer.normal, plane.normal) and longer.offset == pytest.approx(plane.offset)
 
 
 @pytest.mark.data
@@ -154,4 +162,53 @@ def test_what_is_flat_along_an_axis_is_not_supported_there() -> None:
         sheet, np.tile([1.0, 0, 0, 0], (400, 1)), np.full((400, 3), -5.0), np.full(400, 4.0), np.zeros((400, 1, 3))
     )
     shape = _support_shape(cloud, np.array([0.0, 0.0, 1.0]))
+    assert (shape.polygon, shape.level, shape.depth) == (0.0, 0.0, 0.0)
+
+
+def opaque(means: np.ndarray, opacities: np.ndarray | float = 0.98) -> GaussianCloud:
+    """Small round Gaussians at ``means`` (n, 3)."""
+    logits = np.broadcast_to(np.log(opacities / (1.0 - np.asarray(opacities))), len(means))
+    return GaussianCloud.from_numpy(
+        means, np.tile([1.0, 0, 0, 0], (len(means), 1)), np.full((len(means), 3), -5.0), logits,
+        np.zeros((len(means), 1, 3)),
+    )  # fmt: skip
+
+
+def test_the_columns_are_those_of_the_footprint() -> None:
+    """A block of 2 x 1 has 64 columns by 32, all of them with a bottom, and its middle in the middle of them."""
+    x, y, z = np.meshgrid(np.linspace(0.0, 2.0, 160), np.linspace(0.0, 1.0, 80), [0.0, 0.5], indexing="ij")
+    block = opaque(np.column_stack([x.ravel(), y.ravel(), z.ravel()]) + [3.0, -2.0, 1.0])
+    seen = _underside(block, np.array([0.0, 0.0, 1.0]))
+    columns = {(int(a), int(b)) for a, b in seen.columns}
+    if np.ptp(seen.columns[:, 0]) < np.ptp(seen.columns[:, 1]):
+        columns = {(b, a) for a, b in columns}
+    assert columns >= {(a, b) for a in range(64) for b in range(31)}
+    np.testing.assert_allclose(seen.bottoms, 1.0, atol=1e-6)
+    np.testing.assert_allclose(np.sort(seen.centre), [15.5, 31.5], atol=0.5)
+
+
+def test_strays_aside_of_a_narrow_foot_widen_no_support() -> None:
+    """A mushroom: the foot's disc is a ninth of the cap's, with strays at the level of the sole far off or not."""
+    random = np.random.default_rng(0)
+
+    def disc(radius: float, height: float, count: int) -> np.ndarray:
+        angle, share = random.uniform(0.0, 2.0 * np.pi, count), random.uniform(0.0, 1.0, count)
+        flat = radius * np.sqrt(share)[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        return np.column_stack([flat, np.full(count, height)])
+
+    mushroom = np.concatenate([disc(0.2, 0.0, 4000), disc(0.6, 1.0, 40000)])
+    strays = np.array([[9.0, 0.0, 0.0], [-9.0, 1.0, 0.0], [0.0, 9.0, 0.0], [0.0, -9.0, 0.0]])
+    up = np.array([0.0, 0.0, 1.0])
+    for means in (mushroom, np.concatenate([mushroom, strays])):
+        shape = _support_shape(opaque(means), up)
+        assert shape.polygon == pytest.approx(1.0 / 9.0, abs=0.02)
+
+
+def test_what_shows_nothing_low_is_not_supported() -> None:
+    """An opaque block above a haze that is as heavy: no visible Gaussian is low."""
+    random = np.random.default_rng(0)
+    haze, block = random.uniform(0.0, 1.0, (2, 8000, 3))
+    block[:, 2] = 0.8 + 0.2 * block[:, 2]
+    opacities = np.repeat([0.1, 0.9], 8000)
+    shape = _support_shape(opaque(np.concatenate([haze, block]), opacities), np.array([0.0, 0.0, 1.0]))
     assert (shape.polygon, shape.level, shape.depth) == (0.0, 0.0, 0.0)

@@ -15,6 +15,7 @@ from egs_warp.segmentation.clearance import (
     Clearing,
     ClearingOptions,
     Reach,
+    _subdivided,
     clear_plane,
     foot_ring,
     half_space,
@@ -77,6 +78,10 @@ def test_half_above_has_the_moments_of_the_cut_normal_distribution(device: str) 
         expected = sigma0[k] - hazard * (hazard - t) * np.outer(along, along)
         np.testing.assert_allclose(sigma1[k], expected, atol=3e-5 * np.trace(sigma0[k]) + 1e-9)
         assert PLANE.heights(means1[k]) > 0.0
+        # Seen along the plane, its mass is the share above, unless its peak would be higher than before.
+        mass = half.opacities()[k] * np.sqrt(n @ sigma1[k] @ n)
+        share = min(norm.sf(t), np.sqrt(n @ sigma1[k] @ n) / spread)
+        assert mass == pytest.approx(cloud.opacities()[k] * spread * share, rel=1e-3)
     np.testing.assert_array_equal(means1[~chosen], means0[~chosen])
     assert (half.opacities()[chosen] <= cloud.opacities()[chosen] + 1e-5).all()
 
@@ -88,6 +93,76 @@ def test_far_above_the_plane_the_half_is_the_whole(device: str) -> None:
     np.testing.assert_allclose(half.means.numpy(), cloud.means.numpy(), atol=1e-6)
     np.testing.assert_allclose(covariances(half), covariances(cloud), rtol=1e-3, atol=1e-7)
     np.testing.assert_allclose(half.opacities(), cloud.opacities(), atol=1e-5)
+
+
+def test_far_below_the_plane_the_half_lies_on_it(device: str) -> None:
+    """The mean of a normal distribution beyond t deviations is less than 1 / t deviations beyond them (Gordon 1941)."""
+    cloud = cloud_near(PLANE, device)
+    means, spread = (
+        cloud.means.numpy(),
+        np.sqrt(np.einsum("i,nij,j->n", PLANE.normal, covariances(cloud), PLANE.normal)),
+    )
+    t = np.linspace(6.5, 30.0, cloud.count)
+    sunk = GaussianCloud.from_numpy(
+        means - (PLANE.heights(means) + t * spread)[:, None] * PLANE.normal,
+        cloud.rotations.numpy(),
+        cloud.log_scales.numpy(),
+        cloud.opacity_logits.numpy(),
+        cloud.sh.numpy(),
+        device=device,
+    )
+    half = half_space(sunk, PLANE, np.ones(cloud.count, bool))
+    assert (np.abs(PLANE.heights(half.means.numpy())) < spread / t).all()
+    assert np.isfinite(half.opacity_logits.numpy()).all() and half.opacities().max() < 1e-3
+
+
+def test_what_straddles_is_split_in_three_across_the_plane(device: str) -> None:
+    """Along the axis that reaches farthest across; the three have mean and covariance of the one, and none hides more
+    than it. What is clear of the plane stays as it is, what comes to lie below it is left out.
+    """
+    first, second = PLANE.tangents()
+    turn = Rotation.from_matrix(np.stack([second, PLANE.normal, first], axis=1)).as_quat()[[3, 0, 1, 2]]
+    foot = -PLANE.offset * PLANE.normal
+    heights = np.array([0.15, 0.05, 0.5])
+    cloud = GaussianCloud.from_numpy(
+        foot + heights[:, None] * PLANE.normal,
+        np.tile(turn, (3, 1)),
+        np.tile(np.log([0.03, 0.1, 0.02]), (3, 1)),
+        np.array([12.0, 1.0, 2.0]),
+        np.zeros((3, 1, 3)),
+        device=device,
+    )
+    split = _subdivided(cloud, PLANE, Reach.ELLIPSOID)
+    np.testing.assert_allclose(PLANE.heights(split.means.numpy()), [0.5, 0.05, 0.15, 0.25, 0.05, 0.15], atol=1e-5)
+    np.testing.assert_allclose(covariances(split)[0], covariances(cloud)[2], atol=1e-8)
+    arms = split.means.numpy()[1:4].astype(np.float64) - cloud.means.numpy()[0]
+    spread = covariances(split)[1:4] + arms[:, :, None] * arms[:, None, :]
+    np.testing.assert_allclose(np.einsum("k,kij->ij", [0.25, 0.5, 0.25], spread), covariances(cloud)[0], atol=1e-7)
+    opacities = split.opacities()
+    assert opacities[0] == pytest.approx(cloud.opacities()[2])
+    for child, parent in zip(range(1, 6), [0, 0, 0, 1, 1], strict=True):
+        assert 0.0 < opacities[child] < cloud.opacities()[parent]
+
+
+def test_cameras_about_the_foot_look_at_it_from_low_down() -> None:
+    """A column of radius 0.3, away from the origin: its foot is in the middle of each picture and fills most of it."""
+    turns, levels = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 100, endpoint=False), np.linspace(0.0, 1.0, 40))
+    angle, height = turns.ravel(), levels.ravel()
+    means = np.column_stack([5.0 + 0.3 * np.cos(angle), -3.0 + 0.3 * np.sin(angle), height])
+    column = GaussianCloud.from_numpy(
+        means,
+        np.tile([1.0, 0.0, 0.0, 0.0], (4000, 1)),
+        np.full((4000, 3), -4.0),
+        np.zeros(4000),
+        np.zeros((4000, 1, 3)),
+    )
+    foot = means[height < 0.05]
+    for camera in foot_ring(column, Plane(np.array([0.0, 0.0, 1.0]), 0.0)):
+        away = camera.centre - [5.0, -3.0, 0.0]
+        assert 0.0 < np.degrees(np.arctan2(away[2], np.hypot(away[0], away[1]))) < 30.0
+        seen = (foot - camera.centre) @ camera.rotation.T
+        aside = camera.fx * seen[:, 0] / seen[:, 2] / (0.5 * camera.width)
+        assert abs(aside.max() + aside.min()) < 0.05 and 0.6 < aside.max() < 1.0
 
 
 def test_flat_splats_survive_the_cut() -> None:

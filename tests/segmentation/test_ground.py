@@ -112,7 +112,7 @@ def test_roughness_that_views_do_not_agree_on_is_no_ground(
     assert replace(measured, roughness=0.1, noise=0.05).is_flat(1.0)
     assert not replace(measured, roughness=0.1, noise=0.01).is_flat(1.0)
     away = measure_ground(cloud, truth, LEVEL, centre=np.array([50.0, 0.0, 0.5]), size=1.7)
-    assert not away.known.any() and away.is_flat(1.0)
+    assert not away.known.any() and away.is_flat(1.0) and away.roughness == away.noise == 0.0
 
 
 @pytest.mark.data
@@ -132,23 +132,29 @@ def test_real_grounds_that_are_flat_stay_planes(data_dir: Path, file: str, click
 
 def test_ground_reaches_up_to_what_stands_on_it() -> None:
     """Level ground with a hill that the object hides: it is raised to the object there, and nowhere that is seen."""
-    heights = np.zeros((41, 41))
-    known = np.ones((41, 41), bool)
+    heights = np.zeros((41, 61))
+    known = np.ones((41, 61), bool)
     known[12:29, 12:29] = False
     field = HeightField.through(np.eye(3), np.array([-1.0, -1.0, 0.0]), 0.05, heights)
     measured = MeasuredGround(field, known, 0.0, 0.0)
     thing = ball(0.04)
-    raised = measured.touched_by(thing, 1.0)
+    beside = sheet(np.array([[0.0, 1.5, -0.1]]), np.array([[0.0, 0.0, 1.0]]), 0.035, (0.8, 0.3, 0.2))
+    size = np.sqrt(3.0)
+    # Something that hangs down beside the field is not what stands on it.
+    raised = measured.touched_by(joined(thing, beside), size)
     means = thing.means.numpy().astype(np.float64)
     assert field.heights(means).min() > 0.035 and abs(raised.heights(means).min()) < 0.002
     lifted = raised.nodes()[..., 2]
     assert np.abs(lifted[known]).max() < 1e-9 and lifted.max() == pytest.approx(field.heights(means).min())
     # What hovers is not stood on.
-    assert measured.touched_by(ball(0.2), 1.0) is field
+    assert measured.touched_by(ball(0.2), size) is field
 
 
-def test_what_the_object_hid_is_not_taken_for_ground() -> None:
-    """A floor with a hole under a ball, and another floor far below: through the hole one sees the lower one."""
+@pytest.mark.parametrize("scale", [1.0, 0.01])
+def test_what_the_object_hid_is_not_taken_for_ground(scale: float) -> None:
+    """A floor with a hole under a ball, and another floor far below: through the hole one sees the lower one. So it is
+    in metres and in whatever else.
+    """
     up = np.array([[0.0, 0.0, 1.0]])
     top = level((-2.0, -2.0), (2.0, 2.0), 0.0, 0.04)
     top = top[np.linalg.norm(top[:, :2], axis=1) > 0.4]
@@ -158,15 +164,17 @@ def test_what_the_object_hid_is_not_taken_for_ground() -> None:
         for part, gap in ((top, 0.04), (below, 0.08))
     ]
     bare = joined(*floors)
-    camera = Camera.look_at(np.array([0.3, -0.3, 4.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]), width=64, height=64)
-    seen = module._seen_points(joined(bare, ball()), bare, camera)
-    assert len(seen) > 1000 and np.abs(seen[:, 2]).max() < 0.05
+    eye = scale * np.array([0.3, -0.3, 4.0])
+    camera = Camera.look_at(eye, np.zeros(3), np.array([0.0, 1.0, 0.0]), width=64, height=64, near=0.01 * scale)
+    seen = module._seen_points(joined(bare, ball()).scaled(scale), bare.scaled(scale), camera)
+    assert len(seen) > 1000 and np.abs(seen[:, 2]).max() < 0.05 * scale
 
 
-def test_medians_of_what_is_nearest_to_each_node() -> None:
-    """Of odd and even numbers of points; none of those off the grid."""
+@pytest.mark.parametrize("count", [5, 12])
+def test_medians_of_what_is_nearest_to_each_node(count: int) -> None:
+    """Of odd and even numbers of points; none of those off the grid, nor any where there are none."""
     random = np.random.default_rng(0)
-    count, spacing, origin = 5, 0.25, np.array([0.3, -0.2, 0.1])
+    spacing, origin = 0.25, np.array([0.3, -0.2, 0.1])
     axes = np.linalg.qr(random.standard_normal((3, 3)))[0]
     local = np.column_stack([random.uniform(-1.0, 2.2, (400, 2)), random.standard_normal(400)])
     medians = module._medians(origin + local @ axes, axes, origin, spacing, count)

@@ -13,15 +13,15 @@ from egs_warp.commands.object_flag import point_at, read_mask, read_object
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_cameras
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.io import read_cameras, read_capture
 from egs_warp.io.cameras import write_cameras
 from egs_warp.pipelines.locate_plane import locate_plane
-from egs_warp.segmentation.connectivity import connected_parts, enclosed
+from egs_warp.segmentation import object_mask as module
 from egs_warp.segmentation.object_mask import Box, ObjectSpec, masks_from_selection, segment
-from egs_warp.segmentation.plane_search import find_planes, plane_under
 from egs_warp.segmentation.votes import MaskedView
-from tests.support.scenes import FLOOR, ball_on_floor
+from tests.support.grounds import level
+from tests.support.scenes import FLOOR, ball_on_floor, lying, round_ones, shell
 
 
 def check(cloud: GaussianCloud, truth: np.ndarray, spec: ObjectSpec) -> None:
@@ -109,45 +109,6 @@ def test_plane_and_object_from_a_click_alone() -> None:
     assert 1400 < located.segmentation.object_mask.sum() < 1521
     with pytest.raises(UserError, match="plane: none in sight"):
         locate_plane(cloud.subset(cloud.means.numpy()[:, 2] > 0.2), ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
-
-
-def test_several_planes_widest_first() -> None:
-    random = np.random.default_rng(3)
-    table = np.column_stack([random.uniform(-0.5, 0.5, (800, 2)), np.full(800, 0.8)])
-    ground = np.column_stack([random.uniform(-1.5, 1.5, (3000, 2)), np.zeros(3000)])
-    means = np.concatenate([table, ground])
-    cloud = GaussianCloud.from_numpy(
-        means,
-        np.tile([1.0, 0.0, 0.0, 0.0], (len(means), 1)),
-        np.full((len(means), 3), -4.0),
-        np.full(len(means), 3.0),
-        np.zeros((len(means), 1, 3)),
-    )
-    found = find_planes(cloud, np.array([0.1, 0.0, 1.0]), count=2)
-    assert [round(-one.plane.offset, 3) for one in found] == [0.0, 0.8]
-    assert found[0].support > 0.7 and 0.15 < found[1].support < 0.3
-    for height, offset in ((1.0, -0.8), (0.5, 0.0)):
-        under = plane_under(found, np.array([0.0, 0.0, height]), tolerance=0.0)
-        assert under is not None and abs(under.offset - offset) < 1e-3
-    assert plane_under(found, np.array([0.0, 0.0, -1.0]), tolerance=0.0) is None
-
-
-def test_parts_and_insides() -> None:
-    """Two clusters are two parts unless a long Gaussian reaches from one to the other; a shell encloses its inside."""
-    random = np.random.default_rng(0)
-    clusters = np.concatenate([random.normal(scale=0.03, size=(50, 3)) + [x, 0.0, 1.0] for x in (-0.4, 0.4)])
-    means = np.concatenate([clusters, [[0.0, 0.0, 1.0]]])
-    scales = np.full((101, 3), -4.0)
-    scales[100] = [np.log(0.3), -5.0, -5.0]
-    cloud = GaussianCloud.from_numpy(
-        means, np.tile([1.0, 0, 0, 0], (101, 1)), scales, np.full(101, 3.0), np.zeros((101, 1, 3))
-    )
-    both = connected_parts(cloud, np.arange(100), cell=0.1, plane=FLOOR, above=0.0)
-    assert len(set(both[:50])) == len(set(both[50:])) == 1 and both[0] != both[99]
-    bridged = connected_parts(cloud, np.arange(101), cell=0.1, plane=FLOOR, above=0.0)
-    assert len(set(bridged)) == 1
-    ring = np.stack([np.cos(np.linspace(0, 6.28, 200)), np.sin(np.linspace(0, 6.28, 200))], axis=1)
-    assert enclosed(np.array([[0.0, 0.0], [1.0, 0.0], [1.3, 0.0]]), ring, 0.05).tolist() == [True, True, False]
 
 
 def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
@@ -238,18 +199,98 @@ def test_point_at_hits_the_surface() -> None:
     np.testing.assert_allclose(np.linalg.norm(hit - [0.0, 0.0, 0.5]), 0.5, atol=0.03)
 
 
-def test_a_click_finds_what_is_small_in_a_large_room() -> None:
-    """A ball of one unit between walls that are 120 apart: guesses of its size are halved until it is found."""
+@pytest.mark.parametrize("width", [120.0, 400.0])
+def test_a_click_finds_what_is_small_in_a_large_room(width: float) -> None:
+    """A ball of one unit between walls that are far apart: guesses of its size are halved until it is found."""
     cloud, truth = ball_on_floor()
-    line = np.linspace(-60.0, 60.0, 60)
-    walls = [np.column_stack([np.full(60, x), line, np.full(60, z)]) for x in (-60.0, 60.0) for z in (0.5, 1.5)]
-    means = np.concatenate([cloud.means.numpy(), *walls])
-    count = len(means) - cloud.count
+    whole = joined(cloud, walls(width, cloud.sh.shape[1]))
+    check(whole, np.arange(whole.count) < truth.sum(), ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
+
+
+def walls(width: float, bands: int) -> GaussianCloud:
+    """Two, so far apart and as long."""
+    line = np.linspace(-0.5 * width, 0.5 * width, 60)
+    sides = [np.column_stack([np.full(60, x), line, np.full(60, z)]) for x in (line[0], line[-1]) for z in (0.5, 1.5)]
+    return round_ones(np.concatenate(sides), 0.135, bands)
+
+
+def test_a_click_finds_what_is_flat_in_a_room() -> None:
+    """A lens a tenth as high as it is wide, between walls 11 apart: the first guess of its size, half of the room's,
+    overlooks it, and half of that is about right.
+    """
+    lens = round_ones(shell() * [1.0, 1.0, 0.1], 0.02)
+    whole = joined(joined(lens, lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05))), walls(11.3, 1))
+    found = segment(whole, FLOOR, ObjectSpec(point=np.array([0.0, 0.0, 0.1])))
+    assert found.object_mask[: lens.count].mean() > 0.9 and not found.object_mask[lens.count :].any()
+
+
+def test_the_unit_of_length_changes_nothing() -> None:
+    """A ball on its floor, wide shreds of the floor at its foot, and what is buried under it: in metres as in
+    millimetres.
+    """
+    cloud, truth = ball_on_floor()
+    angles = np.arange(6)
+    shreds = np.column_stack([0.3 * np.cos(angles), 0.3 * np.sin(angles), np.full(6, 0.09)])
+    under = np.random.default_rng(0).normal(0.0, 0.05, (30, 3)) - [0.0, 0.0, 0.2]
+    whole = joined(joined(cloud, round_ones(shreds, 0.1)), round_ones(under, 0.02))
+    tone = np.where(np.arange(whole.count) < truth.sum(), -1.0, 1.0)
     whole = GaussianCloud.from_numpy(
-        means,
-        np.tile([1.0, 0.0, 0.0, 0.0], (len(means), 1)),
-        np.concatenate([cloud.log_scales.numpy(), np.full((count, 3), -2.0)]),
-        np.concatenate([cloud.opacity_logits.numpy(), np.full(count, 3.0)]),
-        np.concatenate([cloud.sh.numpy(), np.zeros((count, *cloud.sh.shape[1:], 3))]),
+        whole.means.numpy(),
+        whole.rotations.numpy(),
+        whole.log_scales.numpy(),
+        whole.opacity_logits.numpy(),
+        tone[:, None, None] + np.zeros((1, 1, 3)),
     )
-    check(whole, np.concatenate([truth, np.zeros(count, bool)]), ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
+    small, large = (
+        segment(whole.scaled(scale), FLOOR, ObjectSpec(point=scale * np.array([0.0, -0.5, 0.5])))
+        for scale in (1.0, 1000.0)
+    )
+    assert small.buried_mask[-30:].all() and small.floater_mask[cloud.count : cloud.count + 6].all()
+    np.testing.assert_array_equal(large.object_mask, small.object_mask)
+    np.testing.assert_array_equal(large.buried_mask, small.buried_mask)
+    np.testing.assert_array_equal(large.floater_mask, small.floater_mask)
+    assert large.size == pytest.approx(1000.0 * small.size, rel=1e-5)
+
+
+def test_what_hangs_beside_is_a_floater_only_where_it_is_small() -> None:
+    """Beside a ball, a single Gaussian goes with neither ball nor background; another ball as near is background."""
+    mine = shell()
+    other = mine + [1.13, 0.0, 0.0]
+    floater = np.array([[0.0, -0.62, 0.5]])
+    whole = joined(
+        round_ones(np.concatenate([mine, other, floater]), 0.01), lying(level((-1.0, -1.0), (2.2, 1.0), 0.0, 0.05))
+    )
+    found = segment(whole, FLOOR, ObjectSpec(point=np.array([0.0, 0.0, 1.0])), size=np.sqrt(3.0))
+    clear = whole.means.numpy()[:, 2] > 0.1
+    kinds = np.arange(whole.count)
+    assert found.object_mask[clear & (kinds < 1500)].all()
+    assert found.background_mask[clear & (kinds >= 1500) & (kinds < 3000)].all()
+    assert found.floater_mask[3000]
+
+
+def test_loose_matter_behind_a_hole_is_the_bodys() -> None:
+    """A hollow ball with a round hole in its side, a tenth of its size across: what is loose inside goes along."""
+    skin = shell(3000)
+    away = np.linalg.norm(skin - [0.5, 0.0, 0.5], axis=1)
+    skin = skin[away > 0.085]
+    inside = np.random.default_rng(0).normal(0.0, 0.05, (30, 3)) + [0.0, 0.0, 0.5]
+    whole = joined(round_ones(np.concatenate([skin, inside]), 0.02), lying(level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.05)))
+    found = segment(whole, FLOOR, ObjectSpec(point=np.array([0.0, -0.5, 0.5])))
+    assert found.object_mask[len(skin) : len(skin) + 30].all()
+
+
+def test_how_far_a_floor_scatters_is_judged_beside_the_object() -> None:
+    """Three standard deviations of the floor that is near; not of a higher one far away, nor of what lies under the
+    object.
+    """
+    random = np.random.default_rng(0)
+    thing = shell() * [1.0, 1.0, 0.2] + [2.0, -1.0, 0.0]
+    beside = level((0.8, -2.2), (3.2, 0.2), 0.0, 0.05)
+    beside = beside[np.linalg.norm(beside[:, :2] - [2.0, -1.0], axis=1) > 0.55]
+    beside[:, 2] = random.normal(0.0, 0.001, len(beside))
+    away = np.concatenate([level((-8.0, -8.0), (0.0, 8.0), 0.04, 0.1), level((4.0, -8.0), (8.0, 8.0), 0.04, 0.1)])
+    under = level((1.6, -1.4), (2.4, -0.6), 0.04, 0.01)
+    whole = joined(round_ones(thing, 0.02), lying(np.concatenate([beside, away, under])))
+    scene_ = module._Scene.of(whole, FLOOR)
+    top = module._floor_top(scene_, np.arange(whole.count) < len(thing), np.sqrt(2.0))
+    assert top == pytest.approx(0.003, rel=0.15)

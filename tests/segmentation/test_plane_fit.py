@@ -8,7 +8,7 @@ import pytest
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.plane import Plane
-from egs_warp.segmentation.plane_fit import PlaneView, _tukey, fit_plane, plane_depth
+from egs_warp.segmentation.plane_fit import PlaneView, _gather, _reweighted, _tukey, fit_plane, plane_depth
 
 TRUTH = Plane.from_coefficients(0.2, -0.9, 0.3, 0.4)
 
@@ -79,6 +79,20 @@ def test_exact_depth_gives_the_exact_plane() -> None:
     fit = fit_plane([PlaneView(camera, depth, depth > 0.0)])
     assert angle(fit.plane, TRUTH) < 1e-5
     assert abs(fit.plane.offset - TRUTH.offset) < 1e-6
+
+
+def test_weights_of_one_over_the_residual_leave_outliers_out() -> None:
+    """Weighted so, least squares have the least sum of absolute residuals: exact depth of which a fifth is wrong, all
+    to one side, gives the exact plane.
+    """
+    camera = camera_over(TRUTH, 0.7)
+    depth = plane_depth(TRUTH, camera)
+    mask = (depth > 0.0) & (depth < 12.0)
+    wrong = np.random.default_rng(0).random(depth.shape) < 0.2
+    pixels = _gather([PlaneView(camera, np.where(wrong, 0.6 * depth, depth), mask)], np.random.default_rng(0))
+    found = _reweighted(pixels, Plane(camera.rotation[2], 0.0))
+    assert angle(found, TRUTH) < 0.01
+    assert abs(found.offset - TRUTH.offset) < 1e-3
 
 
 def test_several_views_are_fitted_together() -> None:

@@ -6,20 +6,27 @@ import numpy as np
 import pytest
 
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.geometry.plane import Plane
 from egs_warp.pipelines.locate_plane import locate_plane
-from egs_warp.segmentation.object_mask import Box, ObjectSpec, masks_from_selection, segment
+from egs_warp.segmentation import table_top as module
+from egs_warp.segmentation.object_mask import Box, ObjectSpec, Segmentation, masks_from_selection, segment
 from egs_warp.segmentation.table_top import planes_below, surface_around
-from tests.support.grounds import furnished_room
+from tests.support.grounds import ball, furnished_room, level, sheet
 
 UP = np.array([0.0, 0.0, 1.0])
 BALL = 5000
+MIDDLE = np.array([0.0, 0.0, 0.5])
 
 
 @pytest.fixture(scope="module")
 def room() -> GaussianCloud:
     return furnished_room()
+
+
+@pytest.fixture(scope="module")
+def candidates(room: GaussianCloud) -> list[Plane]:
+    return planes_below(room, UP, MIDDLE)
 
 
 @pytest.mark.parametrize("click", [(0.0, 0.0, 0.5), (0.3, 0.2, 0.85), (0.2, -0.35, 0.2)])
@@ -44,13 +51,72 @@ def test_a_mask_and_a_box_find_it_too(room: GaussianCloud) -> None:
         assert abs(float(located.plane.heights(np.zeros(3)))) < 5e-3
 
 
-def test_candidates_come_from_the_highest_down_and_the_surface_goes_on_around_the_ball(room: GaussianCloud) -> None:
-    planes = planes_below(room, UP, np.array([0.0, 0.0, 0.5]))
-    heights = [-plane.offset for plane in planes]
+def test_candidates_come_from_the_highest_down_and_the_surface_goes_on_around_the_ball(
+    room: GaussianCloud, candidates: list[Plane]
+) -> None:
+    heights = [-plane.offset for plane in candidates]
     assert heights == sorted(heights, reverse=True)
     assert any(abs(height) < 0.02 for height in heights)
-    point = ObjectSpec(point=np.array([0.0, 0.0, 0.5]))
+    point = ObjectSpec(point=MIDDLE)
     top = Plane(UP, 0.0)
     assert surface_around(room, top, segment(room, top, point)) > 0.95
     middle = Plane(UP, -0.3)
     assert surface_around(room, middle, segment(room, middle, point)) < 0.05
+
+
+def test_candidates_do_not_hang_on_the_unit_of_length(room: GaussianCloud, candidates: list[Plane]) -> None:
+    scaled = planes_below(room.scaled(10.0), UP, 10.0 * MIDDLE)
+    np.testing.assert_allclose(
+        [plane.offset for plane in scaled], [10.0 * plane.offset for plane in candidates], atol=1e-3
+    )
+
+
+def test_dust_far_away_changes_no_candidate(room: GaussianCloud, candidates: list[Plane]) -> None:
+    """What is too faint to be seen does not say how large the capture is."""
+    dust = GaussianCloud.from_numpy(
+        np.random.default_rng(0).uniform(-60.0, 60.0, (4000, 3)),
+        np.tile([1.0, 0.0, 0.0, 0.0], (4000, 1)),
+        np.full((4000, 3), -3.0),
+        np.full(4000, -3.0),
+        np.zeros((4000, *room.sh.shape[1:], 3)),
+    )
+    found = planes_below(joined(room, dust), UP, MIDDLE)
+    assert [plane.offset for plane in found] == [plane.offset for plane in candidates]
+
+
+def on_surface(points: np.ndarray, spacing: float, cover: float) -> float:
+    """``surface_around`` a ball of one unit that touches z = 0 at (-3, 2), on flat Gaussians at ``points`` (n, 3), from
+    its foot, of a grid of ``spacing``, whose opacity adds up to ``cover`` of the area.
+    """
+    thing, foot = ball(), np.array([-3.0, 2.0, 0.0])
+    flat = sheet(points, np.tile(UP, (len(points), 1)), spacing, (0.5, 0.5, 0.5))
+    # A Gaussian's opacity adds up to 2 pi s1 s2 times its peak.
+    full = 2.0 * np.pi * flat.opacities()[0] * np.exp(2.0 * float(flat.log_scales.numpy()[0, 0])) / spacing**2
+    whole = joined(
+        thing, sheet(points, np.tile(UP, (len(points), 1)), spacing * np.sqrt(cover / full), (0.5, 0.5, 0.5))
+    )
+    whole = GaussianCloud.from_numpy(
+        whole.means.numpy() + foot,
+        whole.rotations.numpy(),
+        whole.log_scales.numpy(),
+        whole.opacity_logits.numpy(),
+        whole.sh.numpy(),
+    )
+    mine = np.arange(whole.count) < thing.count
+    nothing = np.zeros(whole.count, bool)
+    return surface_around(whole, Plane(UP, 0.0), Segmentation(mine, nothing, nothing, float(np.sqrt(3.0))))
+
+
+def test_the_surface_goes_on_as_far_as_it_lies() -> None:
+    """Half of the surroundings on a table whose edge runs under the ball's middle, wherever the ball stands; all of
+    them where Gaussians cover enough, none where they cover less, and next to none where they begin a cell beyond.
+    """
+    spacing, enough = 0.02, module._COVERED
+    half, whole = (level((left, -1.0), (1.0, 1.0), 0.0, spacing) for left in (0.0, -1.0))
+    # Blurred, the edge stays where it is in the level of half the cover.
+    assert on_surface(half, spacing, 2.0 * enough) == pytest.approx(0.5, abs=0.03)
+    assert on_surface(whole, spacing, 1.2 * enough) > 0.95
+    assert on_surface(whole, spacing, 0.8 * enough) < 0.05
+    # The ball's foot is a circle of radius 0.35; the cell at its outline does not count, nor one beyond the apron.
+    reach = 0.35 + (1 + module._APRON + 1) * module._CELL * np.sqrt(3.0)
+    assert on_surface(whole[np.linalg.norm(whole[:, :2], axis=1) > reach], spacing, 2.0) < 0.2

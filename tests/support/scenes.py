@@ -1,4 +1,4 @@
-"""A ball on a floor, for the tests of scenes."""
+"""A ball on a floor, and what scenes are put together from."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
+from tests.support.grounds import sheet
 
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 
@@ -30,3 +31,27 @@ def ball_on_floor(lift: float = 0.0) -> tuple[GaussianCloud, np.ndarray]:
         random.uniform(-1.0, 1.0, (len(means), 1, 3)),
     )
     return cloud, np.arange(len(means)) < len(shell) + len(inner)
+
+
+def round_ones(means: np.ndarray, radius: float, bands: int = 1) -> GaussianCloud:
+    """Opaque Gaussians at ``means`` (n, 3)."""
+    return GaussianCloud.from_numpy(
+        means,
+        np.tile([1.0, 0.0, 0.0, 0.0], (len(means), 1)),
+        np.full((len(means), 3), np.log(radius)),
+        np.full(len(means), 3.0),
+        np.zeros((len(means), bands, 3)),
+    )
+
+
+def lying(means: np.ndarray) -> GaussianCloud:
+    """Opaque Gaussians at ``means`` (n, 3) that lie flat, as a floor's do."""
+    return sheet(means, np.tile(FLOOR.normal, (len(means), 1)), 0.03, (0.5, 0.5, 0.5))
+
+
+def shell(count: int = 1500) -> np.ndarray:
+    """(n, 3) points spread evenly over a ball of one unit that touches the floor at the origin (Fibonacci lattice)."""
+    z = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
+    angle = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(count)
+    around = np.sqrt(1.0 - z**2)
+    return 0.5 * np.column_stack([around * np.cos(angle), around * np.sin(angle), z]) + [0.0, 0.0, 0.5]

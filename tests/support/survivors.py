@@ -193,6 +193,72 @@ SURVIVORS: list[Survivor] = [
         "lying = core & scene.level & (scene.heights <= 3.0 * foot) & (not spec.masks)",
         "a height that is the very bound",
     ),
+    Survivor(
+        "segmentation/clearance.py",
+        "iterations: int = 200",
+        "iterations: int = 199",
+        "a default: one step of two hundred less",
+    ),
+    Survivor(
+        "segmentation/clearance.py",
+        "return ring_cameras(plane, centre, 1.1 * radius, elevations=(1.0, 10.0, 25.0), size=size)",
+        "return ring_cameras(plane, centre, 1.1 * radius, elevations=(1.0, 10.0, 24.0), size=size)",
+        "a third of the cameras stand a degree lower, and see as much",
+    ),
+    Survivor(
+        "segmentation/ground.py",
+        "_ELEVATIONS = (40.0, 58.0, 75.0)",
+        "_ELEVATIONS = ( 39.0, 58.0, 75.0)",
+        "a third of the cameras stand a degree lower, and see as much",
+    ),
+    Survivor(
+        "segmentation/ground.py",
+        "above = ring_cameras(plane, middle, 1.2 * size, count=_VIEWS - 1, elevations=_ELEVATIONS, size=_SIDE)",
+        "above = ring_cameras(plane, middle, 1.2 * size, count=_VIEWS - 0, elevations=_ELEVATIONS, size=_SIDE)",
+        "a view more of the ground than fifteen",
+    ),
+    Survivor(
+        "segmentation/plane_fit.py",
+        "if plane.heights(pixels.origins[0]) < 0.0:",
+        "if plane.heights(pixels.origins[ -1]) < 0.0:",
+        "the side of the cameras is that of any of them: what is looked at from both sides has none",
+    ),
+    Survivor(
+        "segmentation/plane_fit.py",
+        "scale = max(float(np.quantile(residual, 0.3)) / 0.566, 1e-7)",
+        "scale = max(float(np.quantile(residual, 0.3)) / 0.566, -0.9999999)",
+        "only the start: each of the ten rounds after it is held above zero",
+    ),
+    Survivor(
+        "segmentation/plane_search.py",
+        "tilt_degrees: float = 25.0,",
+        "tilt_degrees: float = 24.0,",
+        "a default: a degree less that up may be wrong by",
+    ),
+    Survivor(
+        "segmentation/plane_search.py",
+        "if len(left) < 10:",
+        "if len(left) < 9:",
+        "nine Gaussians that are left over make no plane that counts beside the widest",
+    ),
+    Survivor(
+        "segmentation/plane_search.py",
+        "near = np.abs(plane.heights(means[left])) < 2.0 * band",
+        "near = np.abs(plane.heights(means[left])) <= 2.0 * band",
+        "a height that is the very bound",
+    ),
+    Survivor(
+        "segmentation/plane_search.py",
+        "if len(points) < 3:",
+        "if len(points) < 2:",
+        "two points lie on a line, and the next test finds those",
+    ),
+    Survivor(
+        "segmentation/clearance.py",
+        "hidden = (behind > 0.0) & (depth > behind) & (alpha > 0.0)",
+        "hidden = (behind > 0.0) & (depth > behind) & (alpha >= 0.0)",
+        "where alpha is 0 depth is 0, which lies behind nothing",
+    ),
 ]
 
 
