@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 # Frames of each example; as many as its motion takes where this is empty.
 FRAMES ?=
-# Threads cost the small matrices of a step more than they bring.
+# Threads cost the small matrices of tests more than they bring; a step sets this for itself.
 export OPENBLAS_NUM_THREADS ?= 1
 # Of make fuzz, for all readers together; make mutation has no end of its own.
 MINUTES ?= 10

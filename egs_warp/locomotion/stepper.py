@@ -18,6 +18,7 @@ from egs_warp.locomotion.planner import STEPS_A_UNIT, Plan, Prospect, StageClock
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.step_cost import objectives_missed
 from egs_warp.locomotion.synergies import find_synergies
+from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleTension, muscle_columns
 
@@ -130,10 +131,11 @@ class LocomotionStepper:
         """One step of ``dt``; one that does not converge is done again in halves under the same activations, since what
         is asked is asked for the whole of it.
         """
-        end, after, report = self.step(state, memory, objectives, dt)
-        if report.converged:
-            return end, after, [report]
-        return self._in_halves(state, memory, report.activations, dt, _MOST_HALVINGS)
+        with one_blas_thread():
+            end, after, report = self.step(state, memory, objectives, dt)
+            if report.converged:
+                return end, after, [report]
+            return self._in_halves(state, memory, report.activations, dt, _MOST_HALVINGS)
 
     def _in_halves(
         self, state: BodyState, memory: StepMemory, activations: np.ndarray, dt: float, left: int

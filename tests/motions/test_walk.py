@@ -87,7 +87,8 @@ def strong(mesh: TetMesh, up: np.ndarray = UP) -> CoarseCreature:
     return coarse_creature(mesh, forward=AHEAD, up=up, sag=DEFAULT_SAG)
 
 
-@pytest.mark.parametrize("slope", [0.0, pytest.param(5.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("slope", [0.0, 5.0])
 def test_a_coarse_stool_takes_a_step(slope: float) -> None:
     """One step, up a slope too, and the closing one: each foot lands once, none slips 2 % of the stride, the distance
     is met, the audit holds."""

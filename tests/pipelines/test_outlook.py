@@ -22,17 +22,8 @@ def _told(text: str, frames: int | None = None) -> np.ndarray:
     return np.array(told)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "jump",
-        pytest.param("hop x2 0.4 0.2", marks=pytest.mark.slow),
-        pytest.param("twist 60", marks=pytest.mark.slow),
-        pytest.param("twist 180", marks=pytest.mark.slow),
-        pytest.param("walk 0.2", marks=pytest.mark.slow),
-        pytest.param("jump 0 0.1, turn 30", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("text", ["jump", "hop x2 0.4 0.2", "twist 60", "twist 180", "walk 0.2", "jump 0 0.1, turn 30"])
 def test_what_is_left_is_told_within_a_factor_of_two(text: str) -> None:
     """Of all frames but the last ones; a twist finds out in the air whether it takes another jump."""
     done, expected = _told(text).T

@@ -40,6 +40,7 @@ def take(tmp_path_factory: pytest.TempPathFactory) -> tuple[Played, Path]:
     return played, folder / "take-1"
 
 
+@pytest.mark.slow
 def test_a_take_is_a_run_like_any_other(take: tuple[Played, Path]):
     played, path = take
     assert played.told[-1].startswith(f"wrote {path} (")
@@ -52,6 +53,7 @@ def test_a_take_is_a_run_like_any_other(take: tuple[Played, Path]):
     np.testing.assert_allclose(frames[-1].positions, played.frames[-1].positions)
 
 
+@pytest.mark.slow
 def test_its_report_is_measured_and_its_audit_holds(take: tuple[Played, Path]):
     report = json.loads((take[1] / "report.json").read_text())
     (jump,) = report["motion"]
@@ -63,10 +65,12 @@ def test_its_report_is_measured_and_its_audit_holds(take: tuple[Played, Path]):
     assert report["notes"] == []
 
 
+@pytest.mark.slow
 def test_its_script_repeats_its_motions_alone(take: tuple[Played, Path]):
     assert motion(str(take[1] / "script.json")) == motion("jump 0.2 0.15")
 
 
+@pytest.mark.slow
 def test_a_script_of_all_that_it_did_is_told(take: tuple[Played, Path], tmp_path: Path):
     played = Played(coarse_pawn(), tmp_path)
     played.ask("script")
