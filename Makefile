@@ -27,11 +27,11 @@ examples: setup
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile
 
 test: setup
-	$(PYTEST) -m "not (slow or data or example)"
+	$(PYTEST) -m "not (slow or data or example or browser)"
 
-# What "make test" leaves out: long runs, real captures, the examples.
+# What "make test" leaves out: long runs, real captures, the examples, the page in Chromium.
 test-rest: setup
-	$(PYTEST) -m "slow or data or example"
+	$(PYTEST) -m "slow or data or example or browser"
 
 test-all: test test-rest
 
@@ -39,7 +39,7 @@ test-all: test test-rest
 COVERED := contact deformation fem geometry io locomotion meshing muscles render segmentation
 FLOOR := 95
 coverage: setup
-	$(PYTEST) -m "not (slow or data or example)" $(COVERED:%=tests/%) tests/test_extremes.py tests/test_faults.py \
+	$(PYTEST) -m "not (slow or data or example or browser)" $(COVERED:%=tests/%) tests/test_extremes.py tests/test_faults.py \
 		$(COVERED:%=--cov=egs_warp/%) --cov-branch --cov-report=term:skip-covered --cov-fail-under=$(FLOOR)
 
 # Damaged files for every reader; Atheris drives them where it installs. What breaks a reader is kept in tests/corpus.
