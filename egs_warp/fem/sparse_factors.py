@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import rslab
 import scipy.sparse as sparse
 
+_SPLIT = 32
+"""Right-hand sides from which on half of them are solved in a second thread."""
+
 
 class SparseFactors:
     """Supernodal L D L^T of symmetric matrices of one pattern; the symbolic analysis is done once. The same bits on any
-    number of threads.
+    number of cores.
     """
 
     def __init__(self, upper_pattern: sparse.csc_matrix | sparse.csc_array) -> None:
@@ -53,4 +58,10 @@ class SparseFactors:
         assert self._factors is not None, "update() comes first"
         if right.ndim == 1:
             return np.asarray(self._factors.solve(right))
-        return np.asarray(self._factors.solve_many(right)) if right.shape[1] else right
+        if right.shape[1] < _SPLIT:
+            return np.asarray(self._factors.solve_many(right)) if right.shape[1] else right
+        half = right.shape[1] // 2
+        with ThreadPoolExecutor(1) as other:
+            second = other.submit(self._factors.solve_many, right[:, half:])
+            first = self._factors.solve_many(right[:, :half])
+            return np.hstack([first, second.result()])

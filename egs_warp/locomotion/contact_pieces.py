@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as dense
 
+from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.locomotion.solvers import QpSolver, quadratic_program
 
 _FACES = 8
@@ -73,6 +74,15 @@ class ContactPieces:
     def objective(self, x: np.ndarray) -> float:
         """Value at ``x``."""
         return float(0.5 * x @ self.P @ x + self.q @ x + self.constant)
+
+    def under(self, activations: np.ndarray, guess: np.ndarray) -> np.ndarray:
+        """(m + 3n,) ``activations`` (m,) and what contact answers to them; its forces are near ``guess`` (n, 3)."""
+        m, n = self.activations, self.contacts
+        operator = self.rows[:, m:].copy()
+        operator[np.diag_indices_from(operator)] += _SINGULAR * operator.diagonal().mean()
+        free = self.offset + self.rows[:, :m] @ activations
+        forces, _ = coulomb_forces(operator, free, np.zeros(n), self.friction, guess)
+        return np.concatenate([activations, forces.ravel()])
 
 
 @dataclass(frozen=True)
@@ -151,6 +161,26 @@ def search_pieces(
             break
         modes = solution.onward
     return PieceSearch(best.x if best else None, best.objective if best else float("inf"), count, infeasible)
+
+
+def solve_relaxed(program: ContactPieces, solver: QpSolver | str) -> tuple[np.ndarray, float] | None:
+    """The activations (m,) and the objective of the optimum with forces that need not be what contact answers: within
+    the cone, but also where nothing touches. No piece has a lower objective. None without a solution.
+    """
+    m, n = program.activations, program.contacts
+    forces = np.hstack([np.zeros((3 * n, m)), np.eye(3 * n)])
+    cone = [forces[::3]]
+    for angle in 2.0 * np.pi * np.arange(_FACES) / _FACES:
+        # Around the cone: what bounds must not cut it.
+        cone.append(program.friction * forces[::3] - np.cos(angle) * forces[1::3] - np.sin(angle) * forces[2::3])
+    A = np.vstack([np.eye(m, m + 3 * n), *cone, program.rows[::3]])
+    lower = np.concatenate([program.lower, np.zeros(n * (1 + _FACES)), -program.offset[::3]])
+    upper = np.concatenate([program.upper, np.full(len(lower) - m, np.inf)])
+    P = program.P + _SINGULAR * program.P.diagonal().mean() * np.eye(len(program.P))
+    found = quadratic_program(P, program.q, A, solver=solver).solve(lower, upper)
+    if not found.usable:
+        return None
+    return np.clip(found.x[:m], program.lower, program.upper), found.objective + program.constant
 
 
 def solve_piece(

@@ -119,7 +119,7 @@ class StepPlanner:
         problem, contacts, members = response.tangent.problem, response.contacts, self.synergies.members
         weight, m, speed = body.weight, self.synergies.count, body.speed_unit
         each = muscle_columns(self.muscles, problem.end_positions(foreseen)).toarray() * self.muscles.bounds
-        # Without muscles and contact, in their stiffness at last step's tension.
+        # Without muscles and contact.
         free = problem.residual(foreseen, None).ravel()
         solved = response.tangent.solve(np.column_stack([problem.dt * (members.T @ each.T).T, free]))
         torques = problem.dt * weight * (contacts.frame @ problem.turns).T

@@ -6,7 +6,7 @@ See docs/concepts/locomotion.md.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -22,7 +22,7 @@ from egs_warp.locomotion.complementarity import (
     states_from_prediction,
     states_of_pairs,
 )
-from egs_warp.locomotion.contact_pieces import ContactModes, ContactPieces, PieceSearch, search_pieces
+from egs_warp.locomotion.contact_pieces import ContactModes, ContactPieces, PieceSearch, search_pieces, solve_relaxed
 from egs_warp.locomotion.lemke import lemke
 from egs_warp.locomotion.program import ContactProgram
 from egs_warp.locomotion.solvers import QpSolution, QpSolver, QpStatus, QuadraticProgram, quadratic_program
@@ -37,6 +37,8 @@ IMMATERIAL = 0.01
 """Unless there is no more to gain than this share of what it costs to do nothing,
 to fall without muscles and ground.
 """
+COSTLY = 0.3
+"""Of the end of a step: what costs less is not doubted."""
 PRESSED = 1e-3
 """Body weights, of a contact that holds."""
 PATIENCE = 3
@@ -191,8 +193,12 @@ def search_program(
     strategy, friction = Strategy(strategy), program.friction
     if strategy is Strategy.PIECES:
         start = np.concatenate([foreseen.activations, foreseen.forces.ravel()])
-        modes = ContactModes.of(foreseen.forces, friction)
-        return search_pieces(program, start, modes, qp_limit=qp_limit, solver=solver)
+        found = search_pieces(
+            program, start, ContactModes.of(foreseen.forces, friction), qp_limit=qp_limit, solver=solver
+        )
+        if found.objective < COSTLY or program.contacts == 0:
+            return found
+        return _searched_elsewhere(program, found, foreseen.forces, qp_limit=qp_limit, solver=solver)
     paired = ContactProgram.of(program, directions)
     predicted = states_from_prediction(
         foreseen.forces[:, 0], foreseen.forces[:, 1:], foreseen.velocities[:, 1:], friction, directions
@@ -200,6 +206,22 @@ def search_program(
     found = find_states(paired, strategy, predicted, foreseen.activations, qp_limit=qp_limit, solver=solver)
     x = None if found.y is None else paired.forces_of(found.y)
     return PieceSearch(x, found.objective, found.qp_count, found.infeasible)
+
+
+def _searched_elsewhere(
+    program: ContactPieces, found: PieceSearch, forces: np.ndarray, *, qp_limit: int, solver: QpSolver | str
+) -> PieceSearch:
+    """The better of ``found`` and of a search from where the optimum without complementarity would end up under true
+    contact; ``forces`` (n, 3) are a guess."""
+    relaxed = solve_relaxed(program, solver)
+    found = replace(found, qp_count=found.qp_count + 1)
+    if relaxed is None or found.objective <= DOUBTFUL * relaxed[1]:
+        return found
+    start = program.under(relaxed[0], forces)
+    modes = ContactModes.of(start[program.activations :].reshape(-1, 3), program.friction)
+    other = search_pieces(program, start, modes, qp_limit=qp_limit, solver=solver)
+    best = min(found, other, key=lambda search: search.objective)
+    return replace(best, qp_count=found.qp_count + other.qp_count, infeasible=found.infeasible + other.infeasible)
 
 
 def find_states(

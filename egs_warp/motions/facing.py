@@ -17,6 +17,8 @@ class Facing(Protocol):
     """From the start to the landing."""
     turned: float
     """From the start until now, counted beyond whole turns."""
+    lands_at: float
+    """What ``turned`` will be at touch-down, as the body flies; told by ``airborne_pose``."""
 
     def see(self, heading: float) -> None:
         """Told before each step: how the body faces, from the start, whole turns apart."""
@@ -42,6 +44,7 @@ class Straight:
 
     turn = 0.0
     turned = 0.0
+    lands_at = 0.0
 
     def see(self, heading: float) -> None:
         """Nothing depends on it."""

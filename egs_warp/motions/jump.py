@@ -357,7 +357,9 @@ class Jump:
         capture_time = stopping_time(self.pose.standing_height, falling, self.gravity)
         capture = touch_down[:2] + seen.velocity[:2] * capture_time + self.pose.base_offset
         low, high = self.pose.support_low, self.pose.support_high
-        goal = self._start_base - RUN_ON * self._time_unit * seen.velocity[:2]
+        # Feet on legs are put down where they are asked to be.
+        run_on = 0.0 if self._feet else RUN_ON
+        goal = self._start_base - run_on * self._time_unit * seen.velocity[:2]
         return np.clip(goal, capture + FOOTHOLD * low, capture + FOOTHOLD * high)
 
     def _write(

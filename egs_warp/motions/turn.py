@@ -41,7 +41,7 @@ class Turn:
         self._goal = place.ground.origin + target.distance * place.ground.axes[0]
         self._left = turn
         self._missing: float | None = None
-        """Radians that the present jump, once it has landed, leaves of the turn."""
+        """Radians that the present jump, once it is in the air, leaves of the turn."""
         first = twist(place, target, turn)
         self.most_in_a_jump = RESERVE * largest_turn(first, place)
         self._one_jump = abs(turn) <= self.most_in_a_jump
@@ -55,8 +55,15 @@ class Turn:
             # What makes up for a landing is a small turn, and hits.
             count = before + (1.0 if before else USUAL_JUMPS) * max(abs(self._left) / at_once, 1.0)
         else:
-            count = before + 1 + (np.ceil(abs(self._missing) / at_once) if abs(self._missing) > TOLERANCE else 0)
+            further = np.ceil(abs(self._missing) / at_once)
+            count = before + 1 + further * self._chance_of_another(abs(self._missing))
         return float(min(count, MOST_JUMPS)) * self.jumps[0].expected_time
+
+    def _chance_of_another(self, missing: float) -> float:
+        """Chance of another jump, by what is ``missing``; in the air, where it will land is not certain."""
+        if self.jumps[-1].phase is JumpPhase.FLIGHT:
+            return min(missing / (2.0 * TOLERANCE), 1.0)
+        return float(missing > TOLERANCE)
 
     @property
     def resting(self) -> bool:
@@ -87,7 +94,7 @@ class Turn:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
         result = self.jumps[-1].objectives(state, report, dt)
         jump = self.jumps[-1]
-        self._missing = None
+        self._missing = self._left - jump.facing.lands_at if jump.phase is JumpPhase.FLIGHT else None
         if jump.phase in (JumpPhase.LAND, JumpPhase.REST):
             # The frame of a landed jump is turned by what was asked of it, so its feet tell what it fell short by.
             self._missing = self._left - jump.facing.turn - jump.pose.sole_heading(state.positions)

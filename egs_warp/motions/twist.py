@@ -15,7 +15,7 @@ from egs_warp.motions.stance import PoseFamily
 
 AIRBORNE_SHARE = 0.88
 """Of the planned time of flight the body is off the ground: it stretches before it leaves it and before it lands."""
-SPARE_SPIN = 1.27
+SPARE_SPIN = 1.15
 """Spin is built with this factor in hand: the muscles fall short of what is asked, and wide in the air the body is
 slowed."""
 SLIDE = np.radians(5.0)
@@ -33,7 +33,7 @@ class Turning:
     """The ``Facing`` of a jump that turns."""
 
     def __init__(self, place: Place, turn: float) -> None:
-        self.body, self.turn, self.turned = place.body, turn, 0.0
+        self.body, self.turn, self.turned, self.lands_at = place.body, turn, 0.0, 0.0
         up = place.ground.axes[2]
         self._standing_inertia = float(up @ place.body.inertia(place.standing) @ up)
 
@@ -51,8 +51,9 @@ class Turning:
 
     def airborne_pose(self, pose: np.ndarray, momentum: np.ndarray, up: np.ndarray, left: float) -> np.ndarray:
         """Arms in, arms out: as wide as makes, with the spin that there is, the turn that is left."""
-        to_turn, yaw = self._left_to_turn(), float(up @ momentum)
-        ratio = yaw * left / (self._standing_inertia * to_turn) if yaw * to_turn > 0.0 else np.inf
+        to_turn, turning = self._left_to_turn(), float(up @ momentum) * left / self._standing_inertia
+        self.lands_at = self.turned + turning
+        ratio = turning / to_turn if turning * to_turn > 0.0 else np.inf
         width = float(np.sqrt(np.clip(ratio, 1.0 / WIDEST**2, WIDEST**2)))
         return pose @ (width * np.eye(3) + (1.0 - width) * np.outer(up, up))
 

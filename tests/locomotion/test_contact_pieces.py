@@ -14,8 +14,10 @@ from egs_warp.locomotion.contact_pieces import (
     ContactPieces,
     search_pieces,
     solve_piece,
+    solve_relaxed,
 )
 from egs_warp.locomotion.solvers import QpSolver
+from egs_warp.locomotion.strategies import COSTLY, Foreseen, Strategy, search_program
 
 FRICTION = 0.6
 CONTACTS = 3
@@ -78,6 +80,35 @@ def test_the_search_ends_where_no_activations_near_by_do_better(solver: QpSolver
         best += min(others) > reached - 0.02 * (first - reached) - 1e-6
         gained += reached < first - 1e-3
     assert best >= 7 and gained >= 10
+
+
+def test_what_costs_much_is_searched_from_elsewhere_too() -> None:
+    """Where forces need not be what contact answers, no end costs more than any under exact contact (a grid over all
+    activations); a search that begins there as well is never worse, now and then much better, and its end is one of
+    exact contact.
+    """
+    grid = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 13)] * 2), axis=-1).reshape(-1, 2)
+    better = worse = costly = 0
+    for seed in range(40):
+        program = random_program(seed)
+        start, modes = started(program)
+        alone = search_pieces(program, start, modes, qp_limit=12, solver=QpSolver.OSQP)
+        relaxed = solve_relaxed(program, QpSolver.OSQP)
+        assert relaxed is not None
+        cheapest = min(program.objective(under(program, a)) for a in grid)
+        assert relaxed[1] <= cheapest + 1e-4 * (1.0 + cheapest)
+        foreseen = Foreseen(start[:2], start[2:].reshape(-1, 3), np.zeros((CONTACTS, 3)))
+        both = search_program(program, Strategy.PIECES, foreseen, directions=4, qp_limit=12)
+        costly += alone.objective >= COSTLY
+        if alone.objective < COSTLY:
+            assert both.objective == alone.objective and both.qp_count == alone.qp_count
+            continue
+        assert both.objective <= alone.objective and both.qp_count > alone.qp_count
+        assert both.x is not None and alone.x is not None
+        before, after = (program.objective(under(program, x[:2])) for x in (alone.x, both.x))
+        better += after < 0.9 * before
+        worse += after > 1.05 * before
+    assert costly >= 20 and better >= 3 and worse == 0
 
 
 def test_within_a_piece_the_plan_is_what_contact_answers() -> None:

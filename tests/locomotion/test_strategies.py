@@ -171,8 +171,9 @@ def test_every_strategy_solves_the_same_program() -> None:
             assert found.x is not None and found.qp_count > 0
             forces = found.x[3:].reshape(-1, 3)
             slack = FRICTION * forces[:, 0] - np.linalg.norm(forces[:, 1:], axis=1)
-            # The pieces hold the cone by a pyramid around their start, which sliding contacts may leave by little.
-            assert np.abs(found.x[:3]).max() <= 1.0 + 1e-6 and slack.min() > -1e-5 - 0.03 * np.abs(forces).max()
+            # The pieces hold the cone by a pyramid around their start, which may break a face by 0.02 and its load too.
+            broken = 0.03 if strategy is Strategy.PIECES else 1e-5
+            assert np.abs(found.x[:3]).max() <= 1.0 + 1e-6 and slack.min() > -broken
             assert found.objective == pytest.approx(pieces.objective(found.x), rel=1e-4, abs=1e-4)
             reached[strategy].append(found.objective)
     means = {strategy: float(np.mean(values)) for strategy, values in reached.items()}
