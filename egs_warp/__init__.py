@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from egs_warp.locomotion.settings import LocomotionSettings
     from egs_warp.locomotion.strategies import Strategy
     from egs_warp.locomotion.trajectory import Trajectory
+    from egs_warp.motions.push import Push, read_pushes
     from egs_warp.motions.script import Script, motion
     from egs_warp.pipelines.animate import AnimateOptions, animate
     from egs_warp.pipelines.creature import Creature, make_creature
@@ -81,6 +82,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "locomotion.settings": ("LocomotionSettings",),
     "locomotion.strategies": ("Strategy",),
     "locomotion.trajectory": ("Trajectory",),
+    "motions.push": ("Push", "read_pushes"),
     "motions.script": ("Script", "motion"),
     "pipelines.animate": ("AnimateOptions", "animate"),
     "pipelines.creature": ("Creature", "make_creature"),
@@ -122,6 +124,7 @@ __all__ = [
     "Performance",
     "Plane",
     "PreparedScene",
+    "Push",
     "Rates",
     "Reach",
     "Report",
@@ -153,6 +156,7 @@ __all__ = [
     "psnr",
     "read_cameras",
     "read_capture",
+    "read_pushes",
     "render_gaussians",
     "render_torch",
     "scene",

@@ -63,6 +63,10 @@ def add_parser(commands: Commands) -> None:
         help="rise of the centre of mass, body heights: of a jump (0.2), hop (0.3) or twist (0.3)",
     )
     motion.add_argument("--heading-degrees", type=float, help="of a twist, counter-clockwise from above (180)")
+    motion.add_argument(
+        "--push",
+        help='what hits it: seconds, impulse (m sqrt(g H)), way, part of the height: "0.5 0.1 left, 1-2 0.3 back 0.8"',
+    )
     motion.add_argument("--frames", type=int, help="pictures at 60 Hz, the first at rest (until the body rests)")
     body = animate.add_argument_group("body and ground")
     body.add_argument("--up", help="axis that points up: x, y, z or with a minus, as --up=-y; else it is guessed")
@@ -233,6 +237,7 @@ def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
     """
     from egs_warp.contact.terrain import read_terrain
     from egs_warp.io.text import parse_json, read_text
+    from egs_warp.motions.push import read_pushes
     from egs_warp.motions.script import motion
     from egs_warp.pipelines.animate import AnimateOptions
 
@@ -241,10 +246,13 @@ def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
     options = AnimateOptions(**given, shadow=not chosen.no_shadow)
     # The files of key frames are read, too.
     motion(chosen.motion, **options.targets()).frames()
+    if chosen.push is not None:
+        read_pushes(chosen.push)
     if chosen.muscles is not None:
         parse_json(read_text(chosen.muscles), chosen.muscles)
     return {
         "motion": chosen.motion,
+        "push": chosen.push,
         "front": parse_direction("front", chosen.front) if chosen.front is not None else None,
         "gravity_up": parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up is not None else None,
         "muscles_file": chosen.muscles,

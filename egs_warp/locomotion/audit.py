@@ -70,6 +70,10 @@ def _momentum_residuals(t: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     force, torque = np.zeros((len(t.dt), 3)), np.zeros((len(t.dt), 3))
     np.add.at(force, t.contact_step, t.contact_force)
     np.add.at(torque, t.contact_step, np.cross(_start_points(t) - com[t.contact_step], t.contact_force))
+    if len(t.kick_step):
+        impulses = t.node_mass[:, None] * t.kick_velocity / t.dt[t.kick_step, None, None]
+        np.add.at(force, t.kick_step, impulses.sum(axis=1))
+        np.add.at(torque, t.kick_step, np.cross(arms[t.kick_step], impulses).sum(axis=1))
     dt = t.dt[:, None]
     moved = np.diff(t.positions, axis=0) / dt[:, None]
     drag_force = t.drag * np.einsum("n,fni->fi", t.node_mass, moved)

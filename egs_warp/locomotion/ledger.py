@@ -17,6 +17,7 @@ STORED = ("kinetic_com", "kinetic_rotation", "kinetic_deformation", "potential",
 """Energies of a state."""
 FLOWS = (
     "muscles",
+    "pushes",
     "damping",
     "drag",
     "friction",
@@ -50,6 +51,8 @@ class Ledger:
     """(F+1,) Neo-Hookean (Eq. 5)."""
     muscles: np.ndarray
     """(F,) sum of T (L before - L after)."""
+    pushes: np.ndarray
+    """(F,) what is given to the nodes from outside as the step begins."""
     damping: np.ndarray
     """(F,) what the material dissipates."""
     drag: np.ndarray
@@ -157,6 +160,7 @@ def _flows(t: Trajectory, body: _Elements, muscles: _Muscles, step: int) -> tupl
     dt, mass = float(t.dt[step]), t.node_mass
     before, after = t.positions[step], t.positions[step + 1]
     way = after - before
+    kick = t.kick_velocity[t.kick_step == step].sum(axis=0) if len(t.kick_step) else np.zeros_like(way)
     # That of the equation of motion; a spin may have been added to what was stored.
     velocity = way / dt
     strain = body.step(before, after, dt)
@@ -169,12 +173,13 @@ def _flows(t: Trajectory, body: _Elements, muscles: _Muscles, step: int) -> tupl
     friction, contact, push_out = _contacts(t, step, way)
     return (
         pull.work,
+        float(mass @ (kick * (t.velocities[step] + 0.5 * kick)).sum(axis=1)),
         strain.dissipated,
         -t.drag * dt * _squared(mass, velocity),
         friction,
         contact,
         push_out,
-        -0.5 * _squared(mass, velocity - t.velocities[step]),
+        -0.5 * _squared(mass, velocity - t.velocities[step] - kick),
         strain.lost_elastic,
         pull.lost,
         strain.lost_damping,

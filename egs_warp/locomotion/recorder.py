@@ -45,14 +45,17 @@ class Recorder:
         self._steps = self._written = self._asked_steps = 0
         self._reports: list[StepReport] = []
         self._asked: list[tuple[int, int]] = []
+        self._kicks: list[tuple[int, np.ndarray]] = []
         self.start = self._first(body, muscles, geometry, start, start_gap, drag, frame)
         """The first part."""
         self._parts = [self.start]
 
-    def add(self, reports: Sequence[StepReport], *, asked: int = 0) -> None:
+    def add(self, reports: Sequence[StepReport], *, asked: int = 0, kick: np.ndarray | None = None) -> None:
         """Write down the next steps, into which one that was asked for was divided; ``asked`` is the ``digest`` of its
-        objectives.
+        objectives, ``kick`` (N, 3) m/s what its nodes were given from outside as it began.
         """
+        if kick is not None:
+            self._kicks.append((self._steps + len(self._reports), kick))
         self._reports += reports
         self._asked += [(self._asked_steps, asked)] * len(reports)
         self._asked_steps += 1
@@ -123,6 +126,8 @@ class Recorder:
             "contact_normal": np.zeros((0, 3)),
             "contact_force": np.zeros((0, 3)),
             "contact_gap": np.zeros(0),
+            "kick_step": np.zeros(0, np.int32),
+            "kick_velocity": np.zeros((0, *start.positions.shape)),
         }
         if geometry.field is not None:
             part |= {
@@ -143,6 +148,7 @@ class Recorder:
         """The steps since the last part."""
         reports, self._reports = self._reports, []
         asked, self._asked = self._asked, []
+        kicks, self._kicks = self._kicks, []
         counts = [report.contacts.count for report in reports]
         part = {
             "time": np.array([report.state.time for report in reports]),
@@ -160,6 +166,8 @@ class Recorder:
             "contact_gap": np.concatenate([report.end_gaps for report in reports]),
             "contact_point": np.concatenate([report.contacts.points for report in reports]),
             "contact_load": np.concatenate([report.forces for report in reports]),
+            "kick_step": np.array([step for step, _ in kicks], np.int32),
+            "kick_velocity": np.array([kick for _, kick in kicks]).reshape(-1, *reports[0].state.positions.shape),
             "asked_step": np.array([step for step, _ in asked]),
             "asked_digest": np.array([number for _, number in asked], np.uint64),
             **{name: np.array([getattr(report, name) for report in reports]) for name in REPORTED},

@@ -90,6 +90,7 @@ def roll_out(
     parts: Callable[[], Path] | None = None,
     resume: Path | None = None,
     finished: Callable[[], bool] = lambda: False,
+    kicks: Callable[[float, float], np.ndarray | None] = lambda time, dt: None,
     progress: Callable[[int], object] = lambda frame: None,
 ) -> Simulation:
     """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``, or a step
@@ -97,7 +98,8 @@ def roll_out(
 
     ``step``: seconds that a solver step takes at most, see ``solver_steps``. ``place`` is where the body lies in its
     capture; steps are written into the folder that ``parts`` tells as they are done (``Recorder``); those in the folder
-    ``resume`` are not solved again (``Replay``). ``progress`` is told each frame done.
+    ``resume`` are not solved again (``Replay``). ``kicks`` tells the velocities (N, 3) m/s that something from outside
+    gives the nodes in the step from a time on, if anything does. ``progress`` is told each frame done.
     """
     dt, per_frame = solver_steps(stepper.body, step)
     state, memory = start, stepper.initial_memory()
@@ -122,13 +124,16 @@ def roll_out(
             objectives = motion.objectives(state, reports[-1] if reports else None, dt)
             asked = digest(objectives)
             done = replay.step(asked) if replay is not None else []
-            done = done or _advanced(stepper, state, memory, objectives, dt)
+            kick = kicks(state.time, dt)
+            # An implicit step from there is, to the letter, the step from ``state`` under the impulse.
+            start = state if kick is None else replace(state, velocities=state.velocities + kick)
+            done = done or _advanced(stepper, start, memory, objectives, dt)
             stopped = not done
             if stopped:
                 break
             state, memory = done[-1].state, StepMemory.after(done[-1])
             reports.extend(done)
-            recorder.add(done, asked=asked)
+            recorder.add(done, asked=asked, kick=kick)
         if shown[-1] < len(reports):
             shown.append(len(reports))
         progress(frame)

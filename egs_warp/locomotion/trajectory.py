@@ -34,6 +34,8 @@ CONTACTS = (
     "contact_gap",
 )
 """Arrays of C rows."""
+KICKS = ("kick_step", "kick_velocity")
+"""Arrays of a row for each step that something from outside pushes in."""
 FIRST_PART = "start.npz"
 """Of a recording that goes on: what never changes, and the state it began at."""
 DAMAGES = (
@@ -121,6 +123,10 @@ class Trajectory:
     """Metres between its nodes."""
     ground_coefficients: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     """(rows, columns) metres, of its biquadratic B-spline (``HeightField``); of none where the ground is flat."""
+    kick_step: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
+    """(K,) int32: steps in which something from outside pushed."""
+    kick_velocity: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    """(K, N, 3) m/s that it gave the nodes as the step began."""
     planned_com: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     """(F+1, 3) centre of mass as planned, NaN where nothing was; or no rows."""
     body_axes: np.ndarray = field(default_factory=lambda: np.eye(3))
@@ -156,7 +162,7 @@ class Trajectory:
     def joined(cls, parts: Sequence[dict[str, np.ndarray]]) -> Trajectory:
         """Of the parts of a recording, the first of which holds the start and all that never changes."""
         values = dict(parts[0])
-        for name in (*STATES, *STEPS, *CONTACTS):
+        for name in (*STATES, *STEPS, *CONTACTS, *KICKS):
             values[name] = np.concatenate([part[name] for part in parts])
         return cls._of(values)
 

@@ -15,11 +15,14 @@ from egs_warp.motions.keyframes import Key, read_keyframes
 from egs_warp.motions.request import LARGEST_TARGET, LARGEST_TURN, MotionRequest, Value
 from egs_warp.motions.route import Route, along, read_path, straight, turning
 from egs_warp.motions.sequence import BodyMotion, Part, Place
+from egs_warp.motions.stand import StandFor
 from egs_warp.motions.turn import Turn
 from egs_warp.motions.walk import Walk
 
 _PACE = 0.1
 """Body heights."""
+_CALMING = 120
+"""Frames after it has stood for its time within which a body that was pushed is at rest."""
 TRAJECTORY_TAIL = 200
 """Frames after the last key of a trajectory within which the body is at rest."""
 
@@ -91,6 +94,11 @@ def _walks_along(request: MotionRequest, height: float) -> list[Part]:
 def _turns_on_the_spot(request: MotionRequest, height: float) -> list[Part]:
     angle = float(np.radians(request.asked["heading_degrees"]))
     return _walking(request, {**request.asked, "distance": 0.0}, turning(angle), height)
+
+
+def _stands(request: MotionRequest, height: float) -> list[Part]:
+    seconds = request.asked["seconds"]
+    return _repeated(request, request.asked, lambda place: StandFor(place, seconds))
 
 
 def _path(request: MotionRequest) -> np.ndarray:
@@ -175,6 +183,11 @@ REPERTOIRE: Mapping[str, MotionKind] = {
         (Value("heading_degrees", 90.0, -LARGEST_TURN, LARGEST_TURN, "degrees"), _SPEED),
         _turns_on_the_spot,
         lambda request: _frames_of_walk(_ROUND * abs(request.asked["heading_degrees"]) / 360.0, request),
+    ),
+    "stand": MotionKind(
+        (Value("seconds", 2.0, 0.0, 60.0, "seconds", above=True),),
+        _stands,
+        lambda request: int(np.ceil(60.0 * request.asked["seconds"])) + _CALMING,
     ),
     "trajectory": MotionKind(
         (),

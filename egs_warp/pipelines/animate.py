@@ -18,6 +18,7 @@ from egs_warp.io.run_folder import RunFolder, run_folder
 from egs_warp.io.video import ffmpeg_program
 from egs_warp.locomotion.ledger import ledger
 from egs_warp.locomotion.settings import LocomotionSettings
+from egs_warp.motions.push import read_pushes
 from egs_warp.motions.request import LARGEST_TARGET, LARGEST_TURN
 from egs_warp.motions.script import motion as script
 from egs_warp.pipelines import drawn
@@ -95,6 +96,7 @@ class Asked:
     view_from: tuple[float, ...]
     gravity_up: tuple[float, ...]
     front: tuple[float, ...]
+    push: str | None
     muscles: str | None
     """Name of the file."""
     solids: int
@@ -110,6 +112,7 @@ def animate(
     out: Path | str | RunFolder,
     *,
     motion: str = "jump",
+    push: str | None = None,
     up: np.ndarray | None = None,
     plane: Plane | None = None,
     ground: HeightField | None = None,
@@ -132,6 +135,7 @@ def animate(
     """Bring ``cloud`` (scene units) to life and write video, contact sheet, plots, report and trajectory into ``out``.
 
     ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.motions.script``).
+    ``push``: what hits it meanwhile (``egs_warp.motions.push``).
     ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
     the object to the camera; ``shot``: how it is filmed. ``ground``, ``muscles_file``, ``solids``, ``gravity_up``,
     ``front``, ``seen_from``, ``settings``: see ``make_creature``. Returns what it wrote as ``report.json``
@@ -143,6 +147,7 @@ def animate(
     shot.check()
     asked = script(motion, **options.targets())
     asked.frames()  # reads the files that it names
+    pushes = read_pushes(push) if push is not None else ()
     ffmpeg_program()
     with run_folder(out, overwrite=overwrite, resume=resume) as run:
         with preparation_bar(quiet=quiet) as begins:
@@ -169,6 +174,7 @@ def animate(
                 creature,
                 asked,
                 frames=options.frames,
+                pushes=pushes,
                 parts=lambda: run.file(PARTS),
                 resume=_recorded(run),
                 progress=told,
@@ -200,6 +206,7 @@ def animate(
             view_from=_numbers(view_from),
             gravity_up=_numbers(gravity_up),
             front=_numbers(front),
+            push=push,
             muscles=None if muscles_file is None else Path(muscles_file).name,
             solids=len(solids),
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.locomotion.rollout import FRAME_RATE, Simulation, roll_out
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.fall import FallWatch
+from egs_warp.motions.push import Kicks, Push
 from egs_warp.motions.script import Script
 from egs_warp.motions.sequence import MotionSequence, Place
 from egs_warp.pipelines.creature import Creature, first_place
@@ -129,6 +130,7 @@ def simulate(
     *,
     frames: int | None = None,
     step: float | None = None,
+    pushes: Sequence[Push] = (),
     parts: Callable[[], Path] | None = None,
     resume: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, expected: None,
@@ -136,10 +138,10 @@ def simulate(
     """Run ``motion`` for ``frames`` pictures at 60 Hz, the first of them at rest, or else until the body has come to
     rest or fallen, or the motion is cut off.
 
-    ``step``: the seconds of a solver step, if not the usual; ``parts`` tells the folder that takes the steps as they
-    are done, ``resume`` is that of a run that was cut off and goes on. ``progress`` is told after each frame how
-    many are done, and how many are expected in all by now. Raises ``UserError`` for a motion that the body cannot do,
-    and a folder that another run has left.
+    ``step``: the seconds of a solver step, if not the usual; ``pushes``: what hits it meanwhile; ``parts`` tells the
+    folder that takes the steps as they are done, ``resume`` is that of a run that was cut off and goes on.
+    ``progress`` is told after each frame how many are done, and how many are expected in all by now. Raises
+    ``UserError`` for a motion that the body cannot do, and a folder that another run has left.
     """
     check_frames(frames)
     place = first_place(creature, step=step)
@@ -162,6 +164,7 @@ def simulate(
         parts=parts,
         resume=resume,
         finished=lambda: frames is None and watch.finished,
+        kicks=Kicks(place, pushes),
         progress=lambda last: progress(
             last + 1, outlook.frames(last + 1, finished=watch.finished) if frames is None else most
         ),

@@ -24,6 +24,7 @@ _STORED = {
 }
 _FLOWS = {
     "muscles": ("muscles",),
+    "pushes": ("pushes",),
     "damping": ("damping",),
     "friction": ("friction",),
     "contact and push-out": ("contact", "push_out"),

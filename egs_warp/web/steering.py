@@ -24,7 +24,8 @@ from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.script import Script, motion
 from egs_warp.motions.sequence import Done, Part, Place
 from egs_warp.motions.stance import sole_shares
-from egs_warp.web.standing import Lie, Stand, tilt_degrees
+from egs_warp.motions.stand import Stand
+from egs_warp.web.standing import Lie, tilt_degrees
 
 ARRIVED = 0.12
 """Body heights from the middle of the feet to the point that it was sent to."""

@@ -20,7 +20,7 @@ from tests.support.slides import slide
 
 CLOSES = 1e-6
 """Of m g H, in every step."""
-IDLE = {"spin_after", "push_out"}
+IDLE = {"spin_after", "push_out", "pushes"}
 """Flows that the slide does not have."""
 
 

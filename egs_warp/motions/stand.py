@@ -1,0 +1,112 @@
+"""A body stands where its feet are, upright: for a while, or between two motions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from egs_warp.fem.body import BodyState
+from egs_warp.locomotion.objectives import AnyObjective
+from egs_warp.locomotion.stepper import StepReport
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.sequence import Place
+from egs_warp.motions.stance import CALM, Calm, PoseFamily, Weights
+
+_RATE = 4.0
+"""Over sqrt(H / g): how fast the centre of mass comes back over the feet."""
+
+
+@dataclass(frozen=True)
+class StandPlan:
+    """What a body that stands aims at."""
+
+    seconds: float
+
+
+class Stand:
+    """Balances over the feet where they are, as a landed jump does, however long."""
+
+    def __init__(self, place: Place) -> None:
+        self.body = place.body
+        self.pose = PoseFamily(place.body, place.ground, place.standing, place.touching, place.friction)
+        self._gravity = float(np.linalg.norm(place.body.gravity))
+        self._time_unit = float(np.sqrt(place.body.height / self._gravity))
+        self._height = self.pose.standing_height
+        self._calm = Calm(place.body)
+        # It begins as the motion before has ended, at rest.
+        self._resting = True
+
+    @property
+    def resting(self) -> bool:
+        """Whether it stands calmly."""
+        return self._resting
+
+    def notes(self) -> list[str]:
+        """None: it has no target."""
+        return []
+
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
+        """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
+        seen = self.pose.measure(state, report)
+        slow = bool(np.linalg.norm(seen.velocity) <= CALM * np.sqrt(self._gravity * self.body.height))
+        self._resting = self._calm.held(seen.velocity, state.time) or (self._resting and slow)
+        rate = _RATE / self._time_unit
+        goal = np.array([*(seen.base - self.pose.base_offset), self._height])
+        acceleration = rate**2 * (goal - seen.com) - 2.0 * rate * seen.velocity
+        acceleration[:2] = self.pose.caught(seen, goal[:2])
+        acceleration[2] = max(acceleration[2], -0.8 * self._gravity)
+        velocity = seen.velocity + dt * acceleration
+        heading = self.pose.sole_heading(state.positions)
+        pose = self.pose.over_base(seen.com + dt * velocity, seen.base, heading)
+        upright = self.pose.turn_towards(state, pose) * 4.0 / self._time_unit
+        velocity, spin = self.pose.balanced(state, seen, velocity, upright, dt)
+        return self.pose.objectives(
+            state,
+            com_velocity=velocity,
+            pose=pose,
+            pose_rate=np.zeros((3, 3)),
+            spin=spin,
+            follow=6.0 / self._time_unit,
+            weights=Weights(),
+        )
+
+
+class StandFor:
+    """Stands for some seconds, and then until it is calm."""
+
+    def __init__(self, place: Place, seconds: float) -> None:
+        self.seconds, self._stand = seconds, Stand(place)
+        self._started: float | None = None
+        self._over = False
+
+    @property
+    def resting(self) -> bool:
+        """Whether the time is over and the body calm."""
+        return self._over and self._stand.resting
+
+    @property
+    def expected_time(self) -> float:
+        """Seconds until it is at rest."""
+        return self.seconds
+
+    def planned(self) -> StandPlan:
+        """For how long."""
+        return StandPlan(self.seconds)
+
+    def planned_com(self, elapsed: float) -> np.ndarray:
+        """(3,) where it stood."""
+        return np.zeros(3)
+
+    def reached(self, trajectory: Trajectory, first: int, last: int) -> None:
+        """Nothing beside what is measured of all motions."""
+
+    def notes(self) -> list[str]:
+        """None: it has no target."""
+        return []
+
+    def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> list[AnyObjective]:
+        """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
+        self._started = state.time if self._started is None else self._started
+        self._over = state.time - self._started >= self.seconds - 1e-9
+        return self._stand.objectives(state, report, dt)

@@ -1,0 +1,135 @@
+"""Pushes: impulses and gusts that momenta, ledger and audit know of; who stands keeps its feet, or falls."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egs_warp.errors import UserError
+from egs_warp.locomotion.audit import audit
+from egs_warp.locomotion.rollout import Simulation, roll_out
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.fall import FallWatch
+from egs_warp.motions.push import WAYS, Kicks, Push, read_pushes
+from egs_warp.motions.script import motion
+from egs_warp.motions.sequence import MotionSequence
+from tests.support.creatures import CoarseCreature, coarse_creature
+from tests.support.meshes import box_mesh
+from tests.support.places import DT, FORWARD
+
+LEFT = np.array(WAYS["left"])
+
+
+def block() -> CoarseCreature:
+    return coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD)
+
+
+@pytest.fixture(scope="module")
+def made() -> CoarseCreature:
+    return block()
+
+
+def stood(made: CoarseCreature, pushes: str, frames: int = 40, **given: Path) -> tuple[Simulation, str | None]:
+    """A block that is told to stand, and how it fell, if it did."""
+    place = made.place
+    watch = FallWatch(MotionSequence(place, motion("stand 0.5").parts(place.body.height)), place)
+    simulation = roll_out(
+        *(made.stepper, made.stepper.geometry, made.start, watch),
+        frames=frames,
+        kicks=Kicks(place, read_pushes(pushes)),
+        finished=lambda: watch.finished,
+        parts=(lambda: given["parts"]) if "parts" in given else None,
+        resume=given.get("resume"),
+    )
+    return simulation, watch.fallen
+
+
+@pytest.fixture(scope="module")
+def pushed(made: CoarseCreature) -> Trajectory:
+    simulation, fallen = stood(made, "0.1 0.06 left 0.8, 0.2-0.3 0.05 back")
+    assert fallen is None and all(report.converged for report in simulation.reports)
+    return simulation.trajectory
+
+
+@pytest.mark.parametrize("dt", [1 / 60, 0.013, 0.2])
+@pytest.mark.parametrize("push", [Push(0.25, LEFT), Push(0.25, LEFT, lasts=0.31), Push(0.0, LEFT, lasts=0.001)])
+def test_steps_share_out_all_of_a_push(push: Push, dt: float) -> None:
+    shares = [push.share(step * dt, dt) for step in range(int(np.ceil(1.0 / dt)))]
+    assert sum(shares) == pytest.approx(1.0) and min(shares) >= 0.0
+    if push.lasts == 0.0:
+        assert sorted(shares)[-2:] == [0.0, 1.0]
+
+
+def test_a_push_has_its_momentum_and_its_arm(made: CoarseCreature) -> None:
+    """m sqrt(g H) is that of the whole body at its unit of speed; what hits it high turns it, what takes all of it
+    does not."""
+    place, body = made.place, made.place.body
+    for height in (None, 0.9, 0.1):
+        kick = Kicks(place, [Push(0.0, 0.3 * LEFT, height)])(0.0, DT)
+        assert kick is not None
+        momentum = body.node_mass @ kick
+        np.testing.assert_allclose(momentum, 0.3 * body.mass * body.speed_unit * place.ground.axes[1], atol=1e-12)
+        turning = place.ground.axes @ body.angular_momentum(place.standing, kick)
+        sign = {None: 0.0, 0.9: -1.0, 0.1: 1.0}[height]
+        unit = body.mass * body.speed_unit * body.height
+        assert abs(turning[0]) < 1e-12 * unit if height is None else sign * turning[0] > 0.05 * unit
+    assert Kicks(place, [Push(0.5, LEFT)])(0.0, DT) is None
+
+
+def test_the_books_hold_what_was_given(pushed: Trajectory) -> None:
+    """Both momenta and the energy of every step, as without pushes; not with one left out or a hundredth stronger."""
+    assert len(pushed.kick_step) == 1 + 6
+    held = audit(pushed)
+    assert held.energy_residual < 1e-8
+    assert held.momentum_residual < 1e-6 and held.angular_momentum_residual < 1e-6
+    left_out = replace(pushed, kick_step=pushed.kick_step[1:], kick_velocity=pushed.kick_velocity[1:])
+    for wrong in (left_out, replace(pushed, kick_velocity=1.01 * pushed.kick_velocity)):
+        found = audit(wrong)
+        assert found.energy_residual > 1e-6
+        assert found.momentum_residual > 1e-4 and found.angular_momentum_residual > 1e-5
+
+
+def test_who_is_pushed_goes_along_and_keeps_its_feet(made: CoarseCreature, pushed: Trajectory) -> None:
+    """A tenth of a second after the first push its centre of mass is to the left, in the end upright and calm."""
+    place = made.place
+    com = np.array([place.body.centre_of_mass(place.ground.local(x)) for x in pushed.positions])
+    after = int(np.searchsorted(pushed.time, 0.2))
+    assert com[after, 1] > 0.005 > com[0, 1] + 0.001
+    assert np.linalg.norm(pushed.node_mass @ pushed.velocities[-1]) < 0.05 * place.body.mass * place.body.speed_unit
+
+
+def test_a_hard_push_throws_it_over(made: CoarseCreature) -> None:
+    _, fallen = stood(made, "0.05 1 left 0.9", frames=90)
+    assert fallen is not None
+
+
+def test_a_pushed_run_goes_on_to_the_same_bits(pushed: Trajectory, tmp_path: Path) -> None:
+    """It was cut off within the gust."""
+    parts = tmp_path / "parts"
+    stood(block(), "0.1 0.06 left 0.8, 0.2-0.3 0.05 back", frames=15, parts=parts)
+    whole, _ = stood(block(), "0.1 0.06 left 0.8, 0.2-0.3 0.05 back")
+    again, _ = stood(block(), "0.1 0.06 left 0.8, 0.2-0.3 0.05 back", resume=parts)
+    for name in ("positions", "velocities", "kick_step", "kick_velocity"):
+        np.testing.assert_array_equal(getattr(again.trajectory, name), getattr(whole.trajectory, name))
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("", "push 1 (''): give a time, an impulse and a way"),
+        ("0.5 0.1", "push 1 ('0.5 0.1'): give a time, an impulse and a way"),
+        ("0.5 0.1 left, soon 0.1 left", "push 2 ('soon 0.1 left'): time 'soon': give seconds"),
+        ("0.5 0.1 sideways", "unknown way 'sideways'; give one of ahead, back, left, right, up, down"),
+        ("0.5 nan left", "impulse nan: give m sqrt(g H) from 0 to 10"),
+        ("0.5 1e9 left", "impulse 1e9: give m sqrt(g H) from 0 to 10"),
+        ("2-1 0.1 left", "time 1: give seconds from 2 to 600"),
+        ("0.5 0.1 left 1.5", "height 1.5: give body heights from 0 to 1"),
+    ],
+)
+def test_a_bad_push_is_told_in_one_line(line: str, said: str) -> None:
+    with pytest.raises(UserError) as error:
+        read_pushes(line)
+    assert said in str(error.value) and "\n" not in str(error.value)
