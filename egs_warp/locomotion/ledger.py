@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -285,29 +286,49 @@ class _Pull:
 
 @dataclass(frozen=True)
 class _Muscles:
-    """Segments that pull with a constant tension along the line between their ends."""
+    """Segments that pull with a constant tension along the line between their ends, with less of it where they are
+    shorter than 0.7 of their rest length, and nothing below 0.3 (docs/concepts/muscles.md)."""
 
     starts: np.ndarray
     nodes: np.ndarray
     weights: np.ndarray
     segments: np.ndarray
     stiffness: np.ndarray
+    rest_positions: np.ndarray
 
     @classmethod
     def of(cls, t: Trajectory) -> _Muscles:
-        return cls(t.muscle_end_starts, t.muscle_end_nodes, t.muscle_end_weights, t.muscle_segments, t.muscle_stiffness)
+        return cls(
+            *(t.muscle_end_starts, t.muscle_end_nodes, t.muscle_end_weights, t.muscle_segments, t.muscle_stiffness),
+            t.rest_positions,
+        )
+
+    @cached_property
+    def _rest_lengths(self) -> np.ndarray:
+        return np.linalg.norm(self._lines(self.rest_positions), axis=1)
 
     def step(self, activations: np.ndarray, before: np.ndarray, after: np.ndarray) -> _Pull:
         """What all segments do in a step."""
         tension = self.stiffness * activations
         start, end = self._lines(before), self._lines(after)
         long, short = np.linalg.norm(start, axis=1), np.linalg.norm(end, axis=1)
-        directions = end / short[:, None]
-        work = tension * (long - short)
-        # T (L0 - L1 + u1.(x1 - x0)): a line that turns gets none of the force across it.
-        turned = 0.5 * long * ((start / long[:, None] - directions) ** 2).sum(axis=1)
-        torque = -np.cross(start, tension[:, None] * directions).sum(axis=0)
-        return _Pull(float(work.sum()), float(work[work > 0.0].sum()), -float(tension @ turned), torque)
+        limb = np.clip((short / self._rest_lengths - 0.3) / 0.4, 0.0, 1.0)
+        share = 3.0 * limb**2 - 2.0 * limb**3
+        work = tension * (self._pulled(long) - self._pulled(short))
+        directions = end / np.maximum(short, 1e-300)[:, None]
+        # The force of the end, share T u1, over the whole way: T (W0 - W1 + share u1.(x1 - x0)), W the length over
+        # which all of the tension would do as much. A line that turns gets none of the force across it, one that
+        # shortens below 0.7 the share of its end.
+        turned = 0.5 * share * long * ((start / np.maximum(long, 1e-300)[:, None] - directions) ** 2).sum(axis=1)
+        limped = self._pulled(long) - self._pulled(short) - share * (long - short)
+        torque = -np.cross(start, (tension * share)[:, None] * directions).sum(axis=0)
+        return _Pull(float(work.sum()), float(work[work > 0.0].sum()), -float(tension @ (turned + limped)), torque)
+
+    def _pulled(self, lengths: np.ndarray) -> np.ndarray:
+        """(M,) metres, the integral of the share of the tension that is left, from nothing to ``lengths`` (M,)."""
+        rest = self._rest_lengths
+        limb = np.clip((lengths / rest - 0.3) / 0.4, 0.0, 1.0)
+        return rest * (0.4 * limb**3 - 0.2 * limb**4) + np.maximum(lengths - 0.7 * rest, 0.0)
 
     def _lines(self, positions: np.ndarray) -> np.ndarray:
         """(M, 3) from each segment's first end to its second."""

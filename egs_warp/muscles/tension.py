@@ -10,24 +10,40 @@ import scipy.sparse as sparse
 
 from egs_warp.muscles.muscle_set import MuscleSet
 
+FULL, SLACK = 0.7, 0.3
+"""Of its rest length: a segment that is at least so long pulls with all its tension, one at most so long not at all."""
+
 
 def lines(rows: sparse.csr_matrix, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(M, 3) vectors in metres between the ends of segments with difference ``rows`` (M, N) at node ``positions``
-    (N, 3), and their lengths (M,); a segment whose ends coincide has length 1, so that it pulls nothing.
+    (N, 3), and their lengths (M,); a segment whose ends coincide has length 1e-300, and a direction of 0.
     """
     vectors = rows @ positions
-    lengths = np.linalg.norm(vectors, axis=1)
-    return vectors, np.where(lengths > 0.0, lengths, 1.0)
+    return vectors, np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)
+
+
+def shares_of_tension(shortened: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """phi, its integral from 0 and its derivative, each (M,), at lengths over rest lengths ``shortened`` (M,).
+
+    A muscle that has shortened far pulls less: the ascending limb of the force-length relation (Gordon, Huxley and
+    Julian 1966), here a smooth step from SLACK to FULL. With a tension that no length changes, two ends that are drawn
+    together meet in a point where the force has no direction, and no step has an end there.
+    """
+    width = FULL - SLACK
+    along = np.clip((shortened - SLACK) / width, 0.0, 1.0)
+    integral = width * along**3 * (1.0 - 0.5 * along) + np.maximum(shortened - FULL, 0.0)
+    return along**2 * (3.0 - 2.0 * along), integral, 6.0 * along * (1.0 - along) / width
 
 
 def muscle_columns(muscles: MuscleSet, positions: np.ndarray) -> sparse.csc_matrix:
     """A(p) of Eq. (7), (3N, M): newtons on each node's axes for each metre of activation, at node ``positions`` (N, 3).
 
-    Column j is k_j (B_i^T u - B_k^T u), u the unit vector from end i to end k: a_j > 0 contracts.
+    Column j is k_j phi (B_i^T u - B_k^T u), u the unit vector from end i to end k: a_j > 0 contracts.
     """
     rows = muscles.difference_rows
     vectors, lengths = lines(rows, positions)
-    pulls = -muscles.stiffness[:, None] * (vectors / lengths[:, None])
+    share, _, _ = shares_of_tension(lengths / muscles.rest_lengths)
+    pulls = -(muscles.stiffness * share)[:, None] * (vectors / lengths[:, None])
     entries = rows.data[:, None] * np.repeat(pulls, np.diff(rows.indptr), axis=0)
     # One entry of a segment's row is three of its column: x, y and z of the node.
     nodes = (3 * rows.indices[:, None] + np.arange(3)).ravel()
@@ -38,8 +54,9 @@ def muscle_columns(muscles: MuscleSet, positions: np.ndarray) -> sparse.csc_matr
 
 @dataclass(frozen=True)
 class MuscleTension:
-    """Segments that pull with constant tensions T over a step: V(p) = sum_j T_j |D_j p|, D_j p the vector between the
-    ends.
+    """Segments that pull with constant tensions T over a step: V(p) = sum_j T_j L_j Phi(|D_j p| / L_j), D_j p the
+    vector between the ends, L_j its length at rest, Phi the integral of phi (``shares_of_tension``): where no segment
+    is shorter than FULL of that, sum_j T_j |D_j p| and a constant.
 
     Its force is that of Eq. (7) at ``p``, so it turns with the body. Forces that keep the direction of the step's start
     instead are dead loads: they press on the elements without the tension's own stiffness T / L across the line, and
@@ -50,48 +67,64 @@ class MuscleTension:
     """(M, N) D."""
     tensions: np.ndarray
     """(M,) newtons, positive where the segment contracts."""
+    rest_lengths: np.ndarray
+    """(M,) metres."""
 
     @classmethod
     def of(cls, muscles: MuscleSet, activations: np.ndarray) -> MuscleTension:
         """Of all segments at ``activations`` (M,) metres."""
-        return cls(muscles.difference_rows, muscles.stiffness * activations)
+        return cls(muscles.difference_rows, muscles.stiffness * activations, muscles.rest_lengths)
 
     @cached_property
     def _ends(self) -> sparse.csr_matrix:
         return self.rows.T.tocsr()
 
+    def energy(self, positions: np.ndarray) -> float:
+        """Joules, V at node ``positions`` (N, 3)."""
+        _, lengths = lines(self.rows, positions)
+        return float((self.tensions * self.rest_lengths) @ shares_of_tension(lengths / self.rest_lengths)[1])
+
     def gradient(self, positions: np.ndarray) -> np.ndarray:
         """(N, 3) newtons: the derivative of V by the positions, minus the force of the muscles."""
         vectors, lengths = lines(self.rows, positions)
-        return self._ends @ ((self.tensions / lengths)[:, None] * vectors)
+        share, _, _ = shares_of_tension(lengths / self.rest_lengths)
+        return self._ends @ ((self.tensions * share / lengths)[:, None] * vectors)
 
     def hessian(self, positions: np.ndarray) -> TensionHessian:
         """The second derivative of V at ``positions``."""
         vectors, lengths = lines(self.rows, positions)
-        return TensionHessian(self.rows, vectors / lengths[:, None], self.tensions / lengths)
+        share, _, slope = shares_of_tension(lengths / self.rest_lengths)
+        return TensionHessian(
+            *(self.rows, vectors / lengths[:, None], self.tensions * share / lengths),
+            self.tensions * slope / self.rest_lengths,
+        )
 
 
 @dataclass(frozen=True)
 class TensionHessian:
-    """K = sum_j T_j / L_j D_j^T (I - u_j u_j^T) D_j, never formed: the ends are spread over dozens of nodes."""
+    """K = sum_j D_j^T (r_j (I - u_j u_j^T) + s_j u_j u_j^T) D_j, never formed: the ends are spread over dozens of
+    nodes.
+    """
 
     rows: sparse.csr_matrix
     """(M, N)."""
     directions: np.ndarray
     """(M, 3) u."""
-    rates: np.ndarray
-    """(M,) T / L, N/m."""
+    across: np.ndarray
+    """(M,) r, tension over length, N/m."""
+    along: np.ndarray
+    """(M,) s, how much more tension a metre of length gives, N/m; 0 where none is so short that it loses any."""
 
     def factors(self, *, least: float) -> tuple[np.ndarray, np.ndarray]:
-        """U (3N, 2m) and rates (2m,) with K = U diag(rates) U^T: two directions across each of the m segments whose
-        rate is above ``least`` of the largest.
+        """U (3N, n) and rates (n,) with K = U diag(rates) U^T: of each segment two directions across it and the one
+        along it, where its rate is above ``least`` of the largest.
         """
-        kept = np.flatnonzero(np.abs(self.rates) > least * np.abs(self.rates).max(initial=1e-300))
-        along = self.directions[kept]
-        axis = np.eye(3)[np.argmin(np.abs(along), axis=1)]
-        first = np.cross(along, axis)
-        first /= np.linalg.norm(first, axis=1, keepdims=True)
-        across = np.stack([first, np.cross(along, first)], axis=1)
-        rows = self.rows[kept].toarray()
-        U = np.einsum("mn,mci->nimc", rows, across).reshape(3 * rows.shape[1], 2 * len(kept))
-        return U, np.repeat(self.rates[kept], 2)
+        axis = np.eye(3)[np.argmin(np.abs(self.directions), axis=1)]
+        first = np.cross(self.directions, axis)
+        first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-300)
+        frames = np.stack([first, np.cross(self.directions, first), self.directions], axis=1)
+        rates = np.stack([self.across, self.across, self.along], axis=1)
+        segments, which = np.nonzero(np.abs(rates) > least * np.abs(rates).max(initial=1e-300))
+        rows = self.rows[segments].toarray()
+        U = np.einsum("mn,mi->nim", rows, frames[segments, which]).reshape(3 * rows.shape[1], len(segments))
+        return U, rates[segments, which]

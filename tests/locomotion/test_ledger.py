@@ -15,6 +15,7 @@ from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion import ledger as module
 from egs_warp.locomotion.ledger import FLOWS, STORED, Ledger, ledger
 from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.muscles.tension import MuscleTension
 from tests.support.places import DT
 from tests.support.slides import slide
 
@@ -78,20 +79,50 @@ def test_spin_that_is_added_after_a_step_counts(trajectory: Trajectory, share: f
     whole = StepProblem.spin(problem, problem.internal_gradient(velocities, None))
     added = np.linalg.solve(body.inertia(end), (1.0 - share) * problem.inertia @ whole)
     after = velocities + np.cross(added, end - body.centre_of_mass(end))
-    nothing = {name: getattr(trajectory, name)[:0] for name in vars(trajectory) if name.startswith("contact_")}
-    step = replace(
-        trajectory,
-        **nothing,
-        time=np.array([0.0, DT]),
-        dt=np.array([DT]),
-        positions=np.stack([positions, end]),
-        velocities=np.stack([state.velocities, after]),
-        activations=np.zeros_like(trajectory.activations[:1]),
-    )
+    step = one_step(trajectory, [positions, end], [state.velocities, after])
     books = ledger(step)
     assert worst(books) < 1e-9
     assert worst(replace(books, spin_after=1.1 * books.spin_after)) > CLOSES
     assert (np.abs(books.spin_inside).max() < 1e-9 * books.unit) == (share == 0.0)
+
+
+def one_step(
+    trajectory: Trajectory, positions: list[np.ndarray], velocities: list[np.ndarray], activations: float = 0.0
+) -> Trajectory:
+    """That of a step in the air between two states, all muscles at ``activations`` metres."""
+    nothing = {name: getattr(trajectory, name)[:0] for name in vars(trajectory) if name.startswith("contact_")}
+    return replace(
+        trajectory,
+        **nothing,
+        time=np.array([0.0, DT]),
+        dt=np.array([DT]),
+        positions=np.stack(positions),
+        velocities=np.stack(velocities),
+        activations=np.full_like(trajectory.activations[:1], activations),
+    )
+
+
+@pytest.mark.parametrize("height", [0.65, 0.5, 0.32])
+def test_muscles_that_lose_their_tension_count(trajectory: Trajectory, height: float) -> None:
+    """A block pressed flat, so that segments pass 0.7 or 0.3 of their rest length, or begin between them."""
+    stepper = slide().stepper
+    body, muscles = stepper.body, stepper.muscles
+    positions = body.mesh.nodes * [1.0, 1.0, height] + [0.0, 0.0, 1.0]
+    state = BodyState(positions, np.array([0.2, 0.1, 1.5 * (1.0 - height)]) * -body.mesh.nodes)
+    tension = MuscleTension.of(muscles, np.full(muscles.segment_count, 0.02))
+    problem = StepProblem(body, state, DT, trajectory.drag)
+    velocities, factors = problem.start, SparseFactors(body.assembly.upper_pattern)
+    for _ in range(40):
+        change = problem.tangent(factors, velocities, tension).solve(problem.residual(velocities, tension).ravel())
+        velocities = velocities - change.reshape(velocities.shape)
+    assert np.linalg.norm(problem.residual(velocities, tension)) < 1e-10 * problem.unit
+    end = problem.end_positions(velocities)
+    lengths = np.stack([muscles.lengths(positions), muscles.lengths(end)]) / muscles.rest_lengths
+    assert (((lengths > 0.3) & (lengths < 0.7)).any(axis=0) & (np.ptp(lengths, axis=0) > 0.01)).any()
+    books = ledger(one_step(trajectory, [positions, end], [state.velocities, velocities], 0.02))
+    assert worst(books) < 1e-9
+    for flow in ("muscles", "lost_muscle"):
+        assert worst(replace(books, **{flow: 1.1 * getattr(books, flow)})) > CLOSES, flow
 
 
 def test_each_stored_energy_counts(books: Ledger) -> None:

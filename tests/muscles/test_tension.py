@@ -40,33 +40,50 @@ def scattered(rng: np.random.Generator) -> MuscleTension:
     return MuscleTension.of(muscles, rng.uniform(-1.0, 1.0, muscles.segment_count) * muscles.bounds)
 
 
-def energy_of(tension: MuscleTension, x: np.ndarray) -> float:
-    """Joules, of all segments at node positions ``x`` (N, 3)."""
-    return float(tension.tensions @ np.linalg.norm(tension.rows @ x, axis=1))
-
-
 def dense(tension: MuscleTension, x: np.ndarray) -> np.ndarray:
     """(3N, 3N) stiffness of all segments."""
     across, rates = tension.hessian(x).factors(least=0.0)
     return (across * rates) @ across.T
 
 
-def test_force_and_stiffness_are_derivatives_of_the_energy() -> None:
-    """Central differences; the factors lack but the slackest segments."""
+@pytest.mark.parametrize("shortened", [1.0, 0.55, 0.2], ids=["long", "short", "slack"])
+def test_force_and_stiffness_are_derivatives_of_the_energy(shortened: float) -> None:
+    """Central differences; the factors lack but the slackest segments. Below 0.7 of the rest length the tension falls,
+    below 0.3 there is none.
+    """
     rng = np.random.default_rng(0)
     tension = scattered(rng)
-    x = ROD.nodes + rng.normal(0.0, 0.004, ROD.nodes.shape)
+    x = shortened * ROD.nodes + rng.normal(0.0, 0.004, ROD.nodes.shape)
     K = dense(tension, x)
     h = 1e-6
     for _ in range(3):
         along = rng.standard_normal(x.shape)
-        slope = (energy_of(tension, x + h * along) - energy_of(tension, x - h * along)) / (2 * h)
-        assert slope == pytest.approx(float((tension.gradient(x) * along).sum()), rel=1e-6)
+        slope = (tension.energy(x + h * along) - tension.energy(x - h * along)) / (2 * h)
+        exact = float((tension.gradient(x) * along).sum())
+        assert slope == pytest.approx(exact, rel=1e-6, abs=1e-9)
         change = (tension.gradient(x + h * along) - tension.gradient(x - h * along)) / (2 * h)
-        assert np.abs((K @ along.ravel()).reshape(x.shape) - change).max() < 1e-6 * np.abs(change).max()
+        assert np.abs((K @ along.ravel()).reshape(x.shape) - change).max() <= 1e-6 * np.abs(change).max()
     across, rates = tension.hessian(x).factors(least=1e-3)
-    assert across.shape[1] == len(rates) <= 2 * len(tension.tensions)
+    assert across.shape[1] == len(rates) <= 3 * len(tension.tensions)
     np.testing.assert_allclose((across * rates) @ across.T, K, rtol=0, atol=1e-3 * np.abs(K).max())
+
+
+def test_full_tension_has_the_energy_of_its_length() -> None:
+    """V = sum T L but for a constant where no segment is shorter than 0.7 of its rest length, so the force is
+    Eq. (7)'s; between 0.3 and 0.7 it does half the work of a full tension, and none below.
+    """
+    muscles = tendon(5)
+    activations = np.linspace(0.1, 0.3, 5) * muscles.bounds
+    tension = MuscleTension.of(muscles, activations)
+
+    def energy(scale: float) -> float:
+        return tension.energy(scale * ROD.nodes)
+
+    full = float(tension.tensions @ muscles.rest_lengths)
+    assert energy(1.3) - energy(0.8) == pytest.approx(0.5 * full, rel=1e-12)
+    assert energy(0.7) - energy(0.3) == pytest.approx(0.2 * full, rel=1e-12)
+    assert energy(0.3) == pytest.approx(0.0, abs=1e-15 * full) and energy(0.0) == 0.0
+    assert not tension.gradient(0.2 * ROD.nodes).any() and not tension.gradient(0.0 * ROD.nodes).any()
 
 
 def test_force_is_equation_7_and_makes_no_net_force_or_torque() -> None:
@@ -131,7 +148,7 @@ def equilibrium(
 def press(rod: SoftBody, load: float, *, follows: bool) -> np.ndarray:
     """(N, 3) the rod on its held foot, nudged sideways, under its tendon's pull of ``load`` newtons."""
     assembly, muscles = rod.assembly, tendon(6)
-    tension = MuscleTension(muscles.difference_rows, np.full(6, load))
+    tension = MuscleTension(muscles.difference_rows, np.full(6, load), muscles.rest_lengths)
     x = ROD.nodes + 0.01 * ROD.nodes[:, 2:] ** 2 * [1.0, 0.0, 0.0]
 
     def elastic(positions: np.ndarray) -> np.ndarray:
@@ -145,7 +162,7 @@ def press(rod: SoftBody, load: float, *, follows: bool) -> np.ndarray:
             x = equilibrium(
                 x,
                 free,
-                lambda p: assembly.energy(p) + energy_of(tension, p),
+                lambda p: assembly.energy(p) + tension.energy(p),
                 lambda p: assembly.gradient(p) + tension.gradient(p),
                 lambda p: elastic(p) + dense(tension, p),
             )
@@ -178,7 +195,7 @@ def test_the_tangent_is_inverted_even_where_the_elastic_part_is_indefinite(
 ) -> None:
     """A free rod pressed by its tendon with ``share`` of Euler's load, below and above it; against dense matrices."""
     euler = np.pi**2 * rod.young_modulus * 0.08**4 / 12 / 0.9**2
-    tension = MuscleTension(tendon(6).difference_rows, np.full(6, share * euler))
+    tension = MuscleTension(tendon(6).difference_rows, np.full(6, share * euler), tendon(6).rest_lengths)
     still = np.zeros_like(ROD.nodes)
     pressed = passive_body(rod)
     for _ in range(4):

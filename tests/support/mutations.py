@@ -66,7 +66,7 @@ EQUATIONS: dict[int, Mutation] = {
         ),
         (
             *(7, "the direction of a segment's pull", "muscles/tension.py"),
-            *("pulls = -muscles.stiffness", "pulls = muscles.stiffness"),
+            *("pulls = -(muscles.stiffness * share)", "pulls = (muscles.stiffness * share)"),
             "muscles/test_muscle_set.py::test_columns_are_equation_7",
         ),
         (
@@ -297,7 +297,7 @@ BESIDE_THE_PAPER: list[Mutation] = [
         ),
         (
             *("ledger: the half of what a turning muscle loses", "locomotion/ledger.py"),
-            *("turned = 0.5 * long", "turned = 0.6 * long"),
+            *("turned = 0.5 * share * long", "turned = 0.6 * share * long"),
             "locomotion/test_ledger.py::test_every_step_closes",
         ),
         (
