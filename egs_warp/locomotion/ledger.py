@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -294,25 +293,21 @@ class _Muscles:
     weights: np.ndarray
     segments: np.ndarray
     stiffness: np.ndarray
-    rest_positions: np.ndarray
+    rest_lengths: np.ndarray
 
     @classmethod
     def of(cls, t: Trajectory) -> _Muscles:
         return cls(
             *(t.muscle_end_starts, t.muscle_end_nodes, t.muscle_end_weights, t.muscle_segments, t.muscle_stiffness),
-            t.rest_positions,
+            t.muscle_rest_lengths,
         )
-
-    @cached_property
-    def _rest_lengths(self) -> np.ndarray:
-        return np.linalg.norm(self._lines(self.rest_positions), axis=1)
 
     def step(self, activations: np.ndarray, before: np.ndarray, after: np.ndarray) -> _Pull:
         """What all segments do in a step."""
         tension = self.stiffness * activations
         start, end = self._lines(before), self._lines(after)
         long, short = np.linalg.norm(start, axis=1), np.linalg.norm(end, axis=1)
-        limb = np.clip((short / self._rest_lengths - 0.3) / 0.4, 0.0, 1.0)
+        limb = np.clip((short / self.rest_lengths - 0.3) / 0.4, 0.0, 1.0)
         share = 3.0 * limb**2 - 2.0 * limb**3
         work = tension * (self._pulled(long) - self._pulled(short))
         directions = end / np.maximum(short, 1e-300)[:, None]
@@ -326,7 +321,7 @@ class _Muscles:
 
     def _pulled(self, lengths: np.ndarray) -> np.ndarray:
         """(M,) metres, the integral of the share of the tension that is left, from nothing to ``lengths`` (M,)."""
-        rest = self._rest_lengths
+        rest = self.rest_lengths
         limb = np.clip((lengths / rest - 0.3) / 0.4, 0.0, 1.0)
         return rest * (0.4 * limb**3 - 0.2 * limb**4) + np.maximum(lengths - 0.7 * rest, 0.0)
 
