@@ -1,0 +1,184 @@
+"""What a step costs by its stages, over the nodes of the cage and the contacts of the step; how that grows, and how far
+it is from real time.
+
+python benchmarks/frame.py [--quick] [--nodes N ...] [--frames N] [--old FOLDER] [--json PATH] [--plot PATH]
+
+The pawn jumps with cages of about 250 to 4,000 nodes; each of the first steps is a record of its stages, its nodes and
+its contacts. To all of a stage's records t = c nodes^p contacts^q is fitted (steps with contact, least squares of the
+logarithms). ``--old`` is a checkout of commit 3848750, whose own example is timed in the same run. Give it two cores
+(``taskset -c 0,1``) and leave them alone.
+
+Aims: ``cpu_541`` (at most 60 ms in the mean and 5 times that in the worst step), ``cpu_10x`` (a tenth of the old
+commit's time), ``cpu_250_realtime`` (16.7 ms). Those of a GPU are null: the step has no form that runs there.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from egs_warp.assets import pawn
+from egs_warp.motions.script import motion
+from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.performance import simulate
+from harness import Row, Table, flags, record, report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+ASKED = (175, 500, 860, 1700, 3500)
+"""--nodes that give the pawn cages of about 250, 541, 1,000, 2,000 and 4,000."""
+BINS = ((1, 8), (9, 16), (17, 32), (33, 64))
+"""Contacts of a step."""
+OLD_STAGES = ("detect", "predict", "linearise", "qp", "correct", "audit")
+GPU = ("gpu_541", "gpu_1000", "gpu_frame_60hz", "many_2000")
+
+
+def measure(asked: int, frames: int, *, device: str, seed: int) -> list[Row]:
+    """A record of each step of the first ``frames`` of a jump; the kernels have been compiled and loaded before."""
+    made = pawn(seed=seed, device=device)
+    creature = make_creature(made.cloud, plane=made.plane, nodes=asked)
+    simulate(creature, motion("jump"), frames=2)
+    begun = time.perf_counter()
+    performance = simulate(creature, motion("jump"), frames=frames)
+    reports = performance.simulation.reports
+    wall = 1e3 * (time.perf_counter() - begun) / len(reports)
+    nodes = len(creature.body.mesh.nodes)
+    return [
+        {
+            **{"nodes": nodes, "contacts": int(one.contacts.count), "wall_ms": wall},
+            "stages": {name: float(value) for name, value in one.milliseconds.items()},
+            "total": float(sum(one.milliseconds.values())),
+        }
+        for one in reports
+    ]
+
+
+def by_contacts(records: list[Row]) -> list[Row]:
+    """Means of the steps of one cage, and of those with so many contacts."""
+    rows = []
+    for low, high in ((0, 10**6), *BINS):
+        chosen = [one for one in records if low <= one["contacts"] <= high]
+        if chosen:
+            totals = [one["total"] for one in chosen]
+            stages = {
+                name: float(np.mean([one["stages"].get(name, 0.0) for one in chosen])) for name in _stages(chosen)
+            }
+            rows.append(
+                {
+                    **{"nodes": chosen[0]["nodes"], "contacts": "all" if low == 0 else f"{low}-{high}"},
+                    **{"steps": len(chosen), "stages": stages, "mean": float(np.mean(totals))},
+                    **{"worst": float(max(totals)), "wall_ms": chosen[0]["wall_ms"]},
+                }
+            )
+    return rows
+
+
+def _stages(records: list[Row]) -> list[str]:
+    return list(dict.fromkeys(name for one in records for name in one["stages"]))
+
+
+def exponents(records: list[Row]) -> dict[str, list[float]]:
+    """Of each stage and of the total, p and q of c nodes^p contacts^q."""
+    chosen = [one for one in records if one["contacts"] > 0]
+    if len({one["nodes"] for one in chosen}) < 2:
+        return {}
+    rows = np.array([[1.0, np.log(one["nodes"]), np.log(one["contacts"])] for one in chosen])
+
+    def fitted(values: list[float]) -> list[float]:
+        known = np.array(values) > 0.0
+        solution = np.linalg.lstsq(rows[known], np.log(np.array(values)[known]), rcond=None)[0]
+        return [float(solution[1]), float(solution[2])]
+
+    found = {name: fitted([one["stages"].get(name, 0.0) for one in chosen]) for name in _stages(chosen)}
+    return found | {"total": fitted([one["total"] for one in chosen])}
+
+
+def old_step(folder: Path, frames: int) -> float:
+    """Milliseconds of a step of the ``folder``'s own example of a jump, by its report."""
+    with tempfile.TemporaryDirectory() as place:
+        command = [sys.executable, "examples/jump.py", "--out", place, "--frames", str(frames)]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])}
+        subprocess.run(command, cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL)
+        timing = json.loads((Path(place) / "report.json").read_text())["timing"]
+    return float(sum(timing[name]["mean"] for name in OLD_STAGES))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Time, fit, print."""
+    parser = flags(__doc__, quick="250 nodes, 20 frames", device="cpu", seed="of the pawn's Gaussians")
+    parser.add_argument("--nodes", type=int, nargs="*", default=list(ASKED), help="asked for, of each cage")
+    parser.add_argument("--frames", type=int, default=60, help="of each jump (60)")
+    parser.add_argument("--old", type=Path, help="checkout of commit 3848750")
+    options = parser.parse_args(arguments)
+    frames, chosen = (20, list(ASKED[:1])) if options.quick else (options.frames, options.nodes)
+    old = old_step(options.old.resolve(), frames) if options.old else None
+    if old is not None:
+        print(f"3848750: {old:.1f} ms a step")
+    records: list[Row] = []
+    table: Table | None = None
+    for asked in chosen:
+        made = measure(asked, frames, device=options.device, seed=options.seed)
+        records += made
+        if table is None:
+            stages = {name: ".1f" for name in _stages(made)}
+            table = Table(**{"nodes": "d", "contacts": "<8", "steps": "d", **stages, "mean": ".1f", "worst": ".1f"})
+        for row in by_contacts(made):
+            figures = [row["stages"].get(name, 0.0) for name in stages]
+            table.row(row["nodes"], row["contacts"], row["steps"], *figures, row["mean"], row["worst"])
+        record(options, **summary(records, old))
+    result = summary(records, old)
+    for name, (p, q) in result["exponents"].items():
+        print(f"{name:<10} nodes^{p:.2f} contacts^{q:.2f}")
+    report(options, **result, draw=lambda figure: draw(figure, result["rows"]))
+
+
+def summary(records: list[Row], old: float | None) -> dict[str, Any]:
+    """Rows, exponents and aims: what ``report`` takes."""
+    cages = [by_contacts([one for one in records if one["nodes"] == n]) for n in sorted({r["nodes"] for r in records})]
+    whole = [rows[0] for rows in cages]
+    small = next((row for row in whole if 200 <= row["nodes"] <= 300), None)
+    usual = next((row for row in whole if 500 <= row["nodes"] <= 620), None)
+    aims: dict[str, bool | None] = {
+        "cpu_541": usual["mean"] <= 60.0 and usual["worst"] <= 5.0 * usual["mean"] if usual else None,
+        "cpu_10x": 10.0 * usual["mean"] <= old if usual and old is not None else None,
+        "cpu_250_realtime": small["mean"] <= 1e3 / 60.0 if small else None,
+        **dict.fromkeys(GPU, None),
+    }
+    nulls = {
+        "cpu_541": "no cage of 500 to 620 nodes",
+        "cpu_10x": "no cage of 500 to 620 nodes, or no --old",
+        "cpu_250_realtime": "no cage of 200 to 300 nodes",
+        **dict.fromkeys(GPU, "the step has no form that runs on a GPU"),
+    }
+    return {
+        "rows": [row for rows in cages for row in rows],
+        "exponents": exponents(records),
+        "old_ms": old,
+        "aims": aims,
+        "why_null": {name: why for name, why in nulls.items() if aims[name] is None},
+    }
+
+
+def draw(figure: Figure, rows: list[Row]) -> None:
+    """Milliseconds over nodes, by stage."""
+    axes = figure.subplots()
+    whole = [row for row in rows if row["contacts"] == "all"]
+    for name in whole[0]["stages"]:
+        axes.loglog([row["nodes"] for row in whole], [row["stages"][name] for row in whole], marker="o", label=name)
+    axes.loglog([row["nodes"] for row in whole], [row["mean"] for row in whole], marker="o", color="k", label="step")
+    axes.set(xlabel="nodes", ylabel="ms, mean of a step")
+    axes.legend(fontsize=7)
+
+
+if __name__ == "__main__":
+    main()

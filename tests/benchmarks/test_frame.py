@@ -1,0 +1,49 @@
+"""The fits, bins and aims of the frame benchmark."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from tests.support.scripts import BENCHMARKS, module_of
+
+
+@pytest.fixture
+def frame(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return module_of("frame")
+
+
+def records(scale: float = 1.0) -> list[dict[str, Any]]:
+    """Steps whose ``solve`` takes 1e-3 n^1.5 c^0.5 ms and ``qp`` 0.1 c."""
+    made = []
+    for nodes in (250, 541, 1000):
+        for contacts in (0, 4, 8, 12, 30):
+            stages = {"solve": scale * 1e-3 * nodes**1.5 * contacts**0.5, "qp": 0.1 * contacts}
+            made.append(
+                {"nodes": nodes, "contacts": contacts, "stages": stages, "total": sum(stages.values()), "wall_ms": 1.0}
+            )
+    return made
+
+
+def test_exponents_are_those_of_the_records(frame: ModuleType) -> None:
+    found = frame.exponents(records())
+    assert found["solve"] == pytest.approx([1.5, 0.5]) and found["qp"] == pytest.approx([0.0, 1.0], abs=1e-9)
+    assert frame.exponents([one for one in records() if one["nodes"] == 250]) == {}
+
+
+def test_steps_are_told_by_their_contacts(frame: ModuleType) -> None:
+    rows = frame.by_contacts([one for one in records() if one["nodes"] == 541])
+    assert [(row["contacts"], row["steps"]) for row in rows] == [("all", 5), ("1-8", 2), ("9-16", 1), ("17-32", 1)]
+    assert rows[0]["worst"] == pytest.approx(max(one["total"] for one in records() if one["nodes"] == 541))
+
+
+def test_aims(frame: ModuleType) -> None:
+    """541 nodes take 35.7 ms in the mean: ten times as fast as 360 ms, not as 350."""
+    for old, fast in ((360.0, True), (350.0, False)):
+        aims = frame.summary(records(), old)["aims"]
+        assert (aims["cpu_541"], aims["cpu_10x"], aims["cpu_250_realtime"]) == (True, fast, True)
+    assert not frame.summary(records(2.0), 400.0)["aims"]["cpu_541"]
+    assert frame.summary(records(), None)["why_null"]["cpu_10x"]
