@@ -33,6 +33,10 @@ FOOTHOLD = 0.4
 RUN_ON = 0.08
 """Of sqrt(H / g): for how long the feet go on at the body's speed when they touch down, swinging and sliding (measured
 on the pawn)."""
+LANDING = 0.35
+"""Of sqrt(H / g): in which the fall of a body on legs is stopped, while it goes on over its feet (measured on the
+robot, whose feet stay where they touch down).
+"""
 CLEARANCE = 0.15
 """Of the height of a step: how far above it the feet are before they swing ahead."""
 IN_TIME = 2.5
@@ -99,6 +103,10 @@ class Jump:
         )
         feet, carriage = carried_on(place)
         self._feet = [BodyPart.of(body, "foot", foot.sole) for foot in feet] if carriage is OnLegs else []
+        self._time_unit = float(np.sqrt(body.height / self.gravity))
+        # Feet on legs are put down where they are asked to be, and stay there.
+        self._landing_time = LANDING * self._time_unit if self._feet else 0.0
+        self._run_on = 0.0 if self._feet else RUN_ON * self._time_unit
         ahead = ground.axes[0] @ (place.touching - body.centre_of_mass(place.standing)).T
         self.plan = plan_jump(
             target,
@@ -108,13 +116,13 @@ class Jump:
             gravity=self.gravity,
             step=place.step,
             lean=min(LEAN * target.distance, FURTHEST_LEAN * float(ahead.max())),
+            landing_time=self._landing_time,
         )
         self.phase = JumpPhase.SETTLE
         self._entered = 0.0
         local = ground.local(place.standing)
         self._start_com = body.centre_of_mass(local)
         self._start_base = self._start_com[:2] + self.pose.base_offset
-        self._time_unit = float(np.sqrt(body.height / self.gravity))
         self._last_pose = self._pose_before = np.eye(3)
         self._asked: np.ndarray | None = None
         self._flew = False
@@ -354,12 +362,10 @@ class Jump:
             # Feet that swing ahead before they are higher than the step would strike it.
             return touch_down[:2] + seen.base - seen.com[:2]
         falling = max(left * self.gravity - seen.velocity[2], 0.0)
-        capture_time = stopping_time(self.pose.standing_height, falling, self.gravity)
+        capture_time = stopping_time(self.pose.standing_height, falling, self.gravity, self._landing_time)
         capture = touch_down[:2] + seen.velocity[:2] * capture_time + self.pose.base_offset
         low, high = self.pose.support_low, self.pose.support_high
-        # Feet on legs are put down where they are asked to be.
-        run_on = 0.0 if self._feet else RUN_ON
-        goal = self._start_base - run_on * self._time_unit * seen.velocity[:2]
+        goal = self._start_base - self._run_on * seen.velocity[:2]
         return np.clip(goal, capture + FOOTHOLD * low, capture + FOOTHOLD * high)
 
     def _write(

@@ -99,16 +99,21 @@ def ramped(share: float) -> tuple[float, float]:
     return speed / whole, way / whole
 
 
-def stopping_time(com_height: float, fall_speed: float, gravity: float) -> float:
+def stopping_time(com_height: float, fall_speed: float, gravity: float, landing_time: float = 0.0) -> float:
     """Seconds t such that a body that lands at speed v ahead, with its feet v t ahead of its centre of mass, comes to
     rest over them.
 
-    Landing without spin, the ground's push goes through the centre of mass at ``com_height`` h above feet d ahead: to
-    stop ``fall_speed`` w it takes w d / h off the speed ahead, and what is left is stopped by the capture point,
-    (v - w d / h) sqrt(h / g) = d.
+    Landing without spin, the ground's push goes through the centre of mass at ``com_height`` h above feet that are y
+    ahead: y'' = W^2 y, with W^2 = (g + w / T) / h for the ``landing_time`` T that the ``fall_speed`` w takes to stop,
+    and w^2 = g / h after it, when the capture point is to be at the feet, -y' = w y. At once (T = 0) the push takes w
+    y / h off the speed ahead.
     """
-    pendulum = np.sqrt(com_height / gravity)
-    return float(pendulum / (1.0 + fall_speed * pendulum / com_height))
+    swaying = np.sqrt(gravity / com_height)
+    if landing_time <= 0.0:
+        return float(1.0 / (swaying + fall_speed / com_height))
+    pressed = np.sqrt((gravity + fall_speed / landing_time) / com_height)
+    even, odd = np.cosh(pressed * landing_time), np.sinh(pressed * landing_time)
+    return float((even + swaying / pressed * odd) / (swaying * even + pressed * odd))
 
 
 def plan_jump(
@@ -120,12 +125,14 @@ def plan_jump(
     gravity: float,
     step: float,
     lean: float,
+    landing_time: float = 0.0,
 ) -> JumpPlan:
     """Stroke, times and take-off velocity for a jump of ``target`` by a body of ``height`` H
     (docs/concepts/motions.md).
 
     Its centre of mass is ``com_height`` over the ground and the front of its feet ``support_ahead`` of it, gravity is
-    in m/s^2, a solver step takes ``step`` seconds and ``lean`` is that of the plan; metres.
+    in m/s^2, a solver step takes ``step`` seconds, ``lean`` is that of the plan, and the fall is stopped within
+    ``landing_time`` seconds; metres.
     """
     time_unit = np.sqrt(height / gravity)
     extension = min(0.04 * height, 0.25 * target.height)
@@ -140,7 +147,8 @@ def plan_jump(
     thrust_time = max(way / (ramped(1.0)[1] * speed_up), 2.0 * step)
     flight_time = np.sqrt(2.0 * rise / gravity) + np.sqrt(2.0 * max(rise - target.rise, 0.0) / gravity)
     # The front of the footprint helps a body that comes in to stop over its base.
-    capture_time = stopping_time(com_height, np.sqrt(2.0 * gravity * max(rise - target.rise, 0.0)), gravity)
+    fall_speed = np.sqrt(2.0 * gravity * max(rise - target.rise, 0.0))
+    capture_time = stopping_time(com_height, fall_speed, gravity, landing_time)
     footprint_help = min(0.3 * support_ahead, 0.5 * target.distance * capture_time / flight_time)
     speed_forward = (target.distance - lean + footprint_help) / (flight_time + capture_time + 0.5 * thrust_time)
     return JumpPlan(

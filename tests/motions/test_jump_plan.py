@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from egs_warp.motions.jump_plan import LEAN, JumpTarget, plan_jump
+from egs_warp.motions.jump_plan import LEAN, JumpTarget, plan_jump, stopping_time
 
 GRAVITY, STEP = 9.81, 1 / 60
 
@@ -93,6 +93,26 @@ def test_a_body_that_does_as_planned_reaches_height_and_distance(target: JumpTar
     )
     stopped = np.abs(stop.y[:, -1] - [pivot, 0.0]) / np.maximum(np.abs(stop.y[:, 0] - [pivot, 0.0]), 1e-9)
     assert stopped.max() < 1.01 * np.exp(-5.0)
+
+
+@pytest.mark.parametrize("landing_time", [0.02, 0.11, 0.3])
+@pytest.mark.parametrize("fall", [0.5, 2.0])
+def test_feet_stop_a_body_whose_fall_takes_a_while(landing_time: float, fall: float) -> None:
+    """A pendulum under the load that stops the fall evenly, then under its weight: at rest over its feet; the feet are
+    further ahead than where the fall stops at once.
+    """
+    com_height, speed = 0.5, 1.3
+    lever = speed * stopping_time(com_height, fall, GRAVITY, landing_time)
+    assert lever > speed * stopping_time(com_height, fall, GRAVITY)
+    loads = (GRAVITY + fall / landing_time, GRAVITY)
+    place = np.array([-lever, speed])
+    for load, lasts in zip(loads, (landing_time, 5.0 * np.sqrt(com_height / GRAVITY)), strict=True):
+        rate = load / com_height
+        solved = solve_ivp(lambda _, y, rate=rate: [y[1], rate * y[0]], (0.0, lasts), place, rtol=1e-11, atol=1e-13)
+        place = solved.y[:, -1]
+    assert np.abs(place).max() < 1.01 * np.exp(-5.0) * lever * np.sqrt(GRAVITY / com_height)
+    soon = [stopping_time(com_height, fall, GRAVITY, short) for short in (1e-7, 0.0)]
+    assert soon[0] == pytest.approx(soon[1], rel=1e-5)
 
 
 def test_a_given_lean_is_kept() -> None:

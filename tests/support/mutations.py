@@ -214,8 +214,13 @@ BESIDE_THE_PAPER: list[Mutation] = [
         ),
         (
             *("a jump's plan: the capture point", "motions/jump_plan.py"),
-            *("pendulum = np.sqrt(com_height / gravity)", "pendulum = np.sqrt(com_height / (1.3 * gravity))"),
+            *("swaying = np.sqrt(gravity / com_height)", "swaying = np.sqrt(1.3 * gravity / com_height)"),
             "motions/test_jump_plan.py::test_a_body_that_does_as_planned_reaches_height_and_distance",
+        ),
+        (
+            *("a jump's plan: the load of a landing", "motions/jump_plan.py"),
+            *("(gravity + fall_speed / landing_time)", "(fall_speed / landing_time)"),
+            "motions/test_jump_plan.py::test_feet_stop_a_body_whose_fall_takes_a_while",
         ),
         (
             *("balance: the centre of pressure under load", "motions/stance.py"),
