@@ -20,13 +20,13 @@ from tests.support.slides import slide
 
 CLOSES = 1e-6
 """Of m g H, in every step."""
-IDLE = {"spin_after", "push_out", "pushes"}
+IDLE = {"spin_after", "push_out"}
 """Flows that the slide does not have."""
 
 
 @pytest.fixture(scope="module")
 def trajectory() -> Trajectory:
-    return slide().trajectory()
+    return slide(struck=True).trajectory()
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,8 @@ def test_spin_that_is_added_after_a_step_counts(trajectory: Trajectory, share: f
     whole = StepProblem.spin(problem, problem.internal_gradient(velocities, None))
     added = np.linalg.solve(body.inertia(end), (1.0 - share) * problem.inertia @ whole)
     after = velocities + np.cross(added, end - body.centre_of_mass(end))
-    nothing = {name: getattr(trajectory, name)[:0] for name in vars(trajectory) if name.startswith("contact_")}
+    of_others = [name for name in vars(trajectory) if name.startswith(("contact_", "kick_"))]
+    nothing = {name: getattr(trajectory, name)[:0] for name in of_others}
     step = replace(
         trajectory,
         **nothing,
@@ -92,6 +93,15 @@ def test_spin_that_is_added_after_a_step_counts(trajectory: Trajectory, share: f
     assert worst(books) < 1e-9
     assert worst(replace(books, spin_after=1.1 * books.spin_after)) > CLOSES
     assert (np.abs(books.spin_inside).max() < 1e-9 * books.unit) == (share == 0.0)
+
+
+def test_the_work_of_a_push_is_the_kinetic_energy_that_it_gives(trajectory: Trajectory, books: Ledger) -> None:
+    """m |v0 + k|^2 / 2 - m |v0|^2 / 2 over the nodes, of a blow on one side and a wind at once."""
+    assert trajectory.kick_step.tolist() == list(range(8, 24)) and (books.pushes[:8] == 0.0).all()
+    mass, before = trajectory.node_mass, trajectory.velocities[8]
+    after = before + trajectory.kick_velocity[0]
+    gained = 0.5 * mass @ (after**2).sum(axis=1) - 0.5 * mass @ (before**2).sum(axis=1)
+    assert books.pushes[8] == pytest.approx(gained, rel=1e-10)
 
 
 def test_each_stored_energy_counts(books: Ledger) -> None:
@@ -111,6 +121,7 @@ def test_each_stored_energy_counts(books: Ledger) -> None:
         "muscle_stiffness",
         "activations",
         "contact_force",
+        "kick_velocity",
         "dt",
     ],
 )
