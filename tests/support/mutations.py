@@ -228,6 +228,11 @@ BESIDE_THE_PAPER: list[Mutation] = [
             "web/test_recording.py::test_the_curve_of_the_momentum_knows_of_pushes",
         ),
         (
+            *("a pull's impulse over a step", "web/spring.py"),
+            *("return dt * self._shares", "return 0.5 * dt * self._shares"),
+            "web/test_spring.py::test_a_step_under_a_pull_has_its_impulse_and_its_torque",
+        ),
+        (
             *("a jump's plan: half a step of gravity", "motions/jump_plan.py"),
             *("(2.0 * gravity * rise) + 0.5 * gravity * step", "(2.0 * gravity * rise)"),
             "motions/test_jump_plan.py::test_a_body_that_does_as_planned_reaches_height_and_distance",
