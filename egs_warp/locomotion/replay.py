@@ -87,8 +87,8 @@ class Replay:
         return reports
 
 
-def digest(objectives: Sequence[AnyObjective]) -> int:
-    """64 bits that tell what is asked of a step from anything else."""
+def digest(objectives: Sequence[AnyObjective | np.ndarray]) -> int:
+    """64 bits that tell what is asked of a step, and what is given to its nodes from outside, from anything else."""
     found = hashlib.blake2b(digest_size=8)
 
     def feed(value: Any) -> None:

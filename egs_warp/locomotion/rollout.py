@@ -122,12 +122,10 @@ def roll_out(
     for frame in range(frames):
         for _ in range(per_frame):
             objectives = motion.objectives(state, reports[-1] if reports else None, dt)
-            asked = digest(objectives)
-            done = replay.step(asked) if replay is not None else []
             kick = kicks(state.time, dt)
-            # An implicit step from there is, to the letter, the step from ``state`` under the impulse.
-            start = state if kick is None else replace(state, velocities=state.velocities + kick)
-            done = done or _advanced(stepper, start, memory, objectives, dt)
+            asked = digest(objectives if kick is None else [*objectives, kick])
+            done = replay.step(asked) if replay is not None else []
+            done = done or _advanced(stepper, state.kicked(kick), memory, objectives, dt)
             stopped = not done
             if stopped:
                 break

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from egs_warp.errors import UserError
+from egs_warp.errors import ArgumentError, UserError
 from egs_warp.motions.sequence import Place
 
 WAYS: Mapping[str, tuple[float, float, float]] = {
@@ -47,6 +47,23 @@ class Push:
     lasts: float = 0.0
     """Seconds."""
 
+    def __post_init__(self) -> None:
+        for name, value, most in (
+            ("time", self.time, LATEST),
+            ("impulse", float(np.linalg.norm(self.impulse)), LARGEST),
+            ("height", self.height or 0.0, 1.0),
+            ("lasts", self.lasts, LATEST),
+        ):
+            if not 0.0 <= value <= most:
+                raise ArgumentError(name, f"give a number from 0 to {most:g}", value=f"{value:g}")
+
+    def missed(self, end: float) -> str | None:
+        """For the user: what of it a run that was over at ``end`` s did not see; None where it saw it all."""
+        if self.time > end - _ROUNDING:
+            return f"the push at {self.time:g} s never came: the run was over before"
+        over = self.time + self.lasts
+        return f"the gust until {over:g} s was not over when the run was" if over > end + _ROUNDING else None
+
     def share(self, time: float, dt: float) -> float:
         """Of the impulse, in a step of ``dt`` s from ``time`` s on."""
         start, end = self.time - time, self.time + self.lasts - time
@@ -63,14 +80,8 @@ class Kicks:
     """What pushes do to the nodes of one body."""
 
     def __init__(self, place: Place, pushes: Sequence[Push]) -> None:
-        body, ground = place.body, place.ground
-        heights = (place.standing - ground.origin) @ ground.surface_normal / body.height
-        unit = body.mass * body.speed_unit
         self._pushes = tuple(pushes)
-        self._velocities = [
-            _accelerations(body.node_mass, heights, push.height)[:, None] * (unit * push.impulse @ ground.axes)
-            for push in pushes
-        ]
+        self._velocities = [kick_of(place, push.impulse @ place.ground.axes, push.height) for push in pushes]
 
     def __call__(self, time: float, dt: float) -> np.ndarray | None:
         """(N, 3) m/s that the nodes are given in a step of ``dt`` s from ``time`` s on; None if nothing pushes."""
@@ -80,12 +91,19 @@ class Kicks:
         return np.sum([share * kick for share, kick in zip(shares, self._velocities, strict=True)], axis=0)
 
 
-def _accelerations(node_mass: np.ndarray, heights: np.ndarray, height: float | None) -> np.ndarray:
-    """(N,) 1/kg, of each node for a newton in all."""
-    if height is None:
-        return np.full(len(node_mass), 1.0 / node_mass.sum())
-    near = np.maximum(1.0 - ((heights - height) / REACH) ** 2, 0.0) ** 2
-    return near / (node_mass @ near)
+def kick_of(place: Place, impulse: np.ndarray, height: float | None) -> np.ndarray:
+    """(N, 3) m/s that an ``impulse`` (3,) m sqrt(g H) gives the nodes of the body that stands at ``place``.
+
+    ``height``: body heights over the sole, around which they take it, if not all of them alike.
+    """
+    body = place.body
+    near = np.ones(len(body.node_mass))
+    if height is not None:
+        heights = (place.standing - place.ground.origin) @ place.ground.surface_normal / body.height
+        away = np.abs(heights - height)
+        # A coarse cage may have no node so near.
+        near = np.maximum(1.0 - (away / max(REACH, 1.5 * float(away.min()))) ** 2, 0.0) ** 2
+    return near[:, None] / (body.node_mass @ near) * (body.mass * body.speed_unit * impulse)
 
 
 def read_pushes(text: str) -> tuple[Push, ...]:

@@ -11,7 +11,7 @@ from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import CALM, Calm, PoseFamily, Weights
+from egs_warp.motions.stance import CALM, Calm, PoseFamily, Weights, sole_shares
 
 _RATE = 4.0
 """Over sqrt(H / g): how fast the centre of mass comes back over the feet."""
@@ -22,6 +22,16 @@ class StandPlan:
     """What a body that stands aims at."""
 
     seconds: float
+
+
+@dataclass(frozen=True)
+class StandReached:
+    """How a body stood; body heights."""
+
+    sole_shift: float
+    """Longest way along the ground that the middle of a sole was from where it stood."""
+    lean: float
+    """Longest way along the ground that the centre of mass was from where it stood."""
 
 
 class Stand:
@@ -76,7 +86,7 @@ class StandFor:
     """Stands for some seconds, and then until it is calm."""
 
     def __init__(self, place: Place, seconds: float) -> None:
-        self.seconds, self._stand = seconds, Stand(place)
+        self.seconds, self._stand, self._place = seconds, Stand(place), place
         self._started: float | None = None
         self._over = False
 
@@ -98,8 +108,17 @@ class StandFor:
         """(3,) where it stood."""
         return np.zeros(3)
 
-    def reached(self, trajectory: Trajectory, first: int, last: int) -> None:
-        """Nothing beside what is measured of all motions."""
+    def reached(self, trajectory: Trajectory, first: int, last: int) -> StandReached:
+        """How far soles and centre of mass went meanwhile."""
+        t, place = trajectory, self._place
+        states = t.positions[first : last + 1]
+        base = np.flatnonzero(sole_shares(place.body, place.ground, place.standing))
+        soles = [foot.sole for foot in place.feet()] or [base]
+        points = [states[:, sole].mean(axis=1) for sole in soles]
+        points.append(np.einsum("n,fni->fi", t.node_mass, states) / t.node_mass.sum())
+        along = place.ground.axes[:2].T
+        *shifts, lean = (float(np.linalg.norm((way - way[0]) @ along, axis=1).max()) / t.height for way in points)
+        return StandReached(max(shifts), lean)
 
     def notes(self) -> list[str]:
         """None: it has no target."""

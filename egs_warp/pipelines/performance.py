@@ -47,6 +47,8 @@ class Performance:
     simulation: Simulation
     fallen: str | None = None
     """How it was told that the creature has fallen, if it has."""
+    pushes: tuple[Push, ...] = ()
+    """What was to hit it."""
 
     @property
     def ending(self) -> Ending:
@@ -56,7 +58,9 @@ class Performance:
     def cut_short(self) -> list[str]:
         """What the end kept from being done, for the user."""
         ended = self.fallen is not None or self.simulation.stopped
-        return self.sequence.not_begun() if ended else self.sequence.cut_short()
+        missed = [push.missed(float(self.trajectory.time[-1])) for push in self.pushes]
+        told = self.sequence.not_begun() if ended else self.sequence.cut_short()
+        return [*told, *(line for line in missed if line is not None)]
 
     @property
     def trajectory(self) -> Trajectory:
@@ -171,4 +175,5 @@ def simulate(
     )
     trajectory = simulation.trajectory
     trajectory = trajectory.with_plan(planned_com(sequence, creature.body, trajectory))
-    return Performance(creature, place, sequence, replace(simulation, trajectory=trajectory), watch.fallen)
+    simulation = replace(simulation, trajectory=trajectory)
+    return Performance(creature, place, sequence, simulation, watch.fallen, tuple(pushes))

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from egs_warp.motions.push import LARGEST
 from egs_warp.motions.script import Script, motion
 
 LONGEST_TEXT = 200
@@ -50,6 +51,16 @@ class Pull:
 @dataclass(frozen=True)
 class Release:
     """Let go of what is pulled."""
+
+
+@dataclass(frozen=True)
+class Hit:
+    """Push the body in the next step."""
+
+    impulse: tuple[float, float, float]
+    """m sqrt(g H), frame of the body."""
+    height: float | None = None
+    """Body heights over the sole of the standing body, around which nodes take it; None: all alike."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +107,9 @@ class TellScript:
     """Say what it has done, as a script."""
 
 
-Message: TypeAlias = Perform | Go | Pull | Release | Change | Pause | Step | Cancel | StandUp | Record | TellScript
+Message: TypeAlias = (
+    Perform | Go | Pull | Release | Hit | Change | Pause | Step | Cancel | StandUp | Record | TellScript
+)
 
 
 def read_message(message: Mapping[str, Any], *, height: float, node_count: int) -> Message:
@@ -136,6 +149,13 @@ def _pull(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
     return Pull(node, (x, y, z))
 
 
+def _hit(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
+    x, y, z = (_number(message, name, -LARGEST, LARGEST) for name in "xyz")
+    if math.hypot(x, y, z) > LARGEST:
+        raise ValueError(f"push: give at most {LARGEST:g} m sqrt(g H)")
+    return Hit((x, y, z), _number(message, "height", 0.0, 1.0) if "height" in message else None)
+
+
 def _change(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
     given = [name for name in ("friction", "sag") if name in message]
     if not given:
@@ -166,6 +186,7 @@ _READERS: dict[str, tuple[tuple[str, ...], _Reader]] = {
     "go": (("x", "y"), _go),
     "pull": (("node", "x", "y", "z"), _pull),
     "release": ((), lambda *_: Release()),
+    "push": (("x", "y", "z", "height"), _hit),
     "set": (("friction", "sag"), _change),
     "pause": (("on",), lambda message, *_: Pause(_on(message))),
     "step": ((), lambda *_: Step()),

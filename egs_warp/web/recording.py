@@ -166,11 +166,15 @@ def _curves(t: Trajectory) -> np.ndarray:
     tangent = np.linalg.norm(t.contact_force - normal[:, None] * t.contact_normal, axis=1)
     force = np.zeros((steps, 3))
     np.add.at(force, t.contact_step, t.contact_force)
+    kicked = np.zeros((steps, 3))
+    if len(t.kick_step):
+        np.add.at(kicked, t.kick_step, np.einsum("n,kni->ki", t.node_mass, t.kick_velocity) / t.dt[t.kick_step, None])
     pressed, rubbed = np.zeros(steps), np.zeros(steps)
     np.add.at(pressed, t.contact_step, normal)
     np.add.at(rubbed, t.contact_step, tangent)
     momentum = np.einsum("n,fni->fi", t.node_mass, t.velocities)
-    residual = np.diff(momentum, axis=0) / np.diff(t.time)[:, None] - mass * t.gravity - force + t.drag * momentum[1:]
+    outside = mass * t.gravity + force + kicked - t.drag * momentum[1:]
+    residual = np.diff(momentum, axis=0) / np.diff(t.time)[:, None] - outside
     used = rubbed / np.maximum(t.friction * pressed, 1e-9 * weight)
     of_steps = np.stack(
         [np.linalg.norm(force, axis=1) / weight, used, np.linalg.norm(residual, axis=1) / weight], axis=1

@@ -19,6 +19,7 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.fem.body import DEFAULT_SAG, BodyState
 from egs_warp.locomotion.rollout import solver_steps
+from egs_warp.motions.push import kick_of
 from egs_warp.motions.script import MOST_MOTIONS
 from egs_warp.pipelines.creature import Creature, changed_creature, first_place
 from egs_warp.pipelines.drawn import DrawnCreature
@@ -26,6 +27,7 @@ from egs_warp.web.messages import (
     Cancel,
     Change,
     Go,
+    Hit,
     Message,
     Pause,
     Perform,
@@ -80,6 +82,8 @@ class Session:
         self._place = first_place(creature)
         self.steering = Steering(self._place, self._tell)
         self._spring: Spring | None = None
+        self._hits: list[Hit] = []
+        """Of the next step."""
         self._take: Take | None = None
         self._paused, self._single_steps = False, 0
         self._still_since: float | None = None
@@ -159,7 +163,9 @@ class Session:
     @property
     def resting(self) -> bool:
         """Whether it stands still with nothing to do; the next thing asked for goes on from there."""
-        if self._still_since is None or not self.steering.idle or self._spring is not None or self._take is not None:
+        if self._still_since is None or not self.steering.idle or self._take is not None:
+            return False
+        if self._spring is not None or self._hits:
             return False
         return self.state.time - self._still_since >= _STILL_TIME
 
@@ -186,8 +192,9 @@ class Session:
         before = self.state
         try:
             objectives = self.steering.objectives(before, self.report, self._dt)
-            start = self._spring.pulled(before, self._dt) if self._spring else before
+            kick = self._kick(before)
             stepper = self.creature.stepper
+            start = before.kicked(kick)
             self.state, self._memory, reports = stepper.advance(start, self._memory, objectives, self._dt)
             if not np.isfinite(self.state.positions).all():
                 raise FloatingPointError("positions are not finite")
@@ -206,12 +213,20 @@ class Session:
         elif self._still_since is None:
             self._still_since = self.state.time
         if self._take is not None:
-            self._take.add(reports, pulled=self._spring is not None)
+            self._take.add(reports, kick=kick)
             if self._take.seconds >= LONGEST_TAKE:
                 self._tell(f"a take has at most {LONGEST_TAKE:g} s")
                 self._end_take()
         self._index += 1
         self._send(self._frame())
+
+    def _kick(self, state: BodyState) -> np.ndarray | None:
+        """(N, 3) m/s that the user's pull, and pushes since the last step, give the nodes; None if there are none."""
+        hits, self._hits = self._hits, []
+        kicks = [kick_of(self._place, np.array(hit.impulse), hit.height) for hit in hits]
+        if self._spring is not None:
+            kicks.append(self._spring.kick(state, self._dt))
+        return np.sum(kicks, axis=0) if kicks else None
 
     def obey(self) -> None:
         """Do what the messages ask that came since."""
@@ -240,6 +255,8 @@ class Session:
                 self._spring.target = np.array(target)
             case Release():
                 self._spring = None
+            case Hit():
+                self._hits.append(message)
             case Change():
                 self._change(message)
             case Pause(on):
@@ -258,6 +275,7 @@ class Session:
     def _stand_up(self) -> None:
         self._end_take()
         self._spring = self._still_since = None
+        self._hits.clear()
         still = np.zeros_like(self.state.velocities)
         self.state = BodyState(self.creature.start.positions.copy(), still, self.state.time)
         self.report = None

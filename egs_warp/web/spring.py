@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from egs_warp.fem.body import BodyState, SoftBody
@@ -38,7 +36,6 @@ class Spring:
         size = float(np.linalg.norm(force))
         return force * min(1.0, STRONGEST * self._body.weight / max(size, 1e-12))
 
-    def pulled(self, state: BodyState, dt: float) -> BodyState:
-        """``state`` with the impulse of a step of ``dt`` s: an implicit Euler step from there is, to the letter, the
-        step from ``state`` under the force, M (v - v0) = dt (f + f_spring)."""
-        return replace(state, velocities=state.velocities + dt * self._shares[:, None] * self.force(state))
+    def kick(self, state: BodyState, dt: float) -> np.ndarray:
+        """(N, 3) m/s that a step of ``dt`` s from ``state`` gives the nodes."""
+        return dt * self._shares[:, None] * self.force(state)

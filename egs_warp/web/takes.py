@@ -41,8 +41,6 @@ class Take:
     creature: Creature
     start: BodyState
     reports: list[StepReport] = field(default_factory=list)
-    pulled: bool = False
-    """Whether the user pulled at the creature meanwhile."""
 
     def __post_init__(self) -> None:
         stepper = self.creature.stepper
@@ -62,11 +60,10 @@ class Take:
         """Its length so far."""
         return self.reports[-1].state.time - self.start.time if self.reports else 0.0
 
-    def add(self, reports: Sequence[StepReport], *, pulled: bool) -> None:
-        """The next steps."""
+    def add(self, reports: Sequence[StepReport], *, kick: np.ndarray | None) -> None:
+        """The next steps, and (N, 3) m/s that the user's pulls and pushes gave the nodes as the first began."""
         self.reports += reports
-        self.pulled |= pulled
-        self._recorder.add(reports)
+        self._recorder.add(reports, kick=kick)
 
     def write(
         self,
@@ -88,7 +85,8 @@ class Take:
             for entry, request in zip(begun, requests, strict=True)
             if trajectory.time[0] - 1e-9 <= entry.start_time < trajectory.time[-1]
         ]
-        notes = ["the user pulled at it; momentum and energy of the audit do not know of that"] if self.pulled else []
+        touched = len(trajectory.kick_step) > 0
+        notes = [f"the user pulled at it or pushed it, which {SCRIPT} does not repeat"] if touched else []
         report = report_of_run(
             *(self.creature, trajectory, self.reports, np.arange(len(trajectory.time))),
             *([entry for entry, _ in chosen], ledger(trajectory)),

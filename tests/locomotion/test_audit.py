@@ -73,6 +73,24 @@ def test_a_run_that_slides_passes() -> None:
     assert result.newton_unconverged == result.inverted_elements == 0 and result.penetration < 5e-3
 
 
+def test_a_push_that_is_left_out_elsewhere_or_late_is_seen() -> None:
+    """A blow on one side and a wind; the same momentum on all nodes alike turns nothing."""
+    struck = slide(struck=True).trajectory()
+    held = audit(struck)
+    assert held.momentum_residual < 1e-8 and held.angular_momentum_residual < 1e-8 and held.energy_residual < 1e-9
+    assert held.friction_gap < 1e-7 and held.complementarity_gap < 1e-7 and held.contact_velocity < 1e-12
+    later = struck.kick_step != 8
+    missed = audit(replace(struck, kick_step=struck.kick_step[later], kick_velocity=struck.kick_velocity[later]))
+    assert min(missed.momentum_residual, missed.angular_momentum_residual, missed.energy_residual) > 1e-3
+    mean = np.einsum("n,kni->ki", struck.node_mass, struck.kick_velocity) / struck.node_mass.sum()
+    even = np.broadcast_to(mean[:, None], struck.kick_velocity.shape)
+    elsewhere = audit(replace(struck, kick_velocity=even))
+    assert elsewhere.momentum_residual < 1e-8
+    assert min(elsewhere.angular_momentum_residual, elsewhere.energy_residual) > 1e-3
+    late = audit(replace(struck, kick_step=struck.kick_step + (struck.kick_step == 8)))
+    assert min(late.momentum_residual, late.angular_momentum_residual, late.energy_residual) > 1e-3
+
+
 def sliding(t: Trajectory) -> np.ndarray:
     """The contacts whose friction does most work."""
     way = np.diff(t.positions, axis=0)[t.contact_step[:, None], t.contact_nodes]

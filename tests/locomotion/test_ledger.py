@@ -21,13 +21,13 @@ from tests.support.slides import slide
 
 CLOSES = 1e-6
 """Of m g H, in every step."""
-IDLE = {"spin_after", "push_out", "pushes"}
+IDLE = {"spin_after", "push_out"}
 """Flows that the slide does not have."""
 
 
 @pytest.fixture(scope="module")
 def trajectory() -> Trajectory:
-    return slide().trajectory()
+    return slide(struck=True).trajectory()
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,8 @@ def one_step(
     trajectory: Trajectory, positions: list[np.ndarray], velocities: list[np.ndarray], activations: float = 0.0
 ) -> Trajectory:
     """That of a step in the air between two states, all muscles at ``activations`` metres."""
-    nothing = {name: getattr(trajectory, name)[:0] for name in vars(trajectory) if name.startswith("contact_")}
+    of_others = [name for name in vars(trajectory) if name.startswith(("contact_", "kick_"))]
+    nothing = {name: getattr(trajectory, name)[:0] for name in of_others}
     return replace(
         trajectory,
         **nothing,
@@ -125,6 +126,15 @@ def test_muscles_that_lose_their_tension_count(trajectory: Trajectory, height: f
         assert worst(replace(books, **{flow: 1.1 * getattr(books, flow)})) > CLOSES, flow
 
 
+def test_the_work_of_a_push_is_the_kinetic_energy_that_it_gives(trajectory: Trajectory, books: Ledger) -> None:
+    """m |v0 + k|^2 / 2 - m |v0|^2 / 2 over the nodes, of a blow on one side and a wind at once."""
+    assert trajectory.kick_step.tolist() == list(range(8, 24)) and (books.pushes[:8] == 0.0).all()
+    mass, before = trajectory.node_mass, trajectory.velocities[8]
+    after = before + trajectory.kick_velocity[0]
+    gained = 0.5 * mass @ (after**2).sum(axis=1) - 0.5 * mass @ (before**2).sum(axis=1)
+    assert books.pushes[8] == pytest.approx(gained, rel=1e-10)
+
+
 def test_each_stored_energy_counts(books: Ledger) -> None:
     for energy in STORED:
         assert worst(replace(books, **{energy: 1.01 * getattr(books, energy)})) > CLOSES, energy
@@ -142,6 +152,7 @@ def test_each_stored_energy_counts(books: Ledger) -> None:
         "muscle_stiffness",
         "activations",
         "contact_force",
+        "kick_velocity",
         "dt",
     ],
 )

@@ -18,6 +18,7 @@ from egs_warp.locomotion.objectives import LoadObjective, SpinObjective, held_co
 from egs_warp.locomotion.replay import Replay, digest
 from egs_warp.locomotion.rollout import Simulation, roll_out
 from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
+from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
 from tests.support.creatures import CoarseCreature, coarse_creature
@@ -157,6 +158,28 @@ def test_a_damaged_part_is_told_and_can_be_left_out(cut_off: Path) -> None:
     (cut_off / "start.npz").unlink()
     with pytest.raises(UserError, match=r"start\.npz: is missing; begin the run again"):
         run(block(), parts=lambda: cut_off, resume=cut_off)
+
+
+def test_a_run_that_is_pushed_goes_on_and_another_push_is_refused(tmp_path: Path) -> None:
+    """The push comes before the cut; what is asked of its step is the same without it."""
+    made = block()
+
+    def pushed(size: float) -> Any:
+        kick = np.tile([0.3 * size, 0.1 * size, 0.0], (len(made.place.standing), 1))
+        return lambda time, dt: kick if 0.0 <= time - 0.2 < dt else None
+
+    whole, parts = run(block(), kicks=pushed(1.0)), tmp_path / "parts"
+    assert len(whole.trajectory.kick_step) == 1
+    with pytest.raises(KilledError):
+        run(block(), killed_at=CUT, parts=lambda: parts, kicks=pushed(1.0))
+    assert Trajectory.load(parts).kick_step.tolist() == whole.trajectory.kick_step.tolist()
+    again = run(block(), parts=lambda: parts, resume=parts, kicks=pushed(1.0))
+    assert same_steps(again.reports, whole.reports)
+    for name in whole.trajectory.__dataclass_fields__:
+        assert np.array_equal(getattr(again.trajectory, name), getattr(whole.trajectory, name)), name
+    for other in (pushed(1.1), lambda time, dt: None):
+        with pytest.raises(UserError, match="does not fit the run that is to go on"):
+            run(block(), resume=parts, kicks=other)
 
 
 def test_a_disk_that_is_full_at_a_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from egs_warp.errors import UserError
+from egs_warp.errors import ArgumentError, UserError
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.rollout import Simulation, roll_out
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.fall import FallWatch
-from egs_warp.motions.push import WAYS, Kicks, Push, read_pushes
+from egs_warp.motions.push import WAYS, Kicks, Push, kick_of, read_pushes
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
+from egs_warp.motions.stand import StandFor
+from egs_warp.pipelines.performance import simulate
+from egs_warp.pipelines.report import AUDIT_LIMITS
 from tests.support.creatures import CoarseCreature, coarse_creature
+from tests.support.lives import coarse_pawn
 from tests.support.meshes import box_mesh
-from tests.support.places import DT, FORWARD
+from tests.support.places import DT, FORWARD, block_place
 
 LEFT = np.array(WAYS["left"])
 
@@ -79,6 +84,20 @@ def test_a_push_has_its_momentum_and_its_arm(made: CoarseCreature) -> None:
     assert Kicks(place, [Push(0.5, LEFT)])(0.0, DT) is None
 
 
+def test_what_is_hit_is_around_the_height(made: CoarseCreature) -> None:
+    """Within a quarter of a body height; where a coarse cage has no node so near, what is nearest to it."""
+    heights = made.place.ground.local(made.place.standing)[:, 2] / made.place.body.height
+    for height in (0.0, 0.5, 1.0):
+        sizes = np.linalg.norm(kick_of(made.place, 0.1 * LEFT, height), axis=1)
+        assert (np.abs(heights[sizes > 0.0] - height) < 0.25).all()
+        assert sizes.argmax() in np.flatnonzero(np.abs(heights - height) < np.abs(heights - height).min() + 0.01)
+    thin = block_place(box_mesh((4, 4, 1), (2.0, 2.0, 0.5)))
+    sizes = np.linalg.norm(kick_of(thin, 0.1 * LEFT, 0.4), axis=1)
+    assert thin.body.node_mass @ sizes == pytest.approx(0.1 * thin.body.mass * thin.body.speed_unit)
+    below, above = thin.standing[:, 2] < 0.25, thin.standing[:, 2] > 0.25
+    assert sizes[below].min() > sizes[above].max() >= 0.0
+
+
 def test_the_books_hold_what_was_given(pushed: Trajectory) -> None:
     """Both momenta and the energy of every step, as without pushes; not with one left out or a hundredth stronger."""
     assert len(pushed.kick_step) == 1 + 6
@@ -98,12 +117,23 @@ def test_who_is_pushed_goes_along_and_keeps_its_feet(made: CoarseCreature, pushe
     com = np.array([place.body.centre_of_mass(place.ground.local(x)) for x in pushed.positions])
     after = int(np.searchsorted(pushed.time, 0.2))
     assert com[after, 1] > 0.005 > com[0, 1] + 0.001
+    reached = StandFor(place, 0.5).reached(pushed, 0, len(pushed.dt))
+    lean = np.linalg.norm((com - com[0])[:, :2], axis=1).max() / place.body.height
+    assert reached.lean == pytest.approx(lean) and reached.sole_shift < 0.3 * lean
     assert np.linalg.norm(pushed.node_mass @ pushed.velocities[-1]) < 0.05 * place.body.mass * place.body.speed_unit
 
 
 def test_a_hard_push_throws_it_over(made: CoarseCreature) -> None:
-    _, fallen = stood(made, "0.05 1 left 0.9", frames=90)
-    assert fallen is not None
+    """Its energy is several times what lifts its centre over its edge, so that no balancing keeps it up."""
+    simulation, fallen = stood(made, "0.05 1 left 0.9", frames=90)
+    assert fallen is not None and fallen.startswith("tilted by")
+    assert audit(simulation.trajectory).energy_residual < 1e-6
+    t = simulation.trajectory
+    reached = StandFor(made.place, 0.5).reached(t, 0, len(t.dt))
+    sole = made.place.ground.local(made.place.standing)[:, 2] < 0.01
+    middle = np.array([made.place.ground.local(x)[sole, :2].mean(axis=0) for x in t.positions])
+    shift = np.linalg.norm(middle - middle[0], axis=1).max() / made.place.body.height
+    assert reached.sole_shift == pytest.approx(shift) and reached.lean > 0.2
 
 
 def test_a_pushed_run_goes_on_to_the_same_bits(pushed: Trajectory, tmp_path: Path) -> None:
@@ -114,6 +144,47 @@ def test_a_pushed_run_goes_on_to_the_same_bits(pushed: Trajectory, tmp_path: Pat
     again, _ = stood(block(), "0.1 0.06 left 0.8, 0.2-0.3 0.05 back", resume=parts)
     for name in ("positions", "velocities", "kick_step", "kick_velocity"):
         np.testing.assert_array_equal(getattr(again.trajectory, name), getattr(whole.trajectory, name))
+
+
+def test_what_the_run_was_over_before_is_told() -> None:
+    pushes = read_pushes("0.5 0.1 left, 1-3 0.1 back, 2 0.1 left")
+    assert [push.missed(2.0) for push in pushes] == [
+        None,
+        "the gust until 3 s was not over when the run was",
+        "the push at 2 s never came: the run was over before",
+    ]
+    assert [push.missed(3.0) for push in pushes] == [None] * 3
+
+
+@pytest.mark.parametrize("script", ["stand 0.2", pytest.param("turn 10", marks=pytest.mark.slow)])
+def test_a_creature_is_pushed_while_it_stands_or_turns(script: str) -> None:
+    """The way is that of the body as it stands at the start; what came too late is told."""
+    creature = coarse_pawn()
+    done = simulate(creature, motion(script), pushes=read_pushes("0.1 0.05 left, 0.2-0.3 0.05 back 0.8, 60 0.1 up"))
+    t = done.trajectory
+    assert done.fallen is None and done.cut_short() == ["the push at 60 s never came: the run was over before"]
+    momentum = np.einsum("n,kni->ki", t.node_mass, t.kick_velocity) @ done.place.ground.axes.T
+    unit = 0.05 * creature.body.mass * creature.body.speed_unit
+    np.testing.assert_allclose(momentum[0] / unit, [0.0, 1.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(momentum[1:].sum(axis=0) / unit, [-1.0, 0.0, 0.0], atol=1e-9)
+    held = vars(audit(t, newton_unconverged=sum(not report.converged for report in done.simulation.reports)))
+    assert {name for name, value in held.items() if not value <= AUDIT_LIMITS[name]} == set()
+
+
+@pytest.mark.parametrize(
+    ("numbers", "said"),
+    [
+        ({"time": -1.0}, "time -1: give a number from 0 to 600"),
+        ({"impulse": np.array([0.0, np.nan, 0.0])}, "impulse nan: give a number from 0 to 10"),
+        ({"impulse": np.array([0.0, 8.0, 8.0])}, "impulse 11.3137: give a number from 0 to 10"),
+        ({"height": 1.5}, "height 1.5: give a number from 0 to 1"),
+        ({"lasts": np.inf}, "lasts inf: give a number from 0 to 600"),
+    ],
+)
+def test_numbers_that_no_push_has_are_refused(numbers: dict[str, Any], said: str) -> None:
+    with pytest.raises(ArgumentError) as error:
+        Push(**{"time": 0.0, "impulse": LEFT, **numbers})
+    assert str(error.value) == said
 
 
 @pytest.mark.parametrize(

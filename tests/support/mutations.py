@@ -198,6 +198,41 @@ BESIDE_THE_PAPER: list[Mutation] = [
             "meshing/test_cage.py::test_tetwild",
         ),
         (
+            *("the work of a push: the half of what it gives", "locomotion/ledger.py"),
+            *("t.velocities[step] + 0.5 * kick", "t.velocities[step] + kick"),
+            "locomotion/test_ledger.py::test_the_work_of_a_push_is_the_kinetic_energy_that_it_gives",
+        ),
+        (
+            *("what implicit Euler takes of a push", "locomotion/ledger.py"),
+            *("velocity - t.velocities[step] - kick)", "velocity - t.velocities[step])"),
+            "locomotion/test_ledger.py::test_every_step_closes",
+        ),
+        (
+            *("the torque of a push", "locomotion/audit.py"),
+            *("np.cross(arms[t.kick_step], impulses)", "np.cross(t.positions[t.kick_step], impulses)"),
+            "locomotion/test_audit.py::test_a_push_that_is_left_out_elsewhere_or_late_is_seen",
+        ),
+        (
+            *("a push's change of speed", "motions/push.py"),
+            *("(body.node_mass @ near) *", "near.sum() *"),
+            "motions/test_push.py::test_a_push_has_its_momentum_and_its_arm",
+        ),
+        (
+            *("a gust's end", "motions/push.py"),
+            *("max(min(end, dt) - max(start, 0.0), 0.0)", "max(dt - max(start, 0.0), 0.0)"),
+            "motions/test_push.py::test_steps_share_out_all_of_a_push",
+        ),
+        (
+            *("the curve of what the momentum misses: pushes", "web/recording.py"),
+            *("force + kicked - t.drag", "force - t.drag"),
+            "web/test_recording.py::test_the_curve_of_the_momentum_knows_of_pushes",
+        ),
+        (
+            *("a pull's impulse over a step", "web/spring.py"),
+            *("return dt * self._shares", "return 0.5 * dt * self._shares"),
+            "web/test_spring.py::test_a_step_under_a_pull_has_its_impulse_and_its_torque",
+        ),
+        (
             *("a jump's plan: half a step of gravity", "motions/jump_plan.py"),
             *("(2.0 * gravity * rise) + 0.5 * gravity * step", "(2.0 * gravity * rise)"),
             "motions/test_jump_plan.py::test_a_body_that_does_as_planned_reaches_height_and_distance",

@@ -26,6 +26,8 @@ class Slide:
     stepper: LocomotionStepper
     start: BodyState
     reports: tuple[StepReport, ...]
+    kicks: tuple[np.ndarray | None, ...]
+    """(N, 3) m/s that its nodes were given from outside as each step began."""
 
     def recorder(self, **given: Any) -> Recorder:
         """A recorder that has seen nothing of it yet."""
@@ -39,13 +41,14 @@ class Slide:
     def trajectory(self) -> Trajectory:
         """All of it."""
         recorder = self.recorder()
-        recorder.add(self.reports)
+        for report, kick in zip(self.reports, self.kicks, strict=True):
+            recorder.add([report], kick=kick)
         return recorder.trajectory()
 
 
 @cache
-def slide() -> Slide:
-    """24 steps in air that drags."""
+def slide(*, struck: bool = False) -> Slide:
+    """24 steps in air that drags; ``struck`` on one side in the ninth, and blown at all over from then on."""
     made = coarse_creature(block_mesh(), forward=FORWARD)
     body, muscles, geometry = made.stepper.body, made.stepper.muscles, made.stepper.geometry
     stepper = LocomotionStepper(body, muscles, geometry, settings=LocomotionSettings(drag=0.3), device="cpu")
@@ -53,13 +56,18 @@ def slide() -> Slide:
     arms = positions - body.centre_of_mass(positions)
     start = BodyState(positions, np.array([0.8, 0.2, -0.5]) + np.cross([0.5, 0.3, 1.0], arms))
     state, memory, reports = start, stepper.initial_memory(), []
-    for step in range(24):
+    one_side = (arms[:, 1] > 0.0)[:, None]
+    blow = np.array([0.3, -0.2, 0.1]) * one_side / (body.node_mass @ one_side) * body.mass
+    wind = np.tile([0.0, 0.02, 0.0], (len(positions), 1))
+    kicks = [None if not struck or step < 8 else blow + wind if step == 8 else wind for step in range(24)]
+    for step, kick in enumerate(kicks):
         wanted = np.array([0.0, 0.0, -0.12 * np.sin(6.0 * DT * (step + 1))])
         objectives = [
             centre_of_mass_velocity(body, wanted, 2.0),
             SpinObjective(np.zeros(3), 5.0),
             node_velocities(body, np.tile(wanted, (len(positions), 1)), 0.01),
         ]
-        state, memory, done = stepper.advance(state, memory, objectives, DT)
+        state, memory, done = stepper.advance(state.kicked(kick), memory, objectives, DT)
+        assert len(done) == 1, "a kick is of one step"
         reports += done
-    return Slide(stepper, start, tuple(reports))
+    return Slide(stepper, start, tuple(reports), tuple(kicks))

@@ -16,6 +16,8 @@ from websockets.sync.client import ClientConnection, connect
 
 from egs_warp.cli import main
 from egs_warp.io import write_ply
+from egs_warp.locomotion.audit import audit
+from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.stance import sole_shares
 from egs_warp.web.feed import LiveFeed, live_camera
 from egs_warp.web.page import PAGE
@@ -33,6 +35,21 @@ def in_browser(test: Any) -> Any:
     for mark in NEEDED:
         test = mark(test)
     return test
+
+
+_FAR = "Math.hypot(...egs.stages[0].middle.toArray().map((x, k) => x - {}[k])) > 0.01"
+"""The centre of mass is no longer there."""
+_SENT = """() => {
+    const { source } = egs.stages[0], send = source.send.bind(source);
+    window.sent = [];
+    source.send = (message) => { window.sent.push(message); send(message); };
+}"""
+"""Keeps what the page asks for from then on."""
+_AWAY = """() => {
+    const { camera } = egs.stages[0], way = camera.getWorldDirection(camera.position.clone());
+    return [way.x, way.y].map((part) => part / Math.hypot(way.x, way.y));
+}"""
+"""Where the eye looks along the ground."""
 
 
 @pytest.fixture
@@ -226,6 +243,27 @@ def test_a_gamepad_steers_it(chromium: Any, session: Session, pressed: list[int]
 
 
 @in_browser
+def test_a_gamepad_pushes_it_once_for_each_press(chromium: Any, session: Session):
+    with _watched(chromium, session) as page:
+        page.evaluate(_SENT)
+        page.evaluate(
+            """() => {
+                const buttons = Array.from({ length: 17 }, (_, k) => ({ pressed: k === 3 }));
+                const held = { mapping: "standard", buttons, axes: [0, 0] };
+                const look = () => { window.looks += 1; return [held]; };
+                window.press = (on) => { buttons[3].pressed = on; window.looks = 0; };
+                window.looks = 0;
+                Object.defineProperty(navigator, "getGamepads", { value: look });
+            }"""
+        )
+        for on in (False, True):
+            wait_until(page, "window.looks > 3")
+            page.evaluate("(on) => window.press(on)", on)
+        wait_until(page, "window.looks > 3")
+        assert [message["type"] for message in page.evaluate("window.sent")] == ["push", "push"]
+
+
+@in_browser
 def test_what_is_shown_goes_evenly_and_never_back(chromium: Any, session: Session):
     with _watched(chromium, session) as page:
         page.keyboard.press(" ")
@@ -280,13 +318,55 @@ def test_a_drag_pulls_at_it(chromium: Any, session: Session):
         page.mouse.down()
         page.mouse.move(seen[0] + 40, seen[1], steps=4)
         wait_until(page, "egs.live.state?.pulled")
-        far = "Math.hypot(...egs.stages[0].middle.toArray().map((x, k) => x - {}[k])) > 0.01"
-        wait_until(page, far.format(before))
+        wait_until(page, _FAR.format(before))
         page.mouse.up()
         wait_until(page, "!egs.live.state?.pulled")
         # The camera has gone along with it, and was not turned.
         moved = np.subtract(page.evaluate("egs.stages[0].camera.position.toArray()"), camera)
         assert np.linalg.norm(moved) < 0.5
+
+
+@in_browser
+def test_a_key_a_button_and_a_click_push_it_away_from_the_eye(chromium: Any, session: Session, tmp_path: Path):
+    with _watched(chromium, session) as page:
+        page.evaluate(_SENT)
+        page.keyboard.press("r")
+        wait_until(page, "egs.live.state?.recording")
+        away, before = np.array(page.evaluate(_AWAY)), np.array(page.evaluate("egs.stages[0].middle.toArray()"))
+        page.keyboard.down("b")
+        page.keyboard.down("b")  # as a key that is held repeats itself
+        page.keyboard.up("b")
+        page.click("[title='Push it away from you (b)']")
+        wait_until(page, _FAR.format(before.tolist()))
+        moved = np.array(page.evaluate("egs.stages[0].middle.toArray()")) - before
+        assert moved[:2] @ away > 0.9 * np.linalg.norm(moved[:2])
+        head = page.evaluate(
+            """() => {
+                const stage = egs.stages[0], box = stage.canvas.getBoundingClientRect();
+                const place = stage.middle.add({ x: 0, y: 0, z: 0.45 * stage.source.header.facts.height });
+                const p = place.project(stage.camera);
+                return [box.left + (p.x + 1) / 2 * box.width, box.top + (1 - p.y) / 2 * box.height];
+            }"""
+        )
+        page.click("[title='Friction, stiffness, pushes']")
+        page.locator("[aria-label=Push]").focus()
+        page.keyboard.press("ArrowLeft")
+        page.mouse.click(*head)
+        pushes = [message for message in page.evaluate("window.sent") if message["type"] == "push"]
+        assert not [message for message in page.evaluate("window.sent") if message["type"] in ("pull", "release", "go")]
+        assert ["height" in push for push in pushes] == [False, False, True] and 0.6 < pushes[2]["height"] <= 1.0
+        for push, size in zip(pushes, (0.15, 0.15, 0.1), strict=True):
+            assert push["z"] == 0.0 and [push["x"], push["y"]] == pytest.approx((size * away).tolist(), abs=0.02 * size)
+        taken = session.state.time
+        wait_until(page, f"egs.stages[0].source.frames.at(-1).time > {taken + 0.1}")
+        page.keyboard.press("r")
+        wait_until(page, "egs.live.told.some((line) => line.startsWith('wrote '))")
+    trajectory = Trajectory.load(tmp_path / "take-1" / "trajectory.npz")
+    given = np.einsum("n,kni->i", trajectory.node_mass, trajectory.kick_velocity)
+    body = session.creature.body
+    assert np.linalg.norm(given) / (body.mass * body.speed_unit) == pytest.approx(0.4, rel=0.02)
+    held = audit(trajectory)
+    assert max(held.momentum_residual, held.angular_momentum_residual, held.energy_residual) < 1e-6
 
 
 @in_browser
@@ -300,7 +380,7 @@ def test_pause_step_sliders_and_script(chromium: Any, session: Session):
             page.keyboard.press(".")
         wait_until(page, f"egs.stages[0].source.frames.at(-1).time > {held + 1.5 / 60.0}")
         assert session.state.time == pytest.approx(held + 2.0 / 60.0)
-        page.click("[title='Friction and stiffness']")
+        page.click("[title='Friction, stiffness, pushes']")
         slider = page.locator("[aria-label=Friction]")
         slider.focus()
         page.keyboard.press("Home")
@@ -354,8 +434,19 @@ def test_a_phone_has_all_controls_within_reach(chromium: Any, session: Session):
     with _watched(chromium, session, 360, 740) as page:
         assert page.evaluate("document.documentElement.scrollWidth") <= 360
         page.click("[title^=Keys]")
-        for part in (".dock", "#left", "#forward", "#jump", "[title^='Record a take']", "[title^=Keys]", ".keys"):
+        for part in (
+            ".dock",
+            "#left",
+            "[title^='Push it']",
+            "#forward",
+            "#jump",
+            "[title^='Record a take']",
+            "[title^=Keys]",
+            ".keys",
+        ):
             box = page.locator(part).bounding_box()
             assert box["x"] >= 0 and box["x"] + box["width"] <= 360 and box["y"] + box["height"] <= 740, part
+        sheet = page.locator("[aria-label=Keys].sheet").bounding_box()
+        assert sheet["y"] >= 0 and sheet["y"] + sheet["height"] <= page.locator(".dock").bounding_box()["y"]
         page.locator("#jump").tap() if page.evaluate("navigator.maxTouchPoints") else page.click("#jump")
         wait_until(page, "egs.live.state?.doing === 'jump'")

@@ -20,7 +20,8 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.io import write_ply
 from egs_warp.web.page import PAGE, page_text
-from egs_warp.web.recording import CURVES, Recording
+from egs_warp.web.recording import CURVES, Recording, _curves
+from tests.support.slides import slide
 
 needs_page = pytest.mark.skipif(not PAGE.is_file(), reason="the page is not built; make web builds it")
 
@@ -117,6 +118,11 @@ def test_curves_are_those_of_the_audit(run_folder: Path):
     assert values[:, names.index("friction")].max() > 0.2
     assert values[0, names.index("force")] == pytest.approx(1.0, abs=0.2)
     assert np.ptp(values[:, names.index("height")]) < 0.1 < values[0, names.index("height")]
+
+
+def test_the_curve_of_the_momentum_knows_of_pushes():
+    struck = slide(struck=True).trajectory()
+    assert _curves(struck)[:, [name for name, _, _ in CURVES].index("residual")].max() < 1e-8
 
 
 @needs_page

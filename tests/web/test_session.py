@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Callable
@@ -10,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.creature import changed_creature
+from egs_warp.pipelines.report import AUDIT_LIMITS
 from egs_warp.web.messages import Pause, Perform, Step, read_message
 from egs_warp.web.packets import Frame
 from egs_warp.web.session import Session
@@ -185,3 +188,43 @@ def test_a_page_that_takes_nothing_loses_the_oldest_frames(tmp_path: Path, monke
         session.advance()
     times = [round(60.0 * one.time) for one in session.waiting() if isinstance(one, Frame)]
     assert times == [4, 5, 6, 7, 8]
+
+
+def test_a_push_strikes_it_in_the_next_step_and_its_take_passes_the_audit(tmp_path: Path):
+    """What is told moves the centre of mass, the head turns it; whoever is at rest wakes, and keeps its feet."""
+    played = Played(coarse_pawn(), tmp_path)
+    session, body = played.session, played.session.creature.body
+    played.until(lambda: session.resting)
+    played.ask("push", x=0.05, y=-0.1, z=0.0)
+    assert not session.resting
+    played.ask("record", on=True)
+    played.step()
+    gained = body.centre_of_mass(session.state.velocities) / body.speed_unit
+    # The ground has had a step to take some of it, by friction; the books of the take say how much.
+    assert 0.2 < gained[0] / 0.05 <= 1.0 and 0.2 < gained[1] / -0.1 <= 1.0
+    played.step(4)
+    spin = body.angular_momentum(session.state.positions, session.state.velocities)
+    played.ask("push", x=0.0, y=0.1, z=0.0, height=0.9)
+    played.ask("push", x=0.0, y=0.05, z=0.0, height=0.9)
+    played.step()
+    turned = body.angular_momentum(session.state.positions, session.state.velocities) - spin
+    assert turned[0] < -0.02 * body.mass * body.speed_unit * body.height
+    played.until(lambda: session.steering.idle and session.state.time > 1.0)
+    assert session.steering.doing == "stand"
+    played.ask("record", on=False)
+    path = tmp_path / "take-1"
+    t, report = Trajectory.load(path / "trajectory.npz"), json.loads((path / "report.json").read_text())
+    given = np.einsum("n,kni->ki", t.node_mass, t.kick_velocity) / (body.mass * body.speed_unit)
+    assert t.kick_step.tolist() == [0, 5]
+    np.testing.assert_allclose(given, [[0.05, -0.1, 0.0], [0.0, 0.15, 0.0]], atol=1e-9)
+    assert {name for name, value in report["audit"].items() if not value <= AUDIT_LIMITS[name]} == set()
+    assert report["notes"] == ["the user pulled at it or pushed it, which script.json does not repeat"]
+
+
+def test_a_push_that_waits_is_dropped_where_the_creature_stands_up_anew(tmp_path: Path):
+    played = Played(coarse_pawn(), tmp_path)
+    played.ask("push", x=0.3, y=0.0, z=0.0)
+    played.ask("stand")
+    played.step()
+    body = played.session.creature.body
+    assert np.linalg.norm(body.centre_of_mass(played.session.state.velocities)) < 0.01 * body.speed_unit

@@ -24,6 +24,7 @@ const ICONS = {
   left: '<path d="M9 4L4.5 8.5 9 13M5 8.5h8a6 6 0 0 1 0 12H9" stroke-linejoin="round"/>',
   right: '<path d="M15 4l4.5 4.5L15 13M19 8.5h-8a6 6 0 0 0 0 12h4" stroke-linejoin="round"/>',
   jump: '<path d="M5 20h14M12 16V4M7.5 8.5L12 4l4.5 4.5" stroke-linejoin="round"/>',
+  push: '<path d="M3 12h11M9.5 7.5L14 12l-4.5 4.5M19 4.5v15" stroke-linejoin="round"/>',
   leap: '<path d="M4 19c2-14 13-16 16-3M16.5 13.5L20 16.5l1.5-4.5" stroke-linejoin="round"/>',
   sliders:
     '<path d="M4 7h9M18 7h2M4 17h2M11 17h9"/><circle cx="15.5" cy="7" r="2.3"/><circle cx="8.5" cy="17" r="2.3"/>',

@@ -42,6 +42,7 @@ const PAD: [number, Action][] = [
   [14, "left"],
   [15, "right"],
 ];
+const PAD_PUSH = 3;
 const STICK = 0.6;
 /** Seconds after which what is held is done again and again. */
 const HELD = 0.45;
@@ -53,8 +54,12 @@ export class Hands {
   private held: { action: Action; source: string; since: number; again: boolean } | undefined;
   private sent = 0;
   private pad: Action | undefined;
+  private padPushes = false;
 
-  constructor(private readonly source: LiveSource) {}
+  constructor(
+    private readonly source: LiveSource,
+    private readonly push: () => void,
+  ) {}
 
   press(action: Action, source: string): void {
     if (this.held?.action === action && this.held.source === source) return;
@@ -103,6 +108,9 @@ export class Hands {
   private lookAtPad(): void {
     const pad = navigator.getGamepads?.().find((one) => one !== null && one.mapping === "standard");
     if (!pad) return;
+    const pushes = pad.buttons[PAD_PUSH]?.pressed ?? false;
+    if (pushes && !this.padPushes) this.push();
+    this.padPushes = pushes;
     let action = PAD.find(([button]) => pad.buttons[button]?.pressed)?.[1];
     const [x = 0, y = 0] = pad.axes;
     if (action === undefined && Math.max(Math.abs(x), Math.abs(y)) > STICK) {
@@ -115,17 +123,19 @@ export class Hands {
   }
 }
 
-/** The pointer: a drag that begins on the creature pulls at it, a click on the ground sends it there. */
+/** The pointer: a drag that begins on the creature pulls at it, a click pushes it; one on the ground sends it there. */
 export class Pointer {
   /** What is held, and where the hand is. */
   pulled: { node: number; hand: THREE.Vector3 } | undefined;
   private readonly plane = new THREE.Plane();
   private began: { x: number; y: number; id: number } | undefined;
+  private dragged = false;
   private last = 0;
 
   constructor(
     private readonly stage: Stage,
     private readonly source: LiveSource,
+    private readonly push: (node: number) => void,
   ) {
     const { canvas } = stage;
     const around = canvas.parentElement as HTMLElement;
@@ -138,6 +148,7 @@ export class Pointer {
   private down(event: PointerEvent): void {
     if (event.target !== this.stage.canvas || event.button !== 0 || !event.isPrimary) return;
     this.began = { x: event.clientX, y: event.clientY, id: event.pointerId };
+    this.dragged = false;
     const hit = this.stage.pick(event.clientX, event.clientY);
     if (hit === undefined) return;
     this.stage.controls.enabled = false;
@@ -152,7 +163,8 @@ export class Pointer {
       this.stage.canvas.classList.toggle("over", over);
     }
     if (this.pulled === undefined || this.began === undefined) return;
-    if (Math.hypot(event.clientX - this.began.x, event.clientY - this.began.y) < 4) return;
+    this.dragged ||= Math.hypot(event.clientX - this.began.x, event.clientY - this.began.y) >= 4;
+    if (!this.dragged) return;
     const hand = this.stage.ray(event.clientX, event.clientY).intersectPlane(this.plane, new THREE.Vector3());
     if (hand === null) return;
     this.pulled.hand.copy(hand);
@@ -171,7 +183,8 @@ export class Pointer {
       this.pulled = undefined;
       this.stage.controls.enabled = true;
       this.stage.invalidate();
-      this.source.send({ type: "release" });
+      if (this.dragged) this.source.send({ type: "release" });
+      else if (event.type === "pointerup") this.push(pulled.node);
       return;
     }
     if (event.type !== "pointerup" || Math.hypot(event.clientX - began.x, event.clientY - began.y) > 4) return;

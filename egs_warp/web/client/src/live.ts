@@ -4,6 +4,7 @@ import { button, element, icon, save } from "./dom";
 import { LiveClock } from "./clock";
 import { Hands, Pointer, type Action } from "./hands";
 import { Marks } from "./marks";
+import { Pushes } from "./pushes";
 import type { LiveSource, News } from "./source";
 import type { Stage } from "./stage";
 
@@ -21,6 +22,7 @@ const HELP: [string[], string][] = [
   [["Space"], "jump"],
   [["J"], "leap ahead"],
   [["H"], "hop"],
+  [["B"], "push it away from you"],
   [["Esc"], "drop what comes next"],
   [["P"], "pause"],
   [["."], "one step"],
@@ -37,6 +39,7 @@ export class Live {
   private readonly hands: Hands;
   private readonly pointer: Pointer;
   private readonly marks: Marks;
+  private readonly pushes: Pushes;
   private readonly pace = element("output", { class: "pace", title: "How fast it lives, beside real time" });
   private readonly pauseButton: HTMLButtonElement;
   private readonly takeButton: HTMLButtonElement;
@@ -53,10 +56,11 @@ export class Live {
     private readonly stage: Stage,
   ) {
     this.clock = new LiveClock(source.frames);
-    this.hands = new Hands(source);
-    this.pointer = new Pointer(stage, source);
     this.marks = new Marks(source.header.facts.height);
     stage.add(this.marks.group);
+    this.pushes = new Pushes(stage, source, this.marks);
+    this.hands = new Hands(source, () => this.pushes.push());
+    this.pointer = new Pointer(stage, source, (node) => this.pushes.push(node));
     this.pauseButton = button("pause", "Pause (p)", () => this.togglePause());
     const recording = "Record a take: a run folder, as animate writes one (r)";
     this.takeButton = button("record", recording, () => this.toggleTake());
@@ -75,8 +79,10 @@ export class Live {
         (value) => source.send({ type: "set", sag: Math.min(Math.max(Math.exp(-value), least), most) }),
       ),
     };
-    const sheet = { class: "sheet", "aria-label": "Body and ground", hidden: "" };
-    this.body = element("section", sheet, this.sliders.friction.part, this.sliders.sag.part);
+    const push = slide("Push", [0.05, 1], 0.05, (value) => value.toFixed(2), (value) => (this.pushes.strength = value));
+    push.show(this.pushes.strength);
+    const sheet = { class: "sheet", "aria-label": "Body, ground and pushes", hidden: "" };
+    this.body = element("section", sheet, this.sliders.friction.part, this.sliders.sag.part, push.part);
     this.help = helpSheet();
     source.onFrame = () => this.clock.arrived(performance.now() / 1000);
     source.listen((news) => this.hear(news));
@@ -118,12 +124,13 @@ export class Live {
       act("right", "Turn right (\u2192)"),
       act("jump", "Jump (space)"),
       act("leap", "Leap ahead (j)"),
+      button("push", "Push it away from you (b)", () => this.pushes.push()),
     );
     const keep = element(
       "div",
       {},
       button("stand", "Stand up at the start (backspace)", () => this.source.send({ type: "stand" })),
-      button("sliders", "Friction and stiffness", open(this.body, this.help)),
+      button("sliders", "Friction, stiffness, pushes", open(this.body, this.help)),
       this.takeButton,
       button("script", "Save what it did as a script", () => this.source.send({ type: "script" })),
       button("help", "Keys (?)", open(this.help, this.body)),
@@ -135,6 +142,7 @@ export class Live {
   /** After `elapsed` seconds; true where the picture is another one. */
   advance(elapsed: number): boolean {
     this.hands.tick();
+    this.pushes.tick();
     const moved = this.clock.advance(elapsed);
     if (moved) this.lastMoved = performance.now();
     return moved;
@@ -158,6 +166,9 @@ export class Live {
     if (event.key === "p") this.togglePause();
     else if (event.key === ".") this.step();
     else if (event.key === "r") this.toggleTake();
+    else if (event.key === "b") {
+      if (!event.repeat) this.pushes.push();
+    }
     else if (event.key === "?") this.help.hidden = !this.help.hidden;
     else if (event.key === "Backspace") this.source.send({ type: "stand" });
     else if (event.key === "Escape") {
@@ -279,6 +290,7 @@ function helpSheet(): HTMLElement {
     list.append(element("dt", {}, ...names), element("dd", {}, what));
   }
   list.append(element("dt", {}, "click"), element("dd", {}, "on the ground: go there"));
+  list.append(element("dt", {}, "click"), element("dd", {}, "the creature: push it there, away from you"));
   list.append(element("dt", {}, "drag"), element("dd", {}, "the creature: pull at it"));
   return element("section", { class: "sheet", "aria-label": "Keys", hidden: "" }, list);
 }

@@ -12,6 +12,7 @@ export class Marks {
   private readonly goal: THREE.Mesh;
   private readonly facing: THREE.Mesh;
   private readonly spring = new Strokes(2.5, 0.95, 16);
+  private readonly ring = new Strokes(3.5, 0.9, 16);
 
   constructor(private readonly height: number) {
     const square = new THREE.PlaneGeometry(0.32 * height, 0.32 * height);
@@ -25,7 +26,7 @@ export class Marks {
       mark.visible = false;
       this.group.add(mark);
     }
-    this.group.add(this.spring.object);
+    this.group.add(this.spring.object, this.ring.object);
   }
 
   showGoal(goal: [number, number] | null): void {
@@ -46,17 +47,32 @@ export class Marks {
       this.spring.set([], []);
       return;
     }
-    const ring: number[] = [];
-    const radius = 0.015 * this.height;
-    for (let k = 0; k < 16; k++) {
-      for (const j of [k, k + 1]) {
-        const angle = (Math.PI * j) / 8;
-        ring.push(hand.x + radius * Math.cos(angle), hand.y + radius * Math.sin(angle), hand.z);
-      }
-    }
+    const ring = circle(hand, 0.015 * this.height, new THREE.Vector3(1, 0, 0), new THREE.Vector3(0, 1, 0));
     const points = [...held.toArray(), ...hand.toArray(), ...ring];
-    this.spring.set(points, Array.from({ length: points.length }, (_, k) => PULL[k % 3]!));
+    this.spring.set(points, points.map((_, k) => PULL[k % 3]!));
   }
+
+  /** A ring that grows around what was hit, `age` from 0 to 1, as `camera` sees it round; without them, none. */
+  showPush(middle?: THREE.Vector3, age = 0, camera?: THREE.Camera): void {
+    if (middle === undefined || camera === undefined) {
+      this.ring.set([], []);
+      return;
+    }
+    const across = new THREE.Vector3(1, 0, 0).applyQuaternion(camera.quaternion);
+    const up = new THREE.Vector3(0, 1, 0).applyQuaternion(camera.quaternion);
+    const points = circle(middle, (0.03 + 0.12 * Math.sqrt(age)) * this.height, across, up);
+    this.ring.set(points, points.map((_, k) => PULL[k % 3]!));
+  }
+}
+
+/** Segments of a circle whose plane has two unit vectors. */
+function circle(middle: THREE.Vector3, radius: number, first: THREE.Vector3, second: THREE.Vector3): number[] {
+  const at = (k: number): number[] => {
+    const angle = (Math.PI * k) / 12;
+    const point = middle.clone().addScaledVector(first, radius * Math.cos(angle));
+    return point.addScaledVector(second, radius * Math.sin(angle)).toArray();
+  };
+  return Array.from({ length: 24 }, (_, k) => [...at(k), ...at(k + 1)]).flat();
 }
 
 /** Flat on the ground, smooth at its edge however few pixels there are: `distance` of p, each side of the square at 1,
