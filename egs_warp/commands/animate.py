@@ -54,7 +54,7 @@ def add_parser(commands: Commands) -> None:
     motion.add_argument(
         "--motion",
         default="jump",
-        help='jump (default), hop, twist, walk, several as "hop x3, twist 180", or a script.json',
+        help='jump (default), hop, twist, walk, dance, several as "hop x3, twist 180", or a script.json',
     )
     motion.add_argument("--distance", type=float, help="body heights: jump (0.5), hop (0.7), twist (0), walk (0.4)")
     motion.add_argument(
@@ -66,6 +66,9 @@ def add_parser(commands: Commands) -> None:
     motion.add_argument(
         "--push",
         help='what hits it: seconds, impulse (m sqrt(g H)), way, part of the height: "0.5 0.1 left, 1-2 0.3 back 0.8"',
+    )
+    motion.add_argument(
+        "--beats", help='of a dance: beats a minute, "90", or with the seconds of the first, "90 0.5", or a file'
     )
     motion.add_argument("--frames", type=int, help="pictures at 60 Hz, the first at rest (until the body rests)")
     body = animate.add_argument_group("body and ground")
@@ -245,7 +248,7 @@ def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
     given = {name: getattr(chosen, name) for name in numbers if getattr(chosen, name) is not None}
     options = AnimateOptions(**given, shadow=not chosen.no_shadow)
     # The files of key frames are read, too.
-    motion(chosen.motion, **options.targets()).frames()
+    motion(chosen.motion, beats=chosen.beats, **options.targets()).frames()
     if chosen.push is not None:
         read_pushes(chosen.push)
     if chosen.muscles is not None:
@@ -253,6 +256,7 @@ def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
     return {
         "motion": chosen.motion,
         "push": chosen.push,
+        "beats": chosen.beats,
         "front": parse_direction("front", chosen.front) if chosen.front is not None else None,
         "gravity_up": parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up is not None else None,
         "muscles_file": chosen.muscles,

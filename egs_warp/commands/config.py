@@ -15,7 +15,7 @@ from egs_warp.errors import UserError
 
 NAME = "run.yaml"
 _CHECKSUM = "capture_sha256"
-_PATHS = ("capture", "object", "plane", "cameras", "background", "terrain", "muscles", "inpainter", "camera")
+_PATHS = ("capture", "object", "plane", "cameras", "background", "terrain", "muscles", "inpainter", "camera", "beats")
 """Flags that may name files: in the file these are relative to its own folder."""
 _WORDS = ("fixed", "follow", "orbit", "patch", "telea", "ns", TRANSPARENT)
 """Values of such flags that are no files."""

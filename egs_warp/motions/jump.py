@@ -81,9 +81,16 @@ class Jump:
     is calm."""
 
     def __init__(
-        self, place: Place, target: JumpTarget, *, facing: Facing | None = None, weights: Weights | None = None
+        self,
+        place: Place,
+        target: JumpTarget,
+        *,
+        facing: Facing | None = None,
+        weights: Weights | None = None,
+        settled: bool = False,
     ) -> None:
-        """``facing``: which way it lands; straight ahead if not given."""
+        """``facing``: which way it lands; straight ahead if not given. ``settled``: it crouches from its first step
+        on."""
         body, ground = place.body, place.ground
         self.body, self.target, self.facing = body, target, facing or Straight()
         self.weights = weights or Weights()
@@ -108,16 +115,9 @@ class Jump:
         self._landing_time = LANDING * self._time_unit if self._feet else 0.0
         self._run_on = 0.0 if self._feet else RUN_ON * self._time_unit
         ahead = ground.axes[0] @ (place.touching - body.centre_of_mass(place.standing)).T
-        self.plan = plan_jump(
-            target,
-            height=body.height,
-            com_height=self.pose.standing_height,
-            support_ahead=float(self.pose.support_high[0]),
-            gravity=self.gravity,
-            step=place.step,
-            lean=min(LEAN * target.distance, FURTHEST_LEAN * float(ahead.max())),
-            landing_time=self._landing_time,
-        )
+        self._step, self._furthest_lean = place.step, FURTHEST_LEAN * float(ahead.max())
+        self.plan = self._planned(target)
+        self._settled = settled
         self.phase = JumpPhase.SETTLE
         self._entered = 0.0
         local = ground.local(place.standing)
@@ -145,6 +145,26 @@ class Jump:
         plan, ahead = self.plan, abs(self.target.distance) / self.body.height
         landing = USUAL_LANDING + USUAL_LANDING_AHEAD * ahead
         return plan.crouch_time + plan.thrust_time + plan.flight_time + (SETTLING + landing) * self._time_unit
+
+    def _planned(self, target: JumpTarget) -> JumpPlan:
+        return plan_jump(
+            target,
+            height=self.body.height,
+            com_height=self.pose.standing_height,
+            support_ahead=float(self.pose.support_high[0]),
+            gravity=self.gravity,
+            step=self._step,
+            lean=min(LEAN * target.distance, self._furthest_lean),
+            landing_time=self._landing_time,
+        )
+
+    def take_off_time(self, height: float) -> float:
+        """Seconds from the crouch of a jump on the spot, ``height`` metres high, until its thrust ends as planned;
+        both take whole steps."""
+        plan = self._planned(JumpTarget(0.0, height))
+        return self._step * float(
+            sum(np.ceil(seconds / self._step - 1e-6) for seconds in (plan.crouch_time, plan.thrust_time))
+        )
 
     @property
     def resting(self) -> bool:
@@ -204,7 +224,7 @@ class Jump:
         seen = replace(seen, touching=seen.touching and seen.velocity[2] < 0.0)
         elapsed, plan = time - self._entered + 1e-9, self.plan
         following = {
-            JumpPhase.SETTLE: elapsed >= SETTLING * self._time_unit,
+            JumpPhase.SETTLE: self._settled or elapsed >= SETTLING * self._time_unit,
             JumpPhase.CROUCH: elapsed >= plan.crouch_time,
             JumpPhase.THRUST: self._risen(seen, dt),
             JumpPhase.FLIGHT: self._flew and self._landed(seen),

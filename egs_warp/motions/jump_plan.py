@@ -23,6 +23,9 @@ ONSET, RAMP = 0.3, 0.4
 is reached.
 """
 
+_EXTENSION, _EXTENDED = 0.04, 0.25
+"""How much higher than it stands a body leaves the ground: body heights, and of the height of the jump at most."""
+
 
 @dataclass(frozen=True)
 class JumpTarget:
@@ -116,6 +119,19 @@ def stopping_time(com_height: float, fall_speed: float, gravity: float, landing_
     return float((even + swaying / pressed * odd) / (swaying * even + pressed * odd))
 
 
+def level_flight(jump_height: float, height: float, gravity: float) -> float:
+    """Seconds that a body of ``height`` metres, whose centre of mass rises by ``jump_height`` metres, is off the ground
+    when it lands as high as it started."""
+    rise = jump_height - min(_EXTENSION * height, _EXTENDED * jump_height)
+    return float(np.sqrt(8.0 * rise / gravity))
+
+
+def height_of_flight(seconds: float, height: float, gravity: float) -> float:
+    """Metres: what ``level_flight`` undoes."""
+    rise = gravity * seconds**2 / 8.0
+    return min(rise + _EXTENSION * height, rise / (1.0 - _EXTENDED))
+
+
 def plan_jump(
     target: JumpTarget,
     *,
@@ -135,7 +151,7 @@ def plan_jump(
     ``landing_time`` seconds; metres.
     """
     time_unit = np.sqrt(height / gravity)
-    extension = min(0.04 * height, 0.25 * target.height)
+    extension = min(_EXTENSION * height, _EXTENDED * target.height)
     rise = target.height - extension
     speed_up = np.sqrt(2.0 * gravity * rise) + 0.5 * gravity * step
     acceleration = PUSH * gravity

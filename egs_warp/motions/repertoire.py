@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from egs_warp.motions.beats import LATEST, MOST_BEATS, even_beats, read_beats
+from egs_warp.motions.dance import Dance
 from egs_warp.motions.follow import Follow
 from egs_warp.motions.hop import Squares
 from egs_warp.motions.jump import Jump
@@ -40,11 +42,14 @@ class MotionKind:
     """At 60 Hz, within which one repeat comes to rest; what takes longer is cut off."""
     file: str | None = None
     """The file that it needs, for messages."""
+    beats: bool = False
+    """Whether it may be given a file of beats, in place of its numbers."""
 
     def usage(self, name: str) -> str:
         """What the motion called ``name`` takes, for messages."""
         names = ", ".join(value.name for value in self.takes)
-        return f"{name} takes {names}" if names else f"{name} takes a file"
+        takes = f"{name} takes {names}" if names else f"{name} takes a file"
+        return f"{takes} or a file of beats" if self.beats else takes
 
 
 def _target(asked: Mapping[str, float], height: float) -> JumpTarget:
@@ -99,6 +104,19 @@ def _turns_on_the_spot(request: MotionRequest, height: float) -> list[Part]:
 def _stands(request: MotionRequest, height: float) -> list[Part]:
     seconds = request.asked["seconds"]
     return _repeated(request, request.asked, lambda place: StandFor(place, seconds))
+
+
+def _dances(request: MotionRequest, height: float) -> list[Part]:
+    beats = _beats(request)
+    asked = request.asked if request.file is None else {"beats": float(len(beats)), "duration": beats[-1]}
+    return _repeated(request, asked, lambda place: Dance(place, beats))
+
+
+def _beats(request: MotionRequest) -> tuple[float, ...]:
+    """Seconds from the start of the dance."""
+    if request.file is not None:
+        return read_beats(request.file)
+    return even_beats(request.asked["tempo"], request.asked["first"], int(request.asked["beats"]))
 
 
 def _path(request: MotionRequest) -> np.ndarray:
@@ -188,6 +206,16 @@ REPERTOIRE: Mapping[str, MotionKind] = {
         (Value("seconds", 2.0, 0.0, 60.0, "seconds", above=True),),
         _stands,
         lambda request: int(np.ceil(60.0 * request.asked["seconds"])) + _CALMING,
+    ),
+    "dance": MotionKind(
+        (
+            Value("tempo", 90.0, 10.0, 400.0, "beats a minute"),
+            Value("first", 1.0, 0.0, LATEST, "seconds"),
+            Value("beats", 16.0, 2.0, MOST_BEATS, "beats", whole=True),
+        ),
+        _dances,
+        lambda request: int(np.ceil(60.0 * _beats(request)[-1])) + _CALMING,
+        beats=True,
     ),
     "trajectory": MotionKind(
         (),

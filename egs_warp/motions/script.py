@@ -16,12 +16,15 @@ from typing import Any
 
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.text import parse_json, read_text, whole_number
+from egs_warp.motions.beats import asked_beats
 from egs_warp.motions.repertoire import REPERTOIRE, MotionKind
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.sequence import Part, Place
 
 MOST_MOTIONS = 100
 _NAMES = ", ".join(REPERTOIRE)
+_FILE = "file of beats"
+"""Among the values that motions take which do not say their own."""
 
 
 @dataclass(frozen=True)
@@ -54,14 +57,18 @@ class Script:
         return [part.begin(place).expected_time for part in self.parts(place.body.height)]
 
 
-def motion(text: str, **values: float | None) -> Script:
+def motion(text: str, *, beats: str | None = None, **values: float | None) -> Script:
     """One motion by name (``jump``, ``hop``, ``twist``, ``walk``, ``walk to``, ``turn`` ...), several as a line of
     text, or the JSON file that ``text`` names.
 
     ``values`` (lengths in body heights) hold for motions that take them and do not say their own; those that are None
-    are left out. Raises ``UserError`` for the first mistake.
+    are left out. ``beats`` are those of dances that do not say theirs: a tempo, as ``90``, with the seconds of its
+    first beat behind it or not, or a file. Raises ``UserError`` for the first mistake.
     """
-    given = {name: value for name, value in values.items() if value is not None}
+    given: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
+    if beats is not None:
+        to_dance_to = asked_beats(beats)
+        given |= {_FILE: to_dance_to} if isinstance(to_dance_to, Path) else to_dance_to
     if text.strip().lower().endswith(".json") and "," not in text and len(text.split()) == 1:
         requests = _from_json(Path(text.strip()), given)
     else:
@@ -71,13 +78,15 @@ def motion(text: str, **values: float | None) -> Script:
     count = sum(request.repeat for request in requests)
     if count > MOST_MOTIONS:
         raise ArgumentError("motion", f"{count} motions are asked for; at most {MOST_MOTIONS} are done in a row")
-    for name in given:
+    if beats is not None and not any(REPERTOIRE[request.name].beats for request in requests):
+        raise ArgumentError("beats", f"no motion of {text.strip()!r} takes them; ask for a dance")
+    for name in values.keys() & given.keys():
         if not any(name in request.asked for request in requests):
             raise ArgumentError(name, f"no motion of {text.strip()!r} takes it")
     return Script(tuple(requests))
 
 
-def _from_words(piece: str, defaults: Mapping[str, float], where: str) -> MotionRequest:
+def _from_words(piece: str, defaults: Mapping[str, Any], where: str) -> MotionRequest:
     words = piece.replace(",", " ").split()
     if not words:
         raise UserError(f"{where}: nothing between two commas; name a motion: {_NAMES}")
@@ -96,7 +105,7 @@ def _from_words(piece: str, defaults: Mapping[str, float], where: str) -> Motion
             if key in values:
                 raise UserError(f"{where} ({piece!r}): {key} is given twice; give it once")
             values[key] = number
-        elif kind.file is not None and file is None:
+        elif file is None and (kind.file is not None or (kind.beats and not _is_number(word))):
             file = Path(word)
         else:
             free = [key for key in order if key not in values]
@@ -106,7 +115,7 @@ def _from_words(piece: str, defaults: Mapping[str, float], where: str) -> Motion
     return _request(name, values, 1 if repeat is None else repeat, file, defaults, f"{where} ({piece!r})")
 
 
-def _from_json(path: Path, defaults: Mapping[str, float]) -> list[MotionRequest]:
+def _from_json(path: Path, defaults: Mapping[str, Any]) -> list[MotionRequest]:
     entries = parse_json(read_text(path), path)
     if not isinstance(entries, list) or not entries:
         raise UserError(f'{path}: give a list of motions, as [{{"motion": "jump"}}]')
@@ -131,6 +140,14 @@ def _from_json(path: Path, defaults: Mapping[str, float]) -> list[MotionRequest]
     return requests
 
 
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
 def _kind(name: str, where: str) -> MotionKind:
     if name not in REPERTOIRE:
         raise UserError(f"{where}: unknown motion {name!r}; known motions are: {_NAMES}")
@@ -138,7 +155,7 @@ def _kind(name: str, where: str) -> MotionKind:
 
 
 def _request(
-    name: str, values: Mapping[str, Any], repeat: float, file: Path | None, defaults: Mapping[str, float], where: str
+    name: str, values: Mapping[str, Any], repeat: float, file: Path | None, defaults: Mapping[str, Any], where: str
 ) -> MotionRequest:
     kind = _kind(name, where)
     known = {value.name: value for value in kind.takes}
@@ -149,7 +166,11 @@ def _request(
         raise UserError(f"{where}: repeat {repeat}; give a whole number from 1 to {MOST_MOTIONS}")
     if file is None and kind.file is not None:
         raise UserError(f"{where}: {name} needs {kind.file}")
-    if file is not None and kind.file is None:
+    if file is not None and kind.file is None and not kind.beats:
         raise UserError(f"{where}: {kind.usage(name)}")
+    if kind.beats and file is None and not values.keys() & known.keys():
+        file = defaults.get(_FILE)
+    if kind.beats and file is not None and values:
+        raise UserError(f"{where}: {', '.join(values)} beside the beats of {file}; give one of them")
     asked = {key: value.read(values.get(key, defaults.get(key, value.default)), where) for key, value in known.items()}
     return MotionRequest(name, asked, int(repeat), file)

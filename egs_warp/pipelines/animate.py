@@ -97,6 +97,7 @@ class Asked:
     gravity_up: tuple[float, ...]
     front: tuple[float, ...]
     push: str | None
+    beats: str | None
     muscles: str | None
     """Name of the file."""
     solids: int
@@ -113,6 +114,7 @@ def animate(
     *,
     motion: str = "jump",
     push: str | None = None,
+    beats: str | None = None,
     up: np.ndarray | None = None,
     plane: Plane | None = None,
     ground: HeightField | None = None,
@@ -135,7 +137,7 @@ def animate(
     """Bring ``cloud`` (scene units) to life and write video, contact sheet, plots, report and trajectory into ``out``.
 
     ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.motions.script``).
-    ``push``: what hits it meanwhile (``egs_warp.motions.push``).
+    ``push``: what hits it meanwhile (``egs_warp.motions.push``); ``beats``: those of a dance, a tempo or a file.
     ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
     the object to the camera; ``shot``: how it is filmed. ``ground``, ``muscles_file``, ``solids``, ``gravity_up``,
     ``front``, ``seen_from``, ``settings``: see ``make_creature``. Returns what it wrote as ``report.json``
@@ -145,7 +147,7 @@ def animate(
     """
     options, shot = options or AnimateOptions(), shot or Shot()
     shot.check()
-    asked = script(motion, **options.targets())
+    asked = script(motion, beats=beats, **options.targets())
     asked.frames()  # reads the files that it names
     pushes = read_pushes(push) if push is not None else ()
     ffmpeg_program()
@@ -207,6 +209,7 @@ def animate(
             gravity_up=_numbers(gravity_up),
             front=_numbers(front),
             push=push,
+            beats=beats,
             muscles=None if muscles_file is None else Path(muscles_file).name,
             solids=len(solids),
         )

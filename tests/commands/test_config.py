@@ -102,7 +102,7 @@ def test_what_is_written_is_what_was_given(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("speed: 3", "unknown key 'speed'; give some of background, camera,"),
+        ("speed: 3", "unknown key 'speed'; give some of background, beats, camera,"),
         ("trust: true", "unknown key 'trust'"),
         ("motion: [jump]", "motion is ['jump']; give a text or a number"),
         ("motion: true", "motion is True; give a text or a number"),

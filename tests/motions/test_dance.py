@@ -1,0 +1,182 @@
+"""Dances: what leaves the ground and meets it does so on a beat, as the forces of the ground tell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egs_warp.errors import ArgumentError, UserError
+from egs_warp.locomotion.audit import audit
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.beats import Span, even_beats, next_span, read_beats
+from egs_warp.motions.dance import HIGHEST, IN_TIME, LOWEST, Dance
+from egs_warp.motions.jump import Jump
+from egs_warp.motions.jump_plan import JumpTarget, height_of_flight, level_flight
+from egs_warp.motions.script import motion
+from egs_warp.motions.sequence import Place
+from egs_warp.pipelines.performance import simulate
+from egs_warp.pipelines.report import verdict
+from tests.support.lives import coarse_pawn
+from tests.support.runs import Run, coarse_block_run
+
+
+@pytest.fixture(scope="module")
+def danced() -> Run:
+    """A block dances to five beats, the third of which comes too soon after the jump to the second."""
+    return coarse_block_run("dance 100 0.5 5")
+
+
+def flights(trajectory: Trajectory, least: float) -> list[tuple[float, float]]:
+    """Ends of the last step on the ground and of the first one on it again, of all flights of ``least`` seconds."""
+    load = np.bincount(
+        trajectory.contact_step,
+        np.einsum("ci,ci->c", trajectory.contact_force, trajectory.contact_normal),
+        len(trajectory.dt),
+    )
+    weight = trajectory.node_mass.sum() * np.linalg.norm(trajectory.gravity)
+    borne = np.flatnonzero(load > 1e-6 * weight) + 1
+    left, met = trajectory.time[borne[:-1]], trajectory.time[borne[1:]]
+    return [(a, b) for a, b in zip(left, met, strict=True) if b - a >= least]
+
+
+def check_that_it_keeps_time(dance: Dance, trajectory: Trajectory) -> None:
+    """Every flight of the trajectory begins and ends within 40 ms of what was asked, and none is left out."""
+    reached = dance.reached(trajectory, 0, -1)
+    asked = np.array([event.asked for event in reached.events]).reshape(-1, 2)
+    found = np.array(flights(trajectory, level_flight(0.5 * LOWEST, 1.0, 9.81)))
+    assert len(found) == len(asked) > 1
+    np.testing.assert_allclose([event.reached for event in reached.events], found.ravel(), atol=1e-9)
+    assert np.abs(found - asked).max() <= IN_TIME
+    assert reached.worst_error == pytest.approx(np.abs(found - asked).max())
+
+
+def test_a_dance_keeps_time(danced: Run) -> None:
+    dance = danced.sequence.done[0].motion
+    assert isinstance(dance, Dance) and dance.resting
+    check_that_it_keeps_time(dance, danced.trajectory)
+    assert {round(event.asked, 9) for event in dance.reached(danced.trajectory, 0, -1).events} == {0.5, 1.1, 2.3, 2.9}
+
+
+def test_what_was_skipped_is_told(danced: Run) -> None:
+    dance = danced.sequence.done[0].motion
+    assert isinstance(dance, Dance)
+    np.testing.assert_allclose(dance.reached(danced.trajectory, 0, -1).skipped, [1.7])
+    assert "1 of 5 beats skipped, too near to the others: 1.70 s" in dance.notes()
+    assert any(note.startswith("4 take-offs and touch-downs, the worst ") for note in dance.notes())
+
+
+def test_its_equations_hold_in_every_step(danced: Run) -> None:
+    found = audit(danced.trajectory, newton_unconverged=sum(not report.converged for report in danced.reports))
+    assert verdict(found).startswith("audit: passed")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("beats", ["dance 90 1 14", "dance 120 0.6 14", "dance 50 1 5"])
+def test_the_pawn_keeps_time_through_the_whole_figure(beats: str) -> None:
+    """Jumps, hops ahead and back, twists; at 50 beats a minute it leaves the ground half-way to a beat."""
+    done = simulate(coarse_pawn(), motion(beats))
+    dance = done.sequence.done[0].motion
+    assert isinstance(dance, Dance) and done.fallen is None
+    check_that_it_keeps_time(dance, done.trajectory)
+
+
+def test_a_flight_and_its_height_are_told_from_each_other() -> None:
+    """T = sqrt(8 Z / g), of the rise Z beyond what the body has stretched by when it leaves the ground."""
+    for height in (LOWEST, 0.16, 0.3, HIGHEST):
+        assert height_of_flight(level_flight(height, 1.0, 9.81), 1.0, 9.81) == pytest.approx(height)
+    assert level_flight(0.5, 1.0, 9.81) == pytest.approx(np.sqrt(8.0 * 0.46 / 9.81))
+
+
+def test_a_jump_says_when_it_takes_off(place: Place) -> None:
+    """As the flight does, the lead follows from the plan that the jump itself has."""
+    jump = Jump(place, JumpTarget(0.0, 0.4), settled=True)
+    assert jump.plan.flight_time == pytest.approx(level_flight(0.4, place.body.height, 9.81))
+    lead = jump.plan.crouch_time + jump.plan.thrust_time
+    assert lead <= jump.take_off_time(0.4) < lead + 2.0 * place.step
+    assert jump.take_off_time(0.2) != jump.take_off_time(0.4)
+
+
+def span_of(beats: tuple[float, ...], after: float = 0.0, lead: float = 0.5) -> Span | None:
+    return next_span(beats, after, earliest=lambda flight: after + lead, flights=(0.25, 0.7), easiest=0.45)
+
+
+def test_a_jump_spans_two_beats() -> None:
+    assert span_of((0.2, 0.6, 1.1, 1.6)) == Span(0.6, 1.1)
+    assert span_of((0.2, 0.6, 1.1, 1.6), after=0.6) == Span(1.1, 1.6)
+    assert span_of((0.2, 0.6, 1.1, 1.6), after=1.1) is None
+
+
+def test_easier_jumps_are_preferred_to_hasty_ones() -> None:
+    """Of beats a sixth of a second apart it takes every third."""
+    found = span_of(tuple(np.arange(1, 20) / 6.0))
+    assert found is not None and found.flight == pytest.approx(0.5)
+
+
+def test_what_is_too_far_for_a_jump_is_divided() -> None:
+    assert span_of((1.0, 2.0)) == Span(1.5, 2.0, 2)
+    assert span_of((1.0, 3.0)) == Span(2.5, 3.0, 4)
+
+
+def test_what_cannot_be_reached_is_left() -> None:
+    assert span_of((0.1, 0.4)) is None
+    assert span_of((1.0,)) is None
+    assert span_of((1.0, 60.0)) is None
+    with pytest.raises(UserError, match=r"^dance: none of the 2 beats can be reached: before the first jump it takes"):
+        coarse_block_run("dance 120 0 2")
+
+
+def test_beats_are_read_from_the_first_column(tmp_path: Path) -> None:
+    file = tmp_path / "beats.csv"
+    file.write_text("time,label\n0.5,kick\n\n# bar\n1.25;snare\n2 hat\n")
+    assert read_beats(file) == (0.5, 1.25, 2.0)
+    assert even_beats(120.0, 0.25, 3) == (0.25, 0.75, 1.25)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "beats.csv: no beats; give lines of seconds"),
+        ("time\n", "beats.csv: no beats; give lines of seconds"),
+        ("1\nsoon\n", "beats.csv, line 2: 'soon': give the seconds of a beat, from 0 to 600"),
+        ("-1\n", "line 1: '-1': give the seconds of a beat, from 0 to 600"),
+        ("1\ninf\n", "line 2: 'inf': give the seconds of a beat, from 0 to 600"),
+        ("1\n1\n", "line 2: '1': is not after 1, the beat before; give beats in their order"),
+        ("\n".join(str(k / 10) for k in range(1001)), "1001 beats; at most 1000 are danced to"),
+    ],
+)
+def test_a_bad_file_of_beats_is_told_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+    file = tmp_path / "beats.csv"
+    file.write_text(text)
+    with pytest.raises(UserError) as error:
+        read_beats(file)
+    assert said in str(error.value) and "\n" not in str(error.value)
+
+
+def test_beats_are_given_to_the_dances_of_a_script(tmp_path: Path) -> None:
+    assert motion("dance", beats="120 0.5") == motion("dance 120 0.5")
+    assert motion("dance 80, jump", beats="120").requests[0].asked["tempo"] == 80.0
+    assert motion("dance", beats="b.csv") == motion("dance b.csv")
+    file = tmp_path / "b.csv"
+    file.write_text("1\n1.5\n")
+    (part,) = motion(f"dance {file}").parts(1.0)
+    assert part.asked == {"beats": 2.0, "duration": 1.5}
+    assert motion(f"dance {file}").frames() == motion("dance 120 1 2").frames()
+
+
+@pytest.mark.parametrize(
+    ("text", "beats", "said"),
+    [
+        ("jump", "90", "beats: no motion of 'jump' takes them; ask for a dance"),
+        ("dance", " ", "beats: nothing is given; give a file of seconds or a tempo, as 90"),
+        ("dance", "9999", "tempo 9999: give a number of beats a minute from 10 to 400"),
+        ("dance", "90 nan", "first nan: give a number of seconds from 0 to 600"),
+        ("dance b.csv 90", None, "tempo beside the beats of b.csv; give one of them"),
+        ("dance 1 2 3 4", None, "'4' is one value too many; dance takes tempo, first, beats or a file of beats"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(text: str, beats: str | None, said: str) -> None:
+    with pytest.raises((UserError, ArgumentError)) as error:
+        motion(text, beats=beats).frames()
+    assert said in str(error.value) and "\n" not in str(error.value)
