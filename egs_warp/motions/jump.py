@@ -107,6 +107,7 @@ class Jump:
         feet, carriage = carried_on(place)
         self._feet = [BodyPart.of(body, "foot", foot.sole) for foot in feet] if carriage is OnLegs else []
         ahead = ground.axes[0] @ (place.touching - body.centre_of_mass(place.standing)).T
+        self._style = place.style
         self._step, self._furthest_lean = place.step, FURTHEST_LEAN * float(ahead.max())
         self.plan = self._planned(target)
         self._settled = settled
@@ -148,6 +149,7 @@ class Jump:
             gravity=self.gravity,
             step=self._step,
             lean=min(LEAN * target.distance, self._furthest_lean),
+            style=self._style,
         )
 
     def take_off_time(self, height: float) -> float:
