@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from egs_warp.locomotion.trajectory import Trajectory
     from egs_warp.motions.push import Push, read_pushes
     from egs_warp.motions.script import Script, motion
+    from egs_warp.motions.style import Style, read_style
     from egs_warp.pipelines.animate import AnimateOptions, animate
     from egs_warp.pipelines.creature import Creature, make_creature
     from egs_warp.pipelines.performance import Performance, simulate
@@ -84,6 +85,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "locomotion.trajectory": ("Trajectory",),
     "motions.push": ("Push", "read_pushes"),
     "motions.script": ("Script", "motion"),
+    "motions.style": ("Style", "read_style"),
     "pipelines.animate": ("AnimateOptions", "animate"),
     "pipelines.creature": ("Creature", "make_creature"),
     "pipelines.performance": ("Performance", "simulate"),
@@ -134,6 +136,7 @@ __all__ = [
     "Shot",
     "Solid",
     "Strategy",
+    "Style",
     "TetMesh",
     "TrainResult",
     "TrainingView",
@@ -157,6 +160,7 @@ __all__ = [
     "read_cameras",
     "read_capture",
     "read_pushes",
+    "read_style",
     "render_gaussians",
     "render_torch",
     "scene",

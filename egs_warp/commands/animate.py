@@ -70,6 +70,9 @@ def add_parser(commands: Commands) -> None:
     motion.add_argument(
         "--beats", help='of a dance: beats a minute, "90", or with the seconds of the first, "90 0.5", or a file'
     )
+    motion.add_argument(
+        "--style", help="of what jumps: light, heavy, rubbery, or anticipation=, squash=, timing=, times the usual"
+    )
     motion.add_argument("--frames", type=int, help="pictures at 60 Hz, the first at rest (until the body rests)")
     body = animate.add_argument_group("body and ground")
     body.add_argument("--up", help="axis that points up: x, y, z or with a minus, as --up=-y; else it is guessed")
@@ -248,7 +251,9 @@ def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
     given = {name: getattr(chosen, name) for name in numbers if getattr(chosen, name) is not None}
     options = AnimateOptions(**given, shadow=not chosen.no_shadow)
     # The files of key frames are read, too.
-    motion(chosen.motion, beats=chosen.beats, **options.targets()).frames()
+    asked = motion(chosen.motion, beats=chosen.beats, **options.targets())
+    asked.frames()
+    asked.style(chosen.style)
     if chosen.push is not None:
         read_pushes(chosen.push)
     if chosen.muscles is not None:
@@ -257,6 +262,7 @@ def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
         "motion": chosen.motion,
         "push": chosen.push,
         "beats": chosen.beats,
+        "style": chosen.style,
         "front": parse_direction("front", chosen.front) if chosen.front is not None else None,
         "gravity_up": parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up is not None else None,
         "muscles_file": chosen.muscles,

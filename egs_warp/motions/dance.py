@@ -219,7 +219,9 @@ class Dance:
         skipped = [f"{beat:.2f}" for beat in self._skipped()]
         if skipped:
             named = ", ".join(skipped[:10]) + (", ..." if len(skipped) > 10 else "")
-            notes.append(f"{len(skipped)} of {len(self._beats)} beats skipped, too near to the others: {named} s")
+            notes.append(
+                f"{len(skipped)} of {len(self._beats)} beats skipped, too near to the others or the last: {named} s"
+            )
         return notes
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:

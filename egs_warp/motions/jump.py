@@ -115,6 +115,7 @@ class Jump:
         self._landing_time = LANDING * self._time_unit if self._feet else 0.0
         self._run_on = 0.0 if self._feet else RUN_ON * self._time_unit
         ahead = ground.axes[0] @ (place.touching - body.centre_of_mass(place.standing)).T
+        self._style = place.style
         self._step, self._furthest_lean = place.step, FURTHEST_LEAN * float(ahead.max())
         self.plan = self._planned(target)
         self._settled = settled
@@ -156,6 +157,7 @@ class Jump:
             step=self._step,
             lean=min(LEAN * target.distance, self._furthest_lean),
             landing_time=self._landing_time,
+            style=self._style,
         )
 
     def take_off_time(self, height: float) -> float:

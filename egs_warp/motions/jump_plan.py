@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from egs_warp.motions.style import Style
+
 CARRIED = 2.0
 """Speed ahead at the end of a crouch, in leans over its time: 2 is a steady acceleration, 0 a stop."""
 LEAN = 0.15
@@ -142,6 +144,7 @@ def plan_jump(
     step: float,
     lean: float,
     landing_time: float = 0.0,
+    style: Style | None = None,
 ) -> JumpPlan:
     """Stroke, times and take-off velocity for a jump of ``target`` by a body of ``height`` H
     (docs/concepts/motions.md).
@@ -150,15 +153,16 @@ def plan_jump(
     in m/s^2, a solver step takes ``step`` seconds, ``lean`` is that of the plan, and the fall is stopped within
     ``landing_time`` seconds; metres.
     """
+    style = style or Style()
     time_unit = np.sqrt(height / gravity)
     extension = min(_EXTENSION * height, _EXTENDED * target.height)
     rise = target.height - extension
     speed_up = np.sqrt(2.0 * gravity * rise) + 0.5 * gravity * step
-    acceleration = PUSH * gravity
+    acceleration = PUSH * gravity / style.timing
     stroke = max(speed_up**2 / (2.0 * acceleration), extension + 0.02 * height)
     # Every step goes its whole way at the speed of its end: half a step's way more than the thrust itself.
     stroke += 0.5 * speed_up * step
-    crouch_depth = min(stroke - extension, DEEPEST_CROUCH * com_height)
+    crouch_depth = min(style.anticipation * (stroke - extension), DEEPEST_CROUCH * com_height)
     way = crouch_depth + extension - 0.5 * speed_up * step
     thrust_time = max(way / (ramped(1.0)[1] * speed_up), 2.0 * step)
     flight_time = np.sqrt(2.0 * rise / gravity) + np.sqrt(2.0 * max(rise - target.rise, 0.0) / gravity)
@@ -170,12 +174,12 @@ def plan_jump(
     return JumpPlan(
         crouch_depth=float(crouch_depth),
         extension=float(extension),
-        crouch_time=float(np.ceil(1.1 * time_unit / step) * step),
+        crouch_time=float(np.ceil(style.anticipation * style.timing * 1.1 * time_unit / step) * step),
         thrust_time=float(thrust_time),
         flight_time=float(flight_time),
         speed_up=float(speed_up),
         speed_forward=float(speed_forward),
         lean=float(lean),
         landing_lag=float(speed_forward * capture_time - footprint_help),
-        landing_rate=float(4.0 / time_unit),
+        landing_rate=float(4.0 / (style.squash * time_unit)),
     )

@@ -42,6 +42,8 @@ class MotionKind:
     """At 60 Hz, within which one repeat comes to rest; what takes longer is cut off."""
     file: str | None = None
     """The file that it needs, for messages."""
+    jumps: bool = False
+    """Whether it is made of jumps, which have a style."""
     beats: bool = False
     """Whether it may be given a file of beats, in place of its numbers."""
 
@@ -159,9 +161,14 @@ def _length(name: str, default: float, *, above: bool = False) -> Value:
 
 
 REPERTOIRE: Mapping[str, MotionKind] = {
-    "jump": MotionKind((_length("distance", 0.5), _length("height", 0.2, above=True)), _jumps, lambda request: 120),
+    "jump": MotionKind(
+        (_length("distance", 0.5), _length("height", 0.2, above=True)), _jumps, lambda request: 120, jumps=True
+    ),
     "hop": MotionKind(
-        (_length("distance", 0.7, above=True), _length("height", 0.3, above=True)), _hops, lambda request: 150
+        (_length("distance", 0.7, above=True), _length("height", 0.3, above=True)),
+        _hops,
+        lambda request: 150,
+        jumps=True,
     ),
     "twist": MotionKind(
         (
@@ -171,6 +178,7 @@ REPERTOIRE: Mapping[str, MotionKind] = {
         ),
         _turns,
         lambda request: 480,
+        jumps=True,
     ),
     "walk": MotionKind(
         (
@@ -215,6 +223,7 @@ REPERTOIRE: Mapping[str, MotionKind] = {
         ),
         _dances,
         lambda request: int(np.ceil(60.0 * _beats(request)[-1])) + _CALMING,
+        jumps=True,
         beats=True,
     ),
     "trajectory": MotionKind(

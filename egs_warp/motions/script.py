@@ -20,6 +20,7 @@ from egs_warp.motions.beats import asked_beats
 from egs_warp.motions.repertoire import REPERTOIRE, MotionKind
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.sequence import Part, Place
+from egs_warp.motions.style import Style, read_style
 
 MOST_MOTIONS = 100
 _NAMES = ", ".join(REPERTOIRE)
@@ -44,6 +45,15 @@ class Script:
         of it. Raises ``UserError`` for a bad file."""
         frames = sum(request.repeat * REPERTOIRE[request.name].frames(request) for request in self.requests)
         return round(frames * max(1.0, height**0.5))
+
+    def style(self, text: str | None) -> Style:
+        """Of its jumps, as ``text`` says (``read_style``), the usual one if it is None. Raises ``UserError`` for a bad
+        one, and where nothing jumps."""
+        if text is None:
+            return Style()
+        if not any(REPERTOIRE[request.name].jumps for request in self.requests):
+            raise ArgumentError("style", f"nothing jumps in {self.name!r}; ask for a jump, hop, twist or dance")
+        return read_style(text)
 
     def parts(self, height: float) -> list[Part]:
         """The motions in their order, for a body of ``height`` metres."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -16,6 +16,7 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.feet import Foot, find_feet
 from egs_warp.motions.limbs import Limbs
 from egs_warp.motions.stance import Ground, heading_between, sole_shares
+from egs_warp.motions.style import Style
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -43,6 +44,8 @@ class Place:
     """Coulomb coefficient."""
     limbs: Limbs | None = None
     """Of the capture, where there is one; else they are those of the cage."""
+    style: Style = field(default_factory=Style)
+    """Of what jumps."""
 
     def feet(self) -> tuple[Foot, ...]:
         """What the body stands on (``find_feet``)."""

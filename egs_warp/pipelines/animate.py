@@ -98,6 +98,7 @@ class Asked:
     front: tuple[float, ...]
     push: str | None
     beats: str | None
+    style: str | None
     muscles: str | None
     """Name of the file."""
     solids: int
@@ -115,6 +116,7 @@ def animate(
     motion: str = "jump",
     push: str | None = None,
     beats: str | None = None,
+    style: str | None = None,
     up: np.ndarray | None = None,
     plane: Plane | None = None,
     ground: HeightField | None = None,
@@ -137,7 +139,8 @@ def animate(
     """Bring ``cloud`` (scene units) to life and write video, contact sheet, plots, report and trajectory into ``out``.
 
     ``motion``: one motion or several in a row, or the name of a JSON script (``egs_warp.motions.script``).
-    ``push``: what hits it meanwhile (``egs_warp.motions.push``); ``beats``: those of a dance, a tempo or a file.
+    ``push``: what hits it meanwhile (``egs_warp.motions.push``); ``beats``: those of a dance, a tempo or a file;
+    ``style``: how it jumps (``egs_warp.motions.style``).
     ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
     the object to the camera; ``shot``: how it is filmed. ``ground``, ``muscles_file``, ``solids``, ``gravity_up``,
     ``front``, ``seen_from``, ``settings``: see ``make_creature``. Returns what it wrote as ``report.json``
@@ -149,6 +152,7 @@ def animate(
     shot.check()
     asked = script(motion, beats=beats, **options.targets())
     asked.frames()  # reads the files that it names
+    acted = asked.style(style)
     pushes = read_pushes(push) if push is not None else ()
     ffmpeg_program()
     with run_folder(out, overwrite=overwrite, resume=resume) as run:
@@ -176,6 +180,7 @@ def animate(
                 creature,
                 asked,
                 frames=options.frames,
+                style=acted,
                 pushes=pushes,
                 parts=lambda: run.file(PARTS),
                 resume=_recorded(run),
@@ -210,6 +215,7 @@ def animate(
             front=_numbers(front),
             push=push,
             beats=beats,
+            style=style,
             muscles=None if muscles_file is None else Path(muscles_file).name,
             solids=len(solids),
         )

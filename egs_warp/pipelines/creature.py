@@ -27,6 +27,7 @@ from egs_warp.meshing.occupancy import solid_from_gaussians
 from egs_warp.motions.limbs import Limbs, Sections, find_limbs
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.stance import Ground
+from egs_warp.motions.style import Style
 from egs_warp.muscles.files import read_muscles
 from egs_warp.muscles.muscle_set import MuscleSet, automatic_muscles
 from egs_warp.pipelines.front import Front, find_front
@@ -295,10 +296,10 @@ def _stands(stepper: LocomotionStepper, start: BodyState) -> bool:
     return bool(np.linalg.norm(moved) < 0.04 * body.height and upright and gaps.min() > -0.01 * body.height)
 
 
-def first_place(creature: Creature, *, step: float | None = None) -> Place:
+def first_place(creature: Creature, *, step: float | None = None, style: Style | None = None) -> Place:
     """Where the creature stands at the start, its front ahead.
 
-    ``step``: seconds that a solver step takes at most, see ``solver_steps``.
+    ``step``: seconds that a solver step takes at most, see ``solver_steps``; ``style``: how it jumps.
     """
     body, start = creature.body, creature.start
     up = -body.gravity / np.linalg.norm(body.gravity)
@@ -311,4 +312,5 @@ def first_place(creature: Creature, *, step: float | None = None) -> Place:
         creature.solids,
         creature.geometry.friction,
         creature.limbs,
+        style or Style(),
     )

@@ -18,6 +18,7 @@ from egs_warp.motions.fall import FallWatch
 from egs_warp.motions.push import Kicks, Push
 from egs_warp.motions.script import Script
 from egs_warp.motions.sequence import MotionSequence, Place
+from egs_warp.motions.style import Style
 from egs_warp.pipelines.creature import Creature, first_place
 from egs_warp.pipelines.ending import Ending
 from egs_warp.pipelines.outlook import Outlook
@@ -134,6 +135,7 @@ def simulate(
     *,
     frames: int | None = None,
     step: float | None = None,
+    style: Style | None = None,
     pushes: Sequence[Push] = (),
     parts: Callable[[], Path] | None = None,
     resume: Path | None = None,
@@ -142,13 +144,13 @@ def simulate(
     """Run ``motion`` for ``frames`` pictures at 60 Hz, the first of them at rest, or else until the body has come to
     rest or fallen, or the motion is cut off.
 
-    ``step``: the seconds of a solver step, if not the usual; ``pushes``: what hits it meanwhile; ``parts`` tells the
-    folder that takes the steps as they are done, ``resume`` is that of a run that was cut off and goes on.
-    ``progress`` is told after each frame how many are done, and how many are expected in all by now. Raises
-    ``UserError`` for a motion that the body cannot do, and a folder that another run has left.
+    ``step``: the seconds of a solver step, if not the usual; ``style``: how it jumps; ``pushes``: what hits it
+    meanwhile; ``parts`` tells the folder that takes the steps as they are done, ``resume`` is that of a run that was
+    cut off and goes on. ``progress`` is told after each frame how many are done, and how many are expected in all by
+    now. Raises ``UserError`` for a motion that the body cannot do, and a folder that another run has left.
     """
     check_frames(frames)
-    place = first_place(creature, step=step)
+    place = first_place(creature, step=step, style=style)
     expected = motion.check(place)
     sequence = MotionSequence(place, motion.parts(creature.body.height))
     watch = FallWatch(sequence, place)

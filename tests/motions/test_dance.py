@@ -63,7 +63,7 @@ def test_what_was_skipped_is_told(danced: Run) -> None:
     dance = danced.sequence.done[0].motion
     assert isinstance(dance, Dance)
     np.testing.assert_allclose(dance.reached(danced.trajectory, 0, -1).skipped, [1.7])
-    assert "1 of 5 beats skipped, too near to the others: 1.70 s" in dance.notes()
+    assert "1 of 5 beats skipped, too near to the others or the last: 1.70 s" in dance.notes()
     assert any(note.startswith("4 take-offs and touch-downs, the worst ") for note in dance.notes())
 
 

@@ -1,0 +1,147 @@
+"""Styles: each number does to a jump of a coarse block what it says, and one of 1 nothing at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from egs_warp.errors import ArgumentError, UserError
+from egs_warp.locomotion.audit import audit
+from egs_warp.locomotion.rollout import roll_out
+from egs_warp.motions.dance import Dance
+from egs_warp.motions.jump_plan import JumpPlan, JumpTarget, plan_jump
+from egs_warp.motions.script import motion
+from egs_warp.motions.sequence import MotionSequence, Place
+from egs_warp.motions.style import PRESETS, Style, read_style
+from egs_warp.pipelines.report import verdict
+from tests.support.creatures import coarse_creature
+from tests.support.meshes import box_mesh
+from tests.support.places import FORWARD
+
+
+@dataclass(frozen=True)
+class Jumped:
+    """Of the centre of mass, metres and seconds."""
+
+    depth: float
+    """Of the crouch."""
+    lowest: float
+    """When it ends."""
+    take_off: float
+    apex: float
+    """Above where it stood."""
+    dip: float
+    """Below where it stood, after touch-down."""
+    heights: tuple[float, ...]
+
+
+@cache
+def jumped(style: str | None) -> Jumped:
+    """A block jumps by 0.2 on the spot, as ``style`` says; checked by the audit."""
+    made = coarse_creature(box_mesh((2, 2, 4), (0.5, 0.5, 1.0)), forward=FORWARD)
+    place = made.place if style is None else replace(made.place, style=read_style(style))
+    sequence = MotionSequence(place, motion("jump 0 0.2").parts(place.body.height))
+    t = roll_out(
+        *(made.stepper, made.stepper.geometry, made.start, sequence), frames=120, finished=lambda: sequence.finished
+    ).trajectory
+    assert sequence.finished and verdict(audit(t)).startswith("audit: passed")
+    height = np.array([place.body.centre_of_mass(x)[2] for x in t.positions])
+    rise = height - height[0]
+    borne = np.unique(t.contact_step[t.contact_force[:, 2] > 1e-3]) + 1
+    flight = int(np.argmax(np.diff(borne)))
+    left, met = borne[flight], borne[flight + 1]
+    lowest = int(rise[:left].argmin())
+    return Jumped(
+        *(float(value) for value in (-rise[lowest], t.time[lowest], t.time[left], rise.max(), -rise[met:].min())),
+        tuple(height.tolist()),
+    )
+
+
+def test_the_usual_style_changes_no_bit() -> None:
+    assert jumped(None).heights == jumped("anticipation=1 squash=1 timing=1").heights
+
+
+@pytest.mark.parametrize("name", ["anticipation", "timing"])
+def test_anticipation_and_timing_lengthen_a_crouch(name: str) -> None:
+    """By as much as they say, to the step; the height that was asked is reached all the same."""
+    short, usual, long = jumped(f"{name}=0.7"), jumped(None), jumped(f"{name}=1.4")
+    crouches = np.array([short.lowest, usual.lowest, long.lowest]) - 0.1  # it settles first
+    np.testing.assert_allclose(crouches / crouches[1], [0.7, 1.0, 1.4], atol=0.06)
+    assert short.take_off < usual.take_off < long.take_off
+    np.testing.assert_allclose([short.apex, long.apex], usual.apex, atol=0.01)
+
+
+def test_anticipation_deepens_a_crouch() -> None:
+    short, usual, deep = jumped("anticipation=0.7"), jumped(None), jumped("anticipation=1.4")
+    assert short.depth < 0.85 * usual.depth and deep.depth > 1.2 * usual.depth
+
+
+def test_timing_makes_a_thrust_soft() -> None:
+    """The mean push is divided by it: to the same speed up, a thrust takes so many times as long."""
+    usual, *others = (planned(Style(timing=timing)) for timing in (1.0, 0.7, 1.4))
+    np.testing.assert_allclose([other.thrust_time / usual.thrust_time for other in others], [0.7, 1.4], rtol=1e-6)
+    assert others[0].speed_up == others[1].speed_up == usual.speed_up
+    assert jumped("timing=1.4").take_off - jumped("timing=1.4").lowest > jumped(None).take_off - jumped(None).lowest
+
+
+def test_squash_lets_a_landing_give_way() -> None:
+    hard, usual, soft = jumped("squash=0.5"), jumped(None), jumped("squash=2")
+    assert hard.dip < usual.dip < soft.dip and soft.dip > 1.2 * usual.dip
+    assert hard.take_off == usual.take_off == soft.take_off
+
+
+def planned(style: Style) -> JumpPlan:
+    """A jump so high that its stroke is neither the least nor the deepest, in very short steps."""
+    return plan_jump(
+        JumpTarget(0.0, 0.3),
+        height=1.0,
+        com_height=0.5,
+        support_ahead=0.2,
+        gravity=9.81,
+        step=1e-9,
+        lean=0.0,
+        style=style,
+    )
+
+
+def test_a_dance_knows_how_long_the_crouches_of_its_style_are(place: Place) -> None:
+    usual, quick = (Dance(replace(place, style=style), (1.0, 1.5)) for style in (Style(), Style(timing=0.5)))
+    assert quick.expected_time == usual.expected_time
+    with pytest.raises(UserError, match="before the first jump it takes"):
+        Dance(place, (0.35, 0.8))
+    assert Dance(replace(place, style=Style(timing=0.5)), (0.35, 0.8)).planned().beats == 2.0
+
+
+def test_presets_can_be_changed() -> None:
+    assert read_style("heavy, squash=1.1") == Style(**{**PRESETS["heavy"], "squash": 1.1})
+    for name, values in PRESETS.items():
+        assert read_style(name) == Style(**values)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "style: nothing is given; give one of light, heavy, rubbery, or numbers as anticipation=1.3, of"),
+        ("floppy", "style: unknown word 'floppy'; give one of light, heavy, rubbery, or numbers"),
+        ("squash=1 heavy", "style: unknown word 'heavy'; give one of"),
+        ("wobble=2", "style: unknown word 'wobble=2'; give one of"),
+        ("squash=3", "style: squash 3: give a number of times the usual from 0.5 to 2"),
+        ("timing=fast", "style: timing fast: give a number of times the usual from 0.5 to 2"),
+        ("timing=nan", "style: timing nan: give a number of times the usual from 0.5 to 2"),
+    ],
+)
+def test_a_bad_style_is_told_in_one_line(text: str, said: str) -> None:
+    with pytest.raises(UserError) as error:
+        motion("jump").style(text)
+    assert said in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_style_without_a_jump_is_refused() -> None:
+    with pytest.raises(ArgumentError, match=r"^style: nothing jumps in 'walk'; ask for a jump, hop, twist or dance$"):
+        motion("walk").style("heavy")
+    assert motion("walk").style(None) == Style()
+    with pytest.raises(ArgumentError, match=r"^squash 9: give a number from 0.5 to 2$"):
+        Style(squash=9)
