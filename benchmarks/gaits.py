@@ -6,8 +6,8 @@ python benchmarks/gaits.py [--quick] [--workers 2] [--bodies NAME ...] [--cells 
 A walk succeeds if it ends within 0.1 body heights and 10 degrees of where it was told to, within 60 sqrt(H/g), upright;
 a twist within 10 degrees in at most two jumps, a standard jump within 15 %; one that stands and is pushed by 0.1
 m sqrt(g H) from the side, if it ends upright and no sole was ever 0.1 body heights from where it stood. Slip is that of
-a foot while it stands over the stride; the cost of transport the muscles' work over m g times the way. Bodies without feet or a flat base refuse
-to walk in one line: that counts as a failure here. Captures take part where they are found.
+a foot while it stands over the stride; the cost of transport the muscles' work over m g times the way. Bodies without
+feet or a flat base refuse to walk in one line: that counts as a failure here. Captures take part where they are found.
 """
 
 from __future__ import annotations
