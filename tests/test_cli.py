@@ -53,6 +53,12 @@ from egs_warp.segmentation.clearance import Clearing
             ["--gravity-up", "1,2"],
             "--gravity-up 1,2: give three numbers x,y,z or an axis as -y",
         ),
+        (["--style", "floppy"], "--style: unknown word 'floppy'; give one of light, heavy, rubbery"),
+        (["--style", "squash=3"], "style: squash 3: give a number of times the usual from 0.5 to 2"),
+        (["--motion", "walk", "--style", "heavy"], "--style: nothing jumps in 'walk'"),
+        (["--beats", "90"], "--beats: no motion of 'jump' takes them; ask for a dance"),
+        (["--motion", "dance", "--beats", "soon.csv"], "soon.csv: no such file"),
+        (["--motion", "dance", "--beats", "90 soon"], "first soon: give a number of seconds from 0 to 600"),
         ([], "nothing.ply"),
     ],
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
-from egs_warp.errors import ArgumentError, UserError
+from egs_warp.errors import ArgumentError
 from egs_warp.motions.request import Value
 
 LEAST, MOST = 0.5, 2.0
@@ -53,7 +53,7 @@ def read_style(text: str) -> Style:
         elif equals and name in _NAMES:
             values[name] = Value(name, 1.0, LEAST, MOST, "times the usual").read(value, "style")
         else:
-            raise UserError(f"style: unknown word {word!r}; give {_usage()}")
+            raise ArgumentError("style", f"unknown word {word!r}; give {_usage()}")
     return Style(**values)
 
 

@@ -54,10 +54,8 @@ def jumped(style: str | None) -> Jumped:
     flight = int(np.argmax(np.diff(borne)))
     left, met = borne[flight], borne[flight + 1]
     lowest = int(rise[:left].argmin())
-    return Jumped(
-        *(float(value) for value in (-rise[lowest], t.time[lowest], t.time[left], rise.max(), -rise[met:].min())),
-        tuple(height.tolist()),
-    )
+    times = float(t.time[lowest]), float(t.time[left])
+    return Jumped(-rise[lowest], *times, rise.max(), -rise[met:].min(), tuple(height.tolist()))
 
 
 def test_the_usual_style_changes_no_bit() -> None:
