@@ -156,6 +156,7 @@ def test_what_the_run_was_over_before_is_told() -> None:
     assert [push.missed(3.0) for push in pushes] == [None] * 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", ["stand 0.2", pytest.param("turn 10", marks=pytest.mark.slow)])
 def test_a_creature_is_pushed_while_it_stands_or_turns(script: str) -> None:
     """The way is that of the body as it stands at the start; what came too late is told."""

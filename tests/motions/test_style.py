@@ -62,6 +62,7 @@ def test_the_usual_style_changes_no_bit() -> None:
     assert jumped(None).heights == jumped("anticipation=1 squash=1 timing=1").heights
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["anticipation", "timing"])
 def test_anticipation_and_timing_lengthen_a_crouch(name: str) -> None:
     """By as much as they say, to the step; the height that was asked is reached all the same."""
@@ -72,11 +73,13 @@ def test_anticipation_and_timing_lengthen_a_crouch(name: str) -> None:
     np.testing.assert_allclose([short.apex, long.apex], usual.apex, atol=0.01)
 
 
+@pytest.mark.slow
 def test_anticipation_deepens_a_crouch() -> None:
     short, usual, deep = jumped("anticipation=0.7"), jumped(None), jumped("anticipation=1.4")
     assert short.depth < 0.85 * usual.depth and deep.depth > 1.2 * usual.depth
 
 
+@pytest.mark.slow
 def test_timing_makes_a_thrust_soft() -> None:
     """The mean push is divided by it: to the same speed up, a thrust takes so many times as long."""
     usual, *others = (planned(Style(timing=timing)) for timing in (1.0, 0.7, 1.4))
@@ -85,6 +88,7 @@ def test_timing_makes_a_thrust_soft() -> None:
     assert jumped("timing=1.4").take_off - jumped("timing=1.4").lowest > jumped(None).take_off - jumped(None).lowest
 
 
+@pytest.mark.slow
 def test_squash_lets_a_landing_give_way() -> None:
     hard, usual, soft = jumped("squash=0.5"), jumped(None), jumped("squash=2")
     assert hard.dip < usual.dip < soft.dip and soft.dip > 1.2 * usual.dip

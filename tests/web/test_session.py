@@ -190,6 +190,7 @@ def test_a_page_that_takes_nothing_loses_the_oldest_frames(tmp_path: Path, monke
     assert times == [4, 5, 6, 7, 8]
 
 
+@pytest.mark.slow
 def test_a_push_strikes_it_in_the_next_step_and_its_take_passes_the_audit(tmp_path: Path):
     """What is told moves the centre of mass, the head turns it; whoever is at rest wakes, and keeps its feet."""
     played = Played(coarse_pawn(), tmp_path)
