@@ -116,8 +116,9 @@ def test_feet_stop_a_body_whose_fall_takes_a_while(landing_time: float, fall: fl
 
 
 def test_a_given_lean_is_kept() -> None:
-    shared = {"height": 1.0, "com_height": 0.5, "support_ahead": 0.2}
-    plan = plan_jump(JumpTarget(0.5, 0.3), **shared, gravity=GRAVITY, step=STEP, lean=0.09)
+    plan = plan_jump(
+        JumpTarget(0.5, 0.3), height=1.0, com_height=0.5, support_ahead=0.2, gravity=GRAVITY, step=STEP, lean=0.09
+    )
     assert plan.lean == 0.09
 
 
