@@ -5,6 +5,8 @@ VENV := .venv
 FRAMES ?=
 # Threads cost the small matrices of tests more than they bring; a step sets this for itself.
 export OPENBLAS_NUM_THREADS ?= 1
+# Tests start many processes, each of which would compile all modules again where bytecode is not kept.
+unexport PYTHONDONTWRITEBYTECODE
 # Of make fuzz, for all readers together; make mutation has no end of its own.
 MINUTES ?= 10
 # Of make mutation, each with its own copy of the tree.

@@ -58,6 +58,7 @@ def jumped(style: str | None) -> Jumped:
     return Jumped(-rise[lowest], *times, rise.max(), -rise[met:].min(), tuple(height.tolist()))
 
 
+@pytest.mark.slow
 def test_the_usual_style_changes_no_bit() -> None:
     assert jumped(None).heights == jumped("anticipation=1 squash=1 timing=1").heights
 

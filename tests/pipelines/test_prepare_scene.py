@@ -160,6 +160,7 @@ def test_ground_that_is_not_flat_goes_along_with_the_parts(tmp_path: Path, monke
     assert creature.stepper.detector.gaps(start)[0].min() > -0.01 * body.height
 
 
+@pytest.mark.slow
 def test_one_command_from_a_scene_to_a_film(
     scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

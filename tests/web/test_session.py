@@ -30,6 +30,7 @@ def _wait(session: Session, woken: threading.Event, seen: list, done: Callable[[
         seen += session.waiting()
 
 
+@pytest.mark.slow
 def test_it_lives_in_its_thread_while_it_is_watched(tmp_path: Path):
     session = session_of(coarse_pawn(), tmp_path)
     woken, seen = threading.Event(), []
