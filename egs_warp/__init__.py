@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from egs_warp.render.autograd import render_torch
     from egs_warp.render.rasteriser import render_gaussians
     from egs_warp.segmentation.clearance import Clearing, ClearingOptions, Reach
+    from egs_warp.segmentation.clicks import Click, click_at
     from egs_warp.segmentation.object_mask import Box, ObjectSpec
     from egs_warp.segmentation.votes import MaskedView
     from egs_warp.training.finetune import (
@@ -96,6 +97,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "render.autograd": ("render_torch",),
     "render.rasteriser": ("render_gaussians",),
     "segmentation.clearance": ("Clearing", "ClearingOptions", "Reach"),
+    "segmentation.clicks": ("Click", "click_at"),
     "segmentation.object_mask": ("Box", "ObjectSpec"),
     "segmentation.votes": ("MaskedView",),
     "training.finetune": ("Densification", "FinetuneOptions", "Rates", "TrainingView", "finetune", "views_of_capture"),
@@ -112,6 +114,7 @@ __all__ = [
     "Camera",
     "Clearing",
     "ClearingOptions",
+    "Click",
     "Creature",
     "Deformer",
     "Densification",
@@ -145,6 +148,7 @@ __all__ = [
     "VideoWriter",
     "__version__",
     "animate",
+    "click_at",
     "contact_sheet",
     "embed_gaussians",
     "finetune",

@@ -58,6 +58,14 @@ def with_config(arguments: Sequence[str], parser: argparse.ArgumentParser) -> li
         if value is None or value is False:
             continue
         action = actions[name]
+        if isinstance(action, argparse._AppendAction):
+            option, texts = action.option_strings[0], value if isinstance(value, list) else [value]
+            if not all(isinstance(one, str | int | float) for one in texts):
+                raise UserError(f"{path}: {key} is {value!r}; give a text or a list of texts")
+            # Given beside it, none of the file's: they would mean both.
+            if not any(argument == option or argument.startswith(f"{option}=") for argument in rest):
+                flags += [f"{option}={_from_file(name, str(one), path.parent)}" for one in texts]
+            continue
         if (value is True) != (action.nargs == 0) or not isinstance(value, bool | int | float | str):
             raise UserError(f"{path}: {key} is {value!r}; give {'true' if action.nargs == 0 else 'a text or a number'}")
         text = _from_file(name, str(value), path.parent)
@@ -89,6 +97,10 @@ def write_config(path: Path, chosen: argparse.Namespace, parser: argparse.Argume
     for name in _actions(parser):
         value = getattr(chosen, name)
         if value is None or value is False:
+            continue
+        if isinstance(value, list):
+            texts = [_for_file(name, str(one), path.parent) for one in value]
+            kept[name] = texts if len(texts) > 1 else texts[0]
             continue
         kept[name] = _for_file(name, str(value), path.parent) if isinstance(value, str | Path) else value
     kept[_CHECKSUM] = _checksum(Path(chosen.capture))

@@ -1,79 +1,118 @@
-"""What the user says about the object on the command line: masks, a box, a point or a click."""
+"""What the user says about the object on the command line: masks, a box, a point or clicks."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.camera import Camera, camera_rays, shrunk
+from egs_warp.geometry.camera import shrunk
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.lens import Straightening
 from egs_warp.io.cameras import PosedImage
 from egs_warp.io.limits import check_pixels, picture_size, read_bytes
-from egs_warp.render.rasteriser import render_gaussians
+from egs_warp.segmentation.clicks import Click, click_at
 from egs_warp.segmentation.object_mask import Box, ObjectSpec
 from egs_warp.segmentation.votes import MaskedView
 
 MAX_MASK_SIDE = 800
 """Pixels: larger masks are read at half, a third, ... of their size."""
-_HELP = "give a mask.png, a folder of masks, x,y,z on it, a box x0,y0,z0,x1,y1,z1, or a pixel u,v with --view"
+_HELP = (
+    "give a mask.png, a folder of masks, x,y,z on it, a box x0,y0,z0,x1,y1,z1, a pixel u,v with --view, or clicks "
+    "+u,v@photo on it and -u,v@photo beside it"
+)
+_CLICK = re.compile(r"([+-]?)([0-9.]+),([0-9.]+)@(.+)", re.DOTALL)
 
 
 def read_object(
-    text: str,
+    texts: str | Sequence[str],
     cloud: GaussianCloud,
     posed: Sequence[PosedImage] | None,
     *,
     view: str | None = None,
     flag: str = "--object",
 ) -> ObjectSpec:
-    """What ``--object text`` means, or that of another ``flag``: a mask's file, a folder of masks, a point, a box, or a
-    pixel of the view ``view``.
+    """What ``--object TEXT`` means, given once or several times, or that of another ``flag``: a mask's file, a folder
+    of masks, a point, a box, or a pixel of the view ``view``; and clicks, which alone will do.
 
     Masks belong to the camera whose photo has the same name. Raises ``UserError`` with one line for anything else.
     """
-    if not text.strip():
-        raise UserError(f"{flag}: nothing is given; {_HELP}")
+    given = [texts] if isinstance(texts, str) else list(texts)
+    found: list[ObjectSpec] = []
+    clicks: list[Click] = []
+    for text in given:
+        if not text.strip():
+            raise UserError(f"{flag}: nothing is given; {_HELP}")
+        click = None if Path(text).exists() else _CLICK.fullmatch(text)
+        if click is not None:
+            one = _view_named(posed or (), click[4], text)
+            clicks.append(_click(cloud, one, click[2], click[3], text, inside=click[1] != "-"))
+        elif not Path(text).exists() and text.count(",") == 1:
+            clicks.append(_pixel(text, cloud, posed, view, flag))
+        else:
+            found.append(_place(text, posed, view, flag))
+    if len(found) > 1:
+        raise UserError(
+            f"{flag}: {len(found)} places, {given[0]} and others; give one, and clicks +u,v@photo beside it"
+        )
+    return replace(found[0], clicks=tuple(clicks)) if found else ObjectSpec.of_clicks(clicks)
+
+
+def _place(text: str, posed: Sequence[PosedImage] | None, view: str | None, flag: str) -> ObjectSpec:
+    """Masks, a point or a box."""
     if Path(text).exists():
         return ObjectSpec(masks=tuple(_read_masks(Path(text), posed, view)))
     try:
         numbers = np.array([float(part) for part in text.split(",")])
     except ValueError:
         raise UserError(f"{flag} {text}: no such file, nor numbers; {_HELP}") from None
-    if not np.isfinite(numbers).all() or len(numbers) not in (2, 3, 6):
+    if not np.isfinite(numbers).all() or len(numbers) not in (3, 6):
         raise UserError(f"{flag} {text}: {len(numbers)} numbers; {_HELP}")
     if len(numbers) == 3:
         return ObjectSpec(point=numbers)
-    if len(numbers) == 6:
-        low, high = np.minimum(numbers[:3], numbers[3:]), np.maximum(numbers[:3], numbers[3:])
-        if (low == high).any():
-            raise UserError(f"--object {text}: the box is flat; give two opposite corners")
-        return ObjectSpec(box=Box(low, high))
+    low, high = np.minimum(numbers[:3], numbers[3:]), np.maximum(numbers[:3], numbers[3:])
+    if (low == high).any():
+        raise UserError(f"--object {text}: the box is flat; give two opposite corners")
+    return ObjectSpec(box=Box(low, high))
+
+
+def _pixel(text: str, cloud: GaussianCloud, posed: Sequence[PosedImage] | None, view: str | None, flag: str) -> Click:
+    """A click on the object in the view ``view``."""
+    u, _, v = text.lstrip("+").partition(",")
+    try:
+        finite = np.isfinite([float(u), float(v)]).all()
+    except ValueError:
+        raise UserError(f"{flag} {text}: no such file, nor numbers; {_HELP}") from None
+    if not finite:
+        raise UserError(f"{flag} {text}: not two numbers; {_HELP}")
     if not posed:
         raise UserError(f"--object {text}: a pixel needs cameras; give --cameras, or a point x,y,z")
-    one = _view_named(posed, view, text)
-    u, v = float(numbers[0]), float(numbers[1])
+    return _click(cloud, _view_named(posed, view, text), u, v, text, inside=True)
+
+
+def _click(cloud: GaussianCloud, one: PosedImage, u: str, v: str, text: str, *, inside: bool) -> Click:
+    camera = one.camera
+    try:
+        x, y = float(u), float(v)
+    except ValueError:
+        raise UserError(f"--object {text}: {u},{v} is no pixel; {_HELP}") from None
     if one.lens is not None:
-        u, v = Straightening.of(one.camera, one.lens).pixel(u, v)
-    return ObjectSpec(point=point_at(cloud, one.camera, u, v))
-
-
-def point_at(cloud: GaussianCloud, camera: Camera, u: float, v: float) -> np.ndarray:
-    """(3,) what pixel (u, v), from the top left corner, shows. Raises ``UserError`` where it shows nothing."""
-    if not (0.0 <= u < camera.width and 0.0 <= v < camera.height):
-        raise UserError(f"--object {u:g},{v:g}: outside of the view's {camera.width} x {camera.height} pixels")
-    small = shrunk(camera, MAX_MASK_SIDE)
-    column, row = int(u * small.width / camera.width), int(v * small.height / camera.height)
-    image = render_gaussians(cloud, small)
-    if image.alpha.numpy()[row, column] < 0.5:
-        raise UserError(f"--object {u:g},{v:g}: the capture shows nothing there; click on the object")
-    return small.centre + float(image.depth.numpy()[row, column]) * camera_rays(small)[row, column]
+        x, y = Straightening.of(camera, one.lens).pixel(x, y)
+    if not (0.0 <= x < camera.width and 0.0 <= y < camera.height):
+        raise UserError(f"--object {text}: outside of the view's {camera.width} x {camera.height} pixels")
+    found = click_at(cloud, camera, x, y, inside=inside)
+    if found is None:
+        raise UserError(f"--object {text}: the capture shows nothing there; click on what is meant")
+    return found
 
 
 def _view_named(posed: Sequence[PosedImage], view: str | None, what: str) -> PosedImage:
+    if not posed:
+        raise UserError(f"--object {what}: a pixel needs cameras; give --cameras, or a point x,y,z")
     if view is None:
         if len(posed) == 1:
             return posed[0]
@@ -84,7 +123,8 @@ def _view_named(posed: Sequence[PosedImage], view: str | None, what: str) -> Pos
         if view in (one.name, Path(one.name).name, Path(one.name).stem):
             return one
     names = ", ".join(Path(one.name).name for one in posed[:3])
-    raise UserError(f"--view {view}: no such camera; there are {len(posed)}: {names}, ...")
+    asked = f"--object {what}" if what.endswith(f"@{view}") else f"--view {view}"
+    raise UserError(f"{asked}: no such camera; there are {len(posed)}: {names}, ...")
 
 
 def _read_masks(path: Path, posed: Sequence[PosedImage] | None, view: str | None) -> list[MaskedView]:

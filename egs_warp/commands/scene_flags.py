@@ -12,7 +12,9 @@ def add_object_flags(parser: argparse._ActionsContainer) -> None:
     """Add the flags that say where the object is."""
     parser.add_argument(
         "--object",
-        help="mask.png, folder of masks, point x,y,z, box x0,y0,z0,x1,y1,z1, or pixel u,v of --view",
+        action="append",
+        help="mask.png, folder of masks, point x,y,z, box x0,y0,z0,x1,y1,z1, pixel u,v of --view, or clicks, as many "
+        "as needed: +u,v@photo goes along, -u,v@photo does not",
     )
     parser.add_argument(
         "--cameras", type=named_path, help="cameras.json, transforms.json or COLMAP model; else a ring is used"

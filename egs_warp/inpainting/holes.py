@@ -16,8 +16,9 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.rectified import PlaneWindow, rectify
 from egs_warp.io.planes import HoleOutline
+from egs_warp.segmentation.above_plane import CELLS
 from egs_warp.segmentation.connectivity import enclosed
-from egs_warp.segmentation.object_mask import CELLS, Segmentation
+from egs_warp.segmentation.object_mask import Segmentation
 from egs_warp.segmentation.votes import MaskedView, check_size
 
 _TEXELS = 256

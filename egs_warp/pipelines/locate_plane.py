@@ -17,10 +17,11 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.io.planes import KnownPlane
 from egs_warp.segmentation.base_plane import guess_up
 from egs_warp.segmentation.ground import ROUGH, measure_ground
-from egs_warp.segmentation.object_mask import ObjectSpec, Segmentation, segment, votes_of_masks
+from egs_warp.segmentation.object_mask import ObjectSpec, Segmentation, segment
 from egs_warp.segmentation.plane_fit import PlaneFit
 from egs_warp.segmentation.plane_search import FoundPlane, find_planes, plane_under, refine_plane
 from egs_warp.segmentation.table_top import planes_below, surface_around
+from egs_warp.segmentation.votes import votes_of_masks
 
 _PLANE_ELEVATIONS = (40.0, 58.0, 75.0)
 """Degrees: seen at a grazing angle, splats in front hide those behind, and the floor seems to lie higher."""
@@ -167,7 +168,8 @@ def _standing(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> tuple[P
     except UserError as error:
         failure = error
     if spec.point is not None or (failure is not None and spec.masks):
-        point = spec.point if spec.point is not None else _low_point(cloud, spec, cloud.means.numpy(), up)
+        point = _lowest_point(spec, up)
+        point = point if point is not None else _low_point(cloud, spec, cloud.means.numpy(), up)
         for plane in planes_below(cloud, _level(up, everywhere), point):
             if wide is not None and plane.heights(point) > _HIGHER * wide.heights(point):
                 break
@@ -201,8 +203,8 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, everyw
     elif spec.masks:
         lowest = _low_point(cloud, spec, means, up)
     else:
-        assert spec.point is not None
-        lowest = spec.point
+        lowest = _lowest_point(spec, up)
+        assert lowest is not None
     planes = find_planes(searched, up, tilt_degrees=_LEVEL_DEGREES)
     plane = plane_under(planes, lowest, tolerance=0.0, least_share=least_share)
     if plane is None and spec.masks and planes:
@@ -216,6 +218,14 @@ def _coarse_plane(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, everyw
             check=("plane", "up"),
         )
     return plane
+
+
+def _lowest_point(spec: ObjectSpec, up: np.ndarray) -> np.ndarray | None:
+    """(3,) the point, or the lowest of the clicks on the object: its plane lies below all of them."""
+    if spec.point is None:
+        return None
+    points = [spec.point, *(click.point for click in spec.clicks if click.inside)]
+    return min(points, key=lambda point: float(point @ up))
 
 
 def _low_point(cloud: GaussianCloud, spec: ObjectSpec, means: np.ndarray, up: np.ndarray) -> np.ndarray:

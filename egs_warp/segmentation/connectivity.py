@@ -16,6 +16,8 @@ from egs_warp.geometry.rows import distinct_rows
 
 _ARM = 1.5
 """Standard deviations: how far a Gaussian reaches to touch another, four cells at most."""
+_FOURTH = 4
+"""Neighbour whose distance tells how sparse a capture is."""
 
 
 def connected_parts(
@@ -27,8 +29,9 @@ def connected_parts(
     units; sparse Gaussians get wider cells), and what reaches lower than ``above`` over the plane connects nothing.
     """
     points = cloud.means.numpy()[chosen].astype(np.float64)
-    if len(points) > 1:
-        cell = max(cell, 2.0 * float(np.median(KDTree(points).query(points, k=2)[0][:, 1])))
+    if len(points) > _FOURTH:
+        # Not the nearest: training that splits in place leaves many at one point.
+        cell = max(cell, 2.0 * float(np.median(KDTree(points).query(points, k=_FOURTH + 1)[0][:, _FOURTH])))
     lengths = np.minimum(_ARM * np.exp(cloud.log_scales.numpy()[chosen].astype(np.float64)), 4.0 * cell)
     turns = Rotation.from_quat(cloud.rotations.numpy()[chosen][:, [1, 2, 3, 0]]).as_matrix()
     arms = (turns * lengths[:, None, :]).transpose(0, 2, 1)
@@ -71,3 +74,10 @@ def close_to(points: np.ndarray, others: np.ndarray, reach: float) -> np.ndarray
     if len(others) == 0:
         return np.zeros(len(points), bool)
     return KDTree(others).query(points, distance_upper_bound=reach)[0] <= reach
+
+
+def nearer_to(points: np.ndarray, these: np.ndarray, those: np.ndarray) -> np.ndarray:
+    """(n,) bool: ``points`` (n, k) that are nearer to one of ``these`` (m, k) than to any of ``those`` (l, k)."""
+    if len(these) == 0 or len(those) == 0:
+        return np.full(len(points), len(those) == 0 < len(these))
+    return KDTree(these).query(points)[0] < KDTree(those).query(points)[0]

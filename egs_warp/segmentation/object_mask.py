@@ -16,19 +16,14 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
-from egs_warp.segmentation.connectivity import close_to, connected_parts, enclosed
-from egs_warp.segmentation.plane_search import lies_along
-from egs_warp.segmentation.votes import MaskedView, Votes, blending_votes, check_size
+from egs_warp.segmentation.above_plane import CELLS, AbovePlane, clicked_parts, hanging_parts
+from egs_warp.segmentation.clicks import Click, cut_apart
+from egs_warp.segmentation.connectivity import close_to, connected_parts, enclosed, nearer_to
+from egs_warp.segmentation.votes import MaskedView, claimed_by
 
 _NOTHING_ABOVE = (
     "object: nothing of it lies above the plane; mark it by other masks, a box or a point, or give its plane"
 )
-_MIN_OPACITY = 0.1
-"""Fainter Gaussians make no connection; they go with what surrounds them."""
-_SEEN = 0.02
-"""A Gaussian of which less than this share shows in the masked views has no say in whether it belongs to the object."""
-CELLS = 64
-"""Across the object, for connectivity."""
 _SMALL = 0.01
 """Of the object's opacity mass: a connected part below this is a floater."""
 _HOLLOW = 0.35
@@ -49,6 +44,8 @@ _HALVINGS = 6
 """Of the first guess of an object's size, about a point in a large room."""
 _LIKELY, _LARGEST = 0.3, 4.0
 """Of a guess: smaller and larger objects are not what it was made for."""
+_HANGING = 0.5
+"""Of the object's size: what is this high above the plane in all of its parts does not stand on it."""
 _FOOT = 0.015
 """Of the object's size: within this height above the plane, floor and object cannot be told apart by connection."""
 
@@ -69,12 +66,24 @@ class Box:
 
 @dataclass(frozen=True)
 class ObjectSpec:
-    """What the user says about where the object is: exactly one of the three."""
+    """What the user says about where the object is: exactly one of masks, box and point; clicks add to it and take
+    from it.
+    """
 
     masks: tuple[MaskedView, ...] = ()
     box: Box | None = None
     point: np.ndarray | None = None
     """(3,) on or in the object, scene units."""
+    clicks: tuple[Click, ...] = ()
+    """What each hits goes along, with what hangs together with it, or does not."""
+
+    @classmethod
+    def of_clicks(cls, clicks: Sequence[Click]) -> ObjectSpec:
+        """The first of the ``clicks`` that are on the object says where it is. Raises ``UserError`` if none is."""
+        for click in clicks:
+            if click.inside:
+                return cls(point=click.point, clicks=tuple(clicks))
+        raise UserError("object: every click takes something away; click on the object itself as well")
 
 
 @dataclass(frozen=True)
@@ -106,9 +115,9 @@ def segment(
     masks are empty, miss the object or have the wrong size, where box or point hold nothing, and where the object does
     not touch the plane.
     """
-    scene = _Scene.of(cloud, plane)
+    scene = AbovePlane.of(cloud, plane)
     if spec.masks:
-        wanted, unknown = _voted(cloud, spec.masks)
+        wanted, unknown = claimed_by(cloud, spec.masks)
     else:
         wanted = spec.box.holds(scene.means) if spec.box is not None else np.ones(cloud.count, bool)
         unknown = np.zeros(cloud.count, bool)
@@ -128,12 +137,13 @@ def segment(
         raise
 
 
-def _of_size(scene: _Scene, wanted: np.ndarray, unknown: np.ndarray, spec: ObjectSpec, size: float) -> Segmentation:
+def _of_size(scene: AbovePlane, wanted: np.ndarray, unknown: np.ndarray, spec: ObjectSpec, size: float) -> Segmentation:
     """The object, if it is roughly of ``size`` (scene units)."""
-    foot = _FOOT * size
+    foot, floor = _FOOT * size, 0.0
+    chosen, small, cut_off = np.zeros((3, len(wanted)), bool)
     # The first round tells how large the object is and how rough its floor; the second goes by that.
     for _ in range(2):
-        chosen, small = _body(scene, wanted, unknown, spec, foot, size)
+        chosen, small, cut_off = _body(scene, wanted, unknown, spec, foot, size)
         size = _diagonal(scene.means[chosen])
         if size == 0.0:
             raise UserError(_NOTHING_ABOVE, check=("plane",))
@@ -147,7 +157,9 @@ def _of_size(scene: _Scene, wanted: np.ndarray, unknown: np.ndarray, spec: Objec
     standing = (scene.heights > floor) & scene.under(chosen, 3.0 * foot, size)
     at_foot = ~above & (scene.heights > 0.0) & (claimed if spec.masks else standing)
     faint = ~scene.solid & above & (wanted | unknown) & near
-    object_mask = chosen | at_foot | faint
+    object_mask = (chosen | at_foot | faint) & ~cut_off
+    for click in spec.clicks:
+        object_mask[click.hits] = click.inside & (scene.heights[click.hits] > 0.0) & ~cut_off[click.hits]
     lowest = float(np.quantile(scene.heights[object_mask], 0.002))
     if lowest > 0.1 * size:
         raise UserError(
@@ -162,42 +174,16 @@ def _of_size(scene: _Scene, wanted: np.ndarray, unknown: np.ndarray, spec: Objec
         wisps = _wisps(scene, object_mask, size)
         object_mask &= ~wisps
         halo |= wisps
-    floaters = (halo | (claimed & above)) & ~object_mask & ~buried
+    floaters = (halo | (claimed & above)) & ~object_mask & ~buried & ~cut_off
     return Segmentation(object_mask, buried, floaters, size)
 
 
-@dataclass(frozen=True)
-class _Scene:
-    """What is asked of the capture again and again; all (n, ...)."""
-
-    cloud: GaussianCloud
-    plane: Plane | HeightField
-    means: np.ndarray
-    flat: np.ndarray
-    """(n, 2) along the plane."""
-    heights: np.ndarray
-    opacity: np.ndarray
-    solid: np.ndarray
-    """(n,) bool: opaque enough to connect."""
-    level: np.ndarray
-    """(n,) bool: flat, and lying along the plane as a floor's Gaussians do."""
-
-    @classmethod
-    def of(cls, cloud: GaussianCloud, plane: Plane | HeightField) -> _Scene:
-        means, opacity = cloud.means.numpy().astype(np.float64), cloud.opacities()
-        level = lies_along(cloud, plane)
-        flat = means @ np.stack(plane.tangents(), axis=1)
-        return cls(cloud, plane, means, flat, plane.heights(means), opacity, opacity >= _MIN_OPACITY, level)
-
-    def under(self, chosen: np.ndarray, height: float, size: float) -> np.ndarray:
-        """(n,) bool: within the outline, seen along the normal, of what ``chosen`` has below ``height``."""
-        return enclosed(self.flat, self.flat[chosen & (self.heights < height)], size / CELLS)
-
-
 def _body(
-    scene: _Scene, wanted: np.ndarray, unknown: np.ndarray, spec: ObjectSpec, foot: float, size: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) bool: the connected part that is meant, all of it higher than ``foot``; and (n,) bool: all small parts."""
+    scene: AbovePlane, wanted: np.ndarray, unknown: np.ndarray, spec: ObjectSpec, foot: float, size: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(n,) bool: the connected parts that are meant, all of them higher than ``foot``; (n,) bool: all small others; and
+    (n,) bool: what clicks took away.
+    """
     core = (wanted | unknown) & scene.solid & (scene.heights > foot)
     # A rumpled floor must not join the object: what lies flat near the plane connects nothing.
     lying = core & scene.level & (scene.heights < 3.0 * foot) & (not spec.masks)
@@ -223,22 +209,36 @@ def _body(
         best = int(np.argmax(claimed))
         if claimed[best] == 0.0:
             raise UserError(_NOTHING_ABOVE, check=("plane",))
-    chosen, small = np.zeros((2, len(core)), bool)
-    chosen[indices[parts == best]] = True
-    small[indices[mass[parts] < _SMALL * mass[best]]] = True
+    meant = np.union1d(best, clicked_parts(indices, parts, scene, spec.clicks, size))
+    chosen, small, cut_off = np.zeros((3, len(core)), bool)
+    chosen[indices[np.isin(parts, meant)]] = True
+    small[indices[(mass[parts] < _SMALL * mass[best]) & ~chosen[indices]]] = True
+    if spec.point is not None:
+        chosen[indices[np.isin(parts, hanging_parts(scene, indices, parts, meant, size))]] = True
+        small &= ~chosen
+    nodes = np.flatnonzero(chosen)
+    cut_off[nodes[~cut_apart(scene.cloud, nodes, spec.clicks)]] = True
+    chosen &= ~cut_off
+    # Strays far out, joined by some huge one, would stretch what follows over the whole room.
+    chosen &= _within(scene.means, chosen, size)
     # Loose matter inside a hollow body would stay behind as a ghost. The floor closes the body from below: its mirror
     # image in the floor does as well.
     shell = scene.means[chosen]
     if _diagonal(shell) > _LARGEST * size:
         # Cells made for a small object would fill a room.
         raise UserError(_NOTHING_ABOVE, check=("plane",))
-    mirrored = shell - 2.0 * (scene.heights[chosen, None] - foot) * scene.plane.normal
-    chosen |= enclosed(scene.means, np.concatenate([shell, mirrored]), 2.0 * size / CELLS) & (scene.heights > foot)
+    heights = scene.heights[chosen]
+    # What hangs high over the plane has no floor that closes it; the two images would span a grid of any size.
+    if len(shell) and heights.min() < _HANGING * size:
+        shell = np.concatenate([shell, shell - 2.0 * (heights[:, None] - foot) * scene.plane.normal])
+    chosen |= enclosed(scene.means, shell, 2.0 * size / CELLS) & (scene.heights > foot)
     chosen |= lying & scene.under(chosen, 0.1 * size, size)
-    return chosen, small
+    # What was found by its place goes with what is next to it.
+    cut_off |= nearer_to(scene.means, scene.means[cut_off], scene.means[chosen & ~cut_off])
+    return chosen & ~cut_off, small, cut_off
 
 
-def _wisps(scene: _Scene, chosen: np.ndarray, size: float) -> np.ndarray:
+def _wisps(scene: AbovePlane, chosen: np.ndarray, size: float) -> np.ndarray:
     """(n,) bool: wide Gaussians at the object's foot in the floor's colour, on uneven ground those that lie flat, too,
     which would go along as shreds of the floor.
     """
@@ -266,7 +266,7 @@ def _wisps(scene: _Scene, chosen: np.ndarray, size: float) -> np.ndarray:
     return found
 
 
-def _first_size(scene: _Scene, wanted: np.ndarray, spec: ObjectSpec) -> float:
+def _first_size(scene: AbovePlane, wanted: np.ndarray, spec: ObjectSpec) -> float:
     """First guess of the object's size, scene units: half of the capture's where only a point is known."""
     if spec.box is not None:
         return float(np.linalg.norm(spec.box.high - spec.box.low))
@@ -281,7 +281,15 @@ def _diagonal(points: np.ndarray) -> float:
     return float(np.linalg.norm(high - low))
 
 
-def _floor_top(scene: _Scene, chosen: np.ndarray, size: float) -> float:
+def _within(points: np.ndarray, chosen: np.ndarray, margin: float) -> np.ndarray:
+    """(n,) bool: in the box that holds nearly all that is ``chosen`` (n,) bool, or so near to it."""
+    if not chosen.any():
+        return chosen
+    low, high = np.quantile(points[chosen], [0.005, 0.995], axis=0)
+    return np.all((points >= low - margin) & (points <= high + margin), axis=1)
+
+
+def _floor_top(scene: AbovePlane, chosen: np.ndarray, size: float) -> float:
     """Height up to which the floor's own Gaussians scatter, judged beside the object ``chosen`` (n,) bool;
     at least 0.
     """
@@ -294,33 +302,6 @@ def _floor_top(scene: _Scene, chosen: np.ndarray, size: float) -> float:
     level = float(np.median(scene.heights[beside]))
     spread = 1.4826 * float(np.median(np.abs(scene.heights[beside] - level)))
     return float(np.clip(level + 3.0 * spread, 0.0, _ROUGHEST * size))
-
-
-def votes_of_masks(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> Votes:
-    """Votes of the masks that mark anything: where the object is out of sight its mask is empty, and says nothing.
-
-    Raises ``UserError`` for masks of another size than their cameras', where all are empty, and where their cameras see
-    nothing.
-    """
-    for view in masks:
-        check_size(view)
-    marked = [view for view in masks if view.mask.any()]
-    if not marked:
-        raise UserError(f"{masks[0].name}: the mask is empty; mark the object in it")
-    votes = blending_votes(cloud, marked)
-    if not (votes.inside + votes.outside > 0.0).any():
-        raise UserError("object: the masks' cameras see nothing of the capture; check that both share one frame")
-    return votes
-
-
-def _voted(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> tuple[np.ndarray, np.ndarray]:
-    """Gaussians that the masks claim, and those that they do not show."""
-    votes = votes_of_masks(cloud, masks)
-    seen = votes.share_seen() >= _SEEN
-    wanted = seen & (votes.share_inside() > 0.5)
-    if not wanted.any():
-        raise UserError("object: nothing of the capture shows inside the masks; check masks and cameras")
-    return wanted, ~seen
 
 
 def masks_from_selection(cloud: GaussianCloud, selection: np.ndarray, cameras: Sequence[Camera]) -> list[MaskedView]:

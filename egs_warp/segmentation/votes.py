@@ -21,6 +21,9 @@ from egs_warp.render.projection import project, view_from_camera
 from egs_warp.render.rasteriser import background_of, refusing_what_does_not_fit
 from egs_warp.render.tiles import build_tile_lists
 
+_SEEN = 0.02
+"""A Gaussian of which less than this share shows in the masked views has no say in whether it belongs to the object."""
+
 
 @dataclass(frozen=True)
 class MaskedView:
@@ -76,6 +79,23 @@ def blending_votes(cloud: GaussianCloud, views: Sequence[MaskedView]) -> Votes:
     return Votes(*sums.T)
 
 
+def votes_of_masks(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> Votes:
+    """Votes of the masks that mark anything: where the object is out of sight its mask is empty, and says nothing.
+
+    Raises ``UserError`` for masks of another size than their cameras', where all are empty, and where their cameras see
+    nothing.
+    """
+    for view in masks:
+        check_size(view)
+    marked = [view for view in masks if view.mask.any()]
+    if not marked:
+        raise UserError(f"{masks[0].name}: the mask is empty; mark the object in it")
+    votes = blending_votes(cloud, marked)
+    if not (votes.inside + votes.outside > 0.0).any():
+        raise UserError("object: the masks' cameras see nothing of the capture; check that both share one frame")
+    return votes
+
+
 def check_size(view: MaskedView) -> None:
     """Raises ``UserError`` for a mask of another size than its camera's picture."""
     height, width = view.camera.height, view.camera.width
@@ -84,6 +104,16 @@ def check_size(view: MaskedView) -> None:
             f"{view.name}: the mask is {view.mask.shape[1]} x {view.mask.shape[0]} pixels, its camera {width} x"
             f" {height}; make it at the photo's size"
         )
+
+
+def claimed_by(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) bool: Gaussians that the masks claim, and (n,) bool: those that they do not show."""
+    votes = votes_of_masks(cloud, masks)
+    seen = votes.share_seen() >= _SEEN
+    wanted = seen & (votes.share_inside() > 0.5)
+    if not wanted.any():
+        raise UserError("object: nothing of the capture shows inside the masks; check masks and cameras")
+    return wanted, ~seen
 
 
 def _votes_of_view(grey: GaussianCloud, masked: MaskedView) -> np.ndarray:

@@ -83,7 +83,7 @@ def test_files_are_relative_to_the_file_and_flags_go_before_it(tmp_path: Path) -
     assert given["capture"] == str(here / "a.ply") and given["terrain"] == here / "steps.json"
     assert given["motion"] == f"trajectory {here / 'bow.csv'}"
     assert (given["friction"], given["no_shadow"], given["no_inpaint"], given["distance"]) == (0.3, True, False, None)
-    assert (given["up"], given["object"], given["camera"]) == ("-y", "0,0,1", "fixed")
+    assert (given["up"], given["object"], given["camera"]) == ("-y", ["0,0,1"], "fixed")
     other = _given(["other.ply", "--config", str(config), "--friction", "0.7"])
     assert (other["capture"], other["friction"]) == ("other.ply", 0.7)
 

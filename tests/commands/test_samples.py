@@ -22,7 +22,7 @@ def test_the_two_commands_fit_the_two_files(tmp_path: Path, capsys: pytest.Captu
     thing, whole = read_capture(alone.capture).cloud, read_capture(scene.capture).cloud
     assert whole.count > thing.count > 3000
     assert np.ptp(thing.means.numpy()[:, 2]) == pytest.approx(1.0, abs=0.05)
-    point = np.array([float(part) for part in scene.object.split(",")])
+    point = np.array([float(part) for part in scene.object[0].split(",")])
     assert np.linalg.norm(whole.means.numpy() - point, axis=1).min() < 0.3
     assert not Path(alone.out).exists() and alone.out != scene.out
 

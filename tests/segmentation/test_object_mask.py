@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from egs_warp.assets import scene
-from egs_warp.commands.object_flag import point_at, read_mask, read_object
+from egs_warp.commands.object_flag import read_mask, read_object
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_cameras
@@ -192,13 +192,6 @@ def test_real_captures_from_one_click(
     assert 0.5 < share < 0.95
 
 
-def test_point_at_hits_the_surface() -> None:
-    cloud, _ = ball_on_floor()
-    camera = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.8, count=1, size=128)[0]
-    hit = point_at(cloud, camera, 64.0, 64.0)
-    np.testing.assert_allclose(np.linalg.norm(hit - [0.0, 0.0, 0.5]), 0.5, atol=0.03)
-
-
 @pytest.mark.parametrize("width", [120.0, 400.0])
 def test_a_click_finds_what_is_small_in_a_large_room(width: float) -> None:
     """A ball of one unit between walls that are far apart: guesses of its size are halved until it is found."""
@@ -291,6 +284,6 @@ def test_how_far_a_floor_scatters_is_judged_beside_the_object() -> None:
     away = np.concatenate([level((-8.0, -8.0), (0.0, 8.0), 0.04, 0.1), level((4.0, -8.0), (8.0, 8.0), 0.04, 0.1)])
     under = level((1.6, -1.4), (2.4, -0.6), 0.04, 0.01)
     whole = joined(round_ones(thing, 0.02), lying(np.concatenate([beside, away, under])))
-    scene_ = module._Scene.of(whole, FLOOR)
+    scene_ = module.AbovePlane.of(whole, FLOOR)
     top = module._floor_top(scene_, np.arange(whole.count) < len(thing), np.sqrt(2.0))
     assert top == pytest.approx(0.003, rel=0.15)

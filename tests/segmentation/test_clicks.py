@@ -1,0 +1,157 @@
+"""Clicks: what each hits, what they add, and where the cut goes between what is meant and what is not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egs_warp.commands.object_flag import read_object
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.camera_ring import ring_cameras
+from egs_warp.geometry.gaussians import GaussianCloud, joined
+from egs_warp.io import read_cameras
+from egs_warp.io.cameras import write_cameras
+from egs_warp.pipelines.locate_plane import locate_plane
+from egs_warp.segmentation.clicks import Click, click_at
+from egs_warp.segmentation.object_mask import ObjectSpec, segment
+from tests.support.grounds import level
+from tests.support.scenes import FLOOR, ball_on_floor, lying, round_ones, shell
+
+SPAN = 1.0
+"""Between the middles of two balls that touch."""
+
+
+def balls(tones: tuple[float, float], between: float = SPAN) -> GaussianCloud:
+    """Two balls of one unit on a floor, in greys of their own; each has 1500 Gaussians, the left one first."""
+    skin = shell()
+    left, right = skin - [0.5 * between, 0.0, 0.0], skin + [0.5 * between, 0.0, 0.0]
+    cloud = joined(round_ones(np.concatenate([left, right]), 0.025), lying(level((-2.0, -1.5), (2.0, 1.5), 0.0, 0.05)))
+    sh = cloud.sh.numpy()
+    sh[:1500], sh[1500:3000] = tones
+    return GaussianCloud.from_numpy(
+        cloud.means.numpy(), cloud.rotations.numpy(), cloud.log_scales.numpy(), cloud.opacity_logits.numpy(), sh
+    )
+
+
+def front(width: int = 200) -> Camera:
+    """A look at both, from before."""
+    eye = np.array([0.0, -5.0, 1.2])
+    return Camera.look_at(eye, np.array([0.0, 0.0, 0.4]), np.array([0.0, 0.0, 1.0]), width=width, height=width)
+
+
+def click(cloud: GaussianCloud, point: tuple[float, float, float], *, inside: bool = True) -> Click:
+    """Where ``front`` sees a point."""
+    camera = front()
+    x, y, z = camera.rotation @ np.array(point) + camera.translation
+    found = click_at(cloud, camera, camera.cx + camera.fx * x / z, camera.cy + camera.fy * y / z, inside=inside)
+    assert found is not None
+    return found
+
+
+def test_a_click_hits_the_surface_and_not_what_shines_through() -> None:
+    """A ball of thin skin before a wall: the nearer side is hit, at its depth."""
+    skin = shell(400)
+    wall = np.stack(np.meshgrid(np.linspace(-2, 2, 60), [3.0], np.linspace(-1, 3, 60)), axis=-1).reshape(-1, 3)
+    cloud = round_ones(np.concatenate([skin, wall]), 0.04)
+    found = click(cloud, (0.0, -0.5, 0.5))
+    np.testing.assert_allclose(found.point, [0.0, -0.5, 0.5], atol=0.05)
+    assert len(found.hits) and (found.hits < 400).all()
+    assert (np.linalg.norm(cloud.means.numpy()[found.hits] - [0.0, -0.5, 0.5], axis=1) < 0.2).all()
+    assert click_at(round_ones(skin, 0.04), front(), 3.0, 3.0) is None
+
+
+@pytest.mark.parametrize("tones", [(-1.0, 1.0), (0.0, 0.0)])
+def test_a_click_beside_cuts_off_what_touches(tones: tuple[float, float]) -> None:
+    """Of two balls that touch one click takes both; a second takes the other away, whatever the colours."""
+    cloud = balls(tones)
+    mine = click(cloud, (-0.5, -0.5, 0.5))
+    both = segment(cloud, FLOOR, ObjectSpec.of_clicks([mine]))
+    clear = cloud.means.numpy()[:3000, 2] > 0.06
+    assert both.object_mask[:3000][clear].all()
+    other = click(cloud, (0.5, -0.5, 0.5), inside=False)
+    # Where they touch, a twentieth wide, nobody can tell two of one colour apart.
+    clear &= np.abs(cloud.means.numpy()[:3000, 0]) > 0.05
+    for clicks in ([mine, other], [other, mine]):
+        found = segment(cloud, FLOOR, ObjectSpec.of_clicks(clicks))
+        assert found.object_mask[:1500][clear[:1500]].all()
+        assert not found.object_mask[1500:3000][clear[1500:]].any()
+        assert found.background_mask[1500:3000][clear[1500:]].all()
+        assert found.size == pytest.approx(np.sqrt(3.0), rel=0.15)
+
+
+def test_a_click_adds_what_stands_apart() -> None:
+    cloud = balls((0.0, 0.0), between=1.6)
+    first, second = click(cloud, (-0.8, -0.5, 0.5)), click(cloud, (0.8, -0.5, 0.5))
+    clear = cloud.means.numpy()[:3000, 2] > 0.06
+    alone = segment(cloud, FLOOR, ObjectSpec.of_clicks([first]))
+    assert alone.object_mask[:1500][clear[:1500]].all() and not alone.object_mask[1500:3000].any()
+    pair = segment(cloud, FLOOR, ObjectSpec.of_clicks([first, second]))
+    assert pair.object_mask[:3000][clear].all()
+
+
+def test_a_click_on_the_floor_takes_nothing_away() -> None:
+    cloud, _ = ball_on_floor()
+    mine, floor = click(cloud, (0.0, -0.5, 0.5)), click(cloud, (0.0, -0.9, 0.0), inside=False)
+    one = segment(cloud, FLOOR, ObjectSpec.of_clicks([mine]))
+    two = segment(cloud, FLOOR, ObjectSpec.of_clicks([mine, floor]))
+    np.testing.assert_array_equal(one.object_mask, two.object_mask)
+    assert two.background_mask[floor.hits].all()
+
+
+def test_leaves_that_hang_in_the_air_go_along_and_what_stands_beside_does_not() -> None:
+    """A blossom that is off its twig by less than two cells hangs on the ball; one as near on the floor is its own."""
+    random = np.random.default_rng(3)
+    leaf = random.uniform(-0.06, 0.06, (60, 3))
+    gap = 0.045
+    hanging, standing = leaf + [0.56 + gap, 0.0, 0.5], leaf * [1, 1, 1.5] + [0.0, 0.62, 0.09]
+    things = round_ones(np.concatenate([shell(), hanging, standing]), 0.012)
+    cloud = joined(things, lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05)))
+    found = segment(cloud, FLOOR, ObjectSpec.of_clicks([click(cloud, (0.0, -0.5, 0.5))]))
+    assert found.object_mask[1500:1560].all()
+    assert not found.object_mask[1560:1620].any()
+
+
+def test_the_plane_lies_below_the_lowest_click() -> None:
+    """A ball on a slab on a floor: with a click on the slab's side, too, both stand on the floor."""
+    across, up_to = np.meshgrid(np.linspace(-0.9, 0.9, 46), np.linspace(0.0, 0.4, 11))
+    side = np.column_stack([np.full(across.size, 0.9), across.ravel(), up_to.ravel()])
+    slab = [level((-0.9, -0.9), (0.9, 0.9), 0.4, 0.04), *(side * [sign, 1, 1] for sign in (-1, 1))]
+    slab += [one[:, [1, 0, 2]] for one in slab[1:]]
+    cloud = joined(
+        round_ones(np.concatenate([shell() + [0.0, 0.0, 0.4], *slab]), 0.025),
+        lying(level((-3.0, -3.0), (3.0, 3.0), 0.0, 0.06)),
+    )
+    up = np.array([0.0, 0.0, 1.0])
+    spec = ObjectSpec.of_clicks([click(cloud, (0.0, -0.5, 0.9)), click(cloud, (0.0, -0.9, 0.2))])
+    located = locate_plane(cloud, spec, up=up)
+    assert abs(located.plane.offset) < 0.02
+    assert located.segmentation.object_mask[:1500].mean() > 0.99
+
+
+def test_clicks_as_the_user_writes_them(tmp_path: Path) -> None:
+    cloud, _ = ball_on_floor()
+    cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.8, count=2, size=64)
+    write_cameras(tmp_path / "cameras.json", cameras, ["a 1.jpg", "b.jpg"])
+    posed = read_cameras(tmp_path / "cameras.json")
+    spec = read_object(["+32,32@b", "-32,60@a 1.jpg", "30,28@1"], cloud, posed)
+    assert [one.inside for one in spec.clicks] == [True, False, True]
+    assert spec.point is not None
+    np.testing.assert_array_equal(spec.point, spec.clicks[0].point)
+    np.testing.assert_allclose(np.linalg.norm(spec.point - [0.0, 0.0, 0.5]), 0.5, atol=0.03)
+    with_box = read_object(["-1,-1,0,1,1,2", "-32,60@b"], cloud, posed)
+    assert with_box.box is not None and with_box.point is None and len(with_box.clicks) == 1
+    for texts, message in (
+        (["-32,60@b"], "every click takes something away; click on the object itself"),
+        (["+32,32@c"], r"--object \+32,32@c: no such camera; there are 2"),
+        (["+1,1@b"], r"--object \+1,1@b: the capture shows nothing there"),
+        (["+64,1@b"], "outside of the view's 64 x 64 pixels"),
+        (["+1.2.3,1@b"], r"1\.2\.3,1 is no pixel"),
+        (["0,0,1", "0,0,2"], "--object: 2 places, 0,0,1 and others; give one, and clicks"),
+    ):
+        with pytest.raises(UserError, match=message):
+            read_object(texts, cloud, posed)
+    with pytest.raises(UserError, match="a pixel needs cameras"):
+        read_object("+32,32@b", cloud, [])
