@@ -65,6 +65,12 @@ def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside
     return Click(camera.centre + depth * camera_rays(window)[reach, reach], np.flatnonzero(hits), inside)
 
 
+def hits_among(nodes: np.ndarray, clicks: Sequence[Click], *, inside: bool) -> np.ndarray:
+    """(m,) bool: those of the ``nodes`` (m,), indices, that clicks on the object hit, or clicks beside it."""
+    hits = [click.hits for click in clicks if click.inside is inside]
+    return np.isin(nodes, np.concatenate(hits)) if hits else np.zeros(len(nodes), bool)
+
+
 def cut_apart(cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click]) -> np.ndarray:
     """(m,) bool: which of the ``nodes`` (m,), indices of ``cloud``, the ``clicks`` leave.
 
@@ -72,16 +78,10 @@ def cut_apart(cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click]) 
     their colours differ; and to the side that has its colour more often. The cut between them is the least one. Nothing
     is cut where no click hits what is not to go along.
     """
-    place = np.full(cloud.count, -1)
-    place[nodes] = np.arange(len(nodes))
-    seeds = {}
-    for side in (True, False):
-        hit = [place[click.hits] for click in clicks if click.inside is side]
-        seeds[side] = np.unique(np.concatenate([*hit, np.zeros(0, int)]))
-        seeds[side] = seeds[side][seeds[side] >= 0].astype(int)
+    held, out = (hits_among(nodes, clicks, inside=inside) for inside in (True, False))
     # Hit by both, as what lies between: it says nothing.
-    both = np.intersect1d(seeds[True], seeds[False])
-    kept, dropped = np.setdiff1d(seeds[True], both), np.setdiff1d(seeds[False], both)
+    held, out = held & ~out, out & ~held
+    kept, dropped = np.flatnonzero(held), np.flatnonzero(out)
     if not len(kept) or not len(dropped):
         return np.ones(len(nodes), bool)
     graph = SplatGraph.of(cloud, nodes)
@@ -93,8 +93,6 @@ def cut_apart(cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click]) 
     leaning[reached] = (to_dropped - to_kept) / np.maximum(to_dropped + to_kept, 1e-12)
     leaning[np.isfinite(far) & ~np.isfinite(near)] = -1.0
     leaning = leaning + _BY_COLOUR * _by_colour(cloud, nodes, leaning)
-    held, out = np.zeros((2, len(nodes)), bool)
-    held[kept], out[dropped] = True, True
     inside = graph.cut(leaning, held, out)
     parts = graph.parts(inside)
     sizes = np.bincount(parts[inside], minlength=parts.max() + 1)

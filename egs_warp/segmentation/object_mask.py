@@ -19,13 +19,16 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.above_plane import CELLS, AbovePlane, clicked_parts, hanging_parts
 from egs_warp.segmentation.clicks import Click, cut_apart
 from egs_warp.segmentation.connectivity import close_to, connected_parts, enclosed, nearer_to
-from egs_warp.segmentation.votes import MaskedView, claimed_by
+from egs_warp.segmentation.labels import labels_of_votes, smoothed_labels
+from egs_warp.segmentation.votes import MaskedView, votes_of_masks
 
 _NOTHING_ABOVE = (
     "object: nothing of it lies above the plane; mark it by other masks, a box or a point, or give its plane"
 )
 _SMALL = 0.01
 """Of the object's opacity mass: a connected part below this is a floater."""
+_PIECE = 0.05
+"""Of the largest connected part: what masks claim elsewhere is another piece of the object from this share on."""
 _HOLLOW = 0.35
 """Of the object's size: a point in the middle of a hollow body is this far from its skin, or less."""
 _ROUGHEST = 0.02
@@ -117,7 +120,7 @@ def segment(
     """
     scene = AbovePlane.of(cloud, plane)
     if spec.masks:
-        wanted, unknown = claimed_by(cloud, spec.masks)
+        wanted, unknown = _masked(scene, spec)
     else:
         wanted = spec.box.holds(scene.means) if spec.box is not None else np.ones(cloud.count, bool)
         unknown = np.zeros(cloud.count, bool)
@@ -135,6 +138,22 @@ def segment(
                 if found.size > _LIKELY * smaller:
                     return found
         raise
+
+
+def _masked(scene: AbovePlane, spec: ObjectSpec) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) bool: Gaussians that masks and clicks mean, and (n,) bool: those that nobody knows of."""
+    votes = votes_of_masks(scene.cloud, spec.masks)
+    wanted, unknown = labels_of_votes(votes)
+    standing = scene.solid & (scene.heights > 0.0)
+    if not (wanted & standing).any():
+        return wanted, unknown
+    size = _diagonal(scene.means[wanted & standing])
+    # The plane is background: what lies at it or below links nothing.
+    standing &= scene.heights > _FOOT * size
+    nodes = np.flatnonzero(standing & _within(scene.means, wanted & standing, size))
+    unknown &= ~standing
+    wanted[nodes] = smoothed_labels(scene.cloud, votes, nodes, spec.clicks)
+    return wanted, unknown
 
 
 def _of_size(scene: AbovePlane, wanted: np.ndarray, unknown: np.ndarray, spec: ObjectSpec, size: float) -> Segmentation:
@@ -192,6 +211,7 @@ def _body(
         raise UserError(_NOTHING_ABOVE, check=("plane",))
     parts = connected_parts(scene.cloud, indices, cell=size / CELLS, plane=scene.plane, above=foot)
     mass = np.bincount(parts, weights=scene.opacity[indices])
+    claimed = np.bincount(parts, weights=scene.opacity[indices] * wanted[indices])
     if spec.point is not None:
         away = np.linalg.norm(scene.means[indices] - spec.point, axis=1)
         # A point may lie in the middle of an object, which is hollow.
@@ -205,11 +225,13 @@ def _body(
         around = around[mass[around] > 0.05 * mass[around].max()]
         best = int(around[np.argmin([away[parts == one].min() for one in around])])
     else:
-        claimed = np.bincount(parts, weights=scene.opacity[indices] * wanted[indices])
         best = int(np.argmax(claimed))
         if claimed[best] == 0.0:
             raise UserError(_NOTHING_ABOVE, check=("plane",))
     meant = np.union1d(best, clicked_parts(indices, parts, scene, spec.clicks, size))
+    if spec.masks:
+        # An object may be of several pieces, and masks mean them all.
+        meant = np.union1d(meant, np.flatnonzero(claimed > _PIECE * claimed[best]))
     chosen, small, cut_off = np.zeros((3, len(core)), bool)
     chosen[indices[np.isin(parts, meant)]] = True
     small[indices[(mass[parts] < _SMALL * mass[best]) & ~chosen[indices]]] = True

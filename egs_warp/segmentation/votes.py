@@ -21,9 +21,6 @@ from egs_warp.render.projection import project, view_from_camera
 from egs_warp.render.rasteriser import background_of, refusing_what_does_not_fit
 from egs_warp.render.tiles import build_tile_lists
 
-_SEEN = 0.02
-"""A Gaussian of which less than this share shows in the masked views has no say in whether it belongs to the object."""
-
 
 @dataclass(frozen=True)
 class MaskedView:
@@ -104,16 +101,6 @@ def check_size(view: MaskedView) -> None:
             f"{view.name}: the mask is {view.mask.shape[1]} x {view.mask.shape[0]} pixels, its camera {width} x"
             f" {height}; make it at the photo's size"
         )
-
-
-def claimed_by(cloud: GaussianCloud, masks: Sequence[MaskedView]) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) bool: Gaussians that the masks claim, and (n,) bool: those that they do not show."""
-    votes = votes_of_masks(cloud, masks)
-    seen = votes.share_seen() >= _SEEN
-    wanted = seen & (votes.share_inside() > 0.5)
-    if not wanted.any():
-        raise UserError("object: nothing of the capture shows inside the masks; check masks and cameras")
-    return wanted, ~seen
 
 
 def _votes_of_view(grey: GaussianCloud, masked: MaskedView) -> np.ndarray:

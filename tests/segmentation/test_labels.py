@@ -1,0 +1,77 @@
+"""Labels from masks: the closed form is the least error of all labels, and neighbours settle what votes leave open."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from egs_warp.assets import scene
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera_ring import ring_cameras
+from egs_warp.segmentation.labels import labels_of_votes, smoothed_labels
+from egs_warp.segmentation.object_mask import ObjectSpec, masks_from_selection, segment
+from egs_warp.segmentation.votes import MaskedView, Votes, votes_of_masks
+from tests.support.clicking import balls, click
+from tests.support.scenes import FLOOR
+
+
+def test_the_closed_form_paints_the_masks_with_the_least_error() -> None:
+    """Over all 2^8 labels: the sum over pixels of |mask - what the labelled Gaussians paint|, which is linear in the
+    labels where weights in a pixel sum to at most one: weight outside where a label is 1, inside where it is 0.
+    """
+    random = np.random.default_rng(0)
+    inside, outside = random.uniform(0.0, 5.0, (2, 8))
+    wanted, unknown = labels_of_votes(Votes(inside, outside, inside + outside))
+    costs = {labels: float(np.where(labels, outside, inside).sum()) for labels in product((False, True), repeat=8)}
+    assert min(costs, key=lambda labels: costs[labels]) == tuple(wanted)
+    assert not unknown.any()
+
+
+def test_a_bias_makes_the_object_leaner_or_fuller() -> None:
+    inside = np.array([1.0, 3.0, 5.0, 7.0, 9.0, 0.0])
+    votes = Votes(inside, 10.0 - inside, np.full(6, 10.0))
+    for bias, least in ((-0.5, 2.5), (0.0, 5.0), (0.5, 7.5)):
+        np.testing.assert_array_equal(labels_of_votes(votes, background_bias=bias)[0], inside > least)
+    with pytest.raises(UserError, match="nothing of the capture shows inside the masks"):
+        labels_of_votes(Votes(np.zeros(6), np.ones(6), np.ones(6)))
+
+
+def test_rough_masks_of_three_views_find_a_stool_with_its_legs() -> None:
+    """Masks whose edges are three pixels off, up and down: the cut is right where votes alone are not."""
+    made = scene("stool")
+    cloud, truth = made.whole()
+    cameras = ring_cameras(made.plane, np.array([0.0, 0.0, 0.5]), 0.9, count=3, size=256)
+    random, masks = np.random.default_rng(0), []
+    for view in masks_from_selection(cloud, truth, cameras):
+        waves = ndimage.gaussian_filter(random.normal(size=view.mask.shape), 6.0)
+        edge = ndimage.distance_transform_edt(view.mask) - ndimage.distance_transform_edt(~view.mask)
+        masks.append(MaskedView(view.camera, edge + 3.0 * waves / waves.std() > 0.0, view.name))
+    votes = votes_of_masks(cloud, masks)
+    wanted, unknown = labels_of_votes(votes)
+    opacity, heights = cloud.opacities(), made.plane.heights(cloud.means.numpy())
+    nodes = np.flatnonzero((opacity > 0.1) & (heights > 0.02))
+    weight, right = opacity[nodes], truth[nodes]
+
+    def overlap(labels: np.ndarray) -> float:
+        return float(weight[labels & right].sum() / weight[labels | right].sum())
+
+    assert overlap((wanted | unknown)[nodes]) < 0.9
+    assert overlap(smoothed_labels(cloud, votes, nodes)) > 0.97
+
+
+def test_masks_mean_every_piece_and_clicks_correct_them() -> None:
+    """Two balls apart, both masked: both are the object; a click takes one away again."""
+    cloud = balls((0.0, 0.0), between=1.6)
+    pair = np.arange(cloud.count) < 3000
+    cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 1.5, count=3, size=128)
+    masks = tuple(masks_from_selection(cloud, pair, cameras))
+    clear = cloud.means.numpy()[:3000, 2] > 0.06
+    found = segment(cloud, FLOOR, ObjectSpec(masks=masks))
+    assert found.object_mask[:3000][clear].all()
+    other = click(cloud, (0.8, -0.5, 0.5), inside=False)
+    only = segment(cloud, FLOOR, ObjectSpec(masks=masks, clicks=(other,)))
+    assert only.object_mask[:1500][clear[:1500]].all()
+    assert only.object_mask[other.hits].sum() == 0
