@@ -222,13 +222,17 @@ def _write_pictures(run: RunFolder, given: SceneInput, scene: PreparedScene) -> 
     """Pictures that show whether each step has worked, as the steps' own commands write them; returns their names."""
     from egs_warp.inpainting.picture import before_and_after
     from egs_warp.io.video import write_png
+    from egs_warp.pipelines.doubts import doubts
     from egs_warp.pipelines.pictures import picture_cameras, plane_picture, segmentation_picture
 
     centre, size = scene.located.centre, scene.located.size
     cameras = picture_cameras(scene.plane, centre, size, given.cameras)
+    words = doubts(given.cloud, scene.located, scene.object, cameras)
+    for line in words:
+        say(f"the object {line}")
     pictures = {
         "plane.png": plane_picture(given.cloud, [scene.plane], cameras, centre=centre, size=size),
-        "segment.png": segmentation_picture(given.cloud, scene.object, scene.bare, cameras),
+        "segment.png": segmentation_picture(given.cloud, scene.object, scene.bare, cameras, words),
     }
     if scene.filled is not None:
         pictures["filled.png"] = before_and_after(scene.filled)

@@ -50,6 +50,7 @@ def _segment(chosen: argparse.Namespace) -> int:
     from egs_warp.io.planes import read_planes
     from egs_warp.io.run_folder import check_run_folder, run_folder
     from egs_warp.io.video import write_png
+    from egs_warp.pipelines.doubts import doubts
     from egs_warp.pipelines.pictures import picture_cameras, segmentation_picture
     from egs_warp.pipelines.prepare_scene import SceneOptions
 
@@ -64,7 +65,10 @@ def _segment(chosen: argparse.Namespace) -> int:
             say(note)
         scene.write(run, known)
         cameras = picture_cameras(scene.plane, scene.located.centre, scene.located.size, given.cameras)
-        picture = segmentation_picture(given.cloud, scene.object, scene.background, cameras)
+        words = doubts(given.cloud, scene.located, scene.object, cameras)
+        for line in words:
+            say(f"the object {line}")
+        picture = segmentation_picture(given.cloud, scene.object, scene.background, cameras, words)
         write_png(run.file("segment.png"), picture)
         run.finish()
     print(f"object: {scene.object.count} Gaussians, background: {scene.background.count}")

@@ -17,7 +17,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.io.planes import KnownPlane
 from egs_warp.segmentation.base_plane import guess_up
 from egs_warp.segmentation.ground import ROUGH, measure_ground
-from egs_warp.segmentation.object_mask import ObjectSpec, Segmentation, segment
+from egs_warp.segmentation.object_mask import TOUCHING, ObjectSpec, Segmentation, segment
 from egs_warp.segmentation.plane_fit import PlaneFit
 from egs_warp.segmentation.plane_search import FoundPlane, find_planes, plane_under, refine_plane
 from egs_warp.segmentation.table_top import planes_below, surface_around
@@ -35,6 +35,8 @@ _HIGHER = 0.7
 _GOES_ON = 0.25
 """Share of an object's surroundings in which what it stands on must go on: slabs and laps of real objects do in none or
 next to none, the cloth on the bonsai's narrow table in 0.4."""
+_HOVERING = 0.25
+"""Of an object's size: so high above the only plane below it, it may hang."""
 _PLANE_SIDE = 400
 """Pixels of the pictures that the plane is fitted to."""
 
@@ -96,7 +98,8 @@ def locate_plane(
         level = centre - coarse.heights(centre) * coarse.normal
         views = ring_cameras(coarse, level, radius, count=9, elevations=_PLANE_ELEVATIONS, size=_PLANE_SIDE)
     fit = refine_plane(cloud, coarse, views, centre=centre, radius=radius, object_mask=~found.background_mask)
-    found = segment(cloud, fit.plane, spec)
+    found = segment(cloud, fit.plane, spec, hover=_HOVERING)
+    notes += _hovering(cloud, fit.plane, found)
     notes.append(
         f"plane {','.join(f'{x:.4f}' for x in (*fit.plane.normal, fit.plane.offset))}: fits {fit.pixel_count} pixels "
         f"to {100 * fit.noise:.2f} % of depth, {100 * fit.inlier_share:.0f} % of them inliers"
@@ -139,6 +142,16 @@ def on_its_ground(
     )
 
 
+def _hovering(cloud: GaussianCloud, plane: Plane, found: Segmentation) -> tuple[str, ...]:
+    """What there is to say of an object that hangs in the air."""
+    lowest = float(np.quantile(plane.heights(cloud.means.numpy()[found.object_mask]), 0.002))
+    if lowest <= TOUCHING * found.size:
+        return ()
+    return (
+        f"its lowest part hangs {lowest / found.size:.2f} of its size above the plane; if parts are missing, say so",
+    )
+
+
 def _middle(cloud: GaussianCloud, found: Segmentation) -> np.ndarray:
     means = cloud.means.numpy()[found.object_mask].astype(np.float64)
     return 0.5 * (np.quantile(means, 0.01, axis=0) + np.quantile(means, 0.99, axis=0))
@@ -177,6 +190,10 @@ def _standing(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> tuple[P
                 standing = segment(cloud, plane, spec)
                 if surface_around(cloud, plane, standing) > _GOES_ON:
                     return plane, standing
+    if wide is not None and found is None:
+        # Where nothing higher is below it, it may hover: it comes down before it moves.
+        with contextlib.suppress(UserError):
+            found = segment(cloud, wide, spec, hover=_HOVERING)
     if wide is None or found is None:
         assert failure is not None
         raise failure

@@ -17,6 +17,8 @@ from egs_warp.render.rasteriser import render_gaussians
 
 _BACKDROP = (0.55, 0.75, 0.55)
 _SIDE = 480
+_LINE = 22
+"""Pixels, for a line of words."""
 
 
 def picture_cameras(plane: Plane, centre: np.ndarray, size: float, cameras: Sequence[Camera] = ()) -> list[Camera]:
@@ -55,16 +57,27 @@ def plane_picture(
 
 
 def segmentation_picture(
-    cloud: GaussianCloud, thing: GaussianCloud, background: GaussianCloud, cameras: Sequence[Camera]
+    cloud: GaussianCloud,
+    thing: GaussianCloud,
+    background: GaussianCloud,
+    cameras: Sequence[Camera],
+    words: Sequence[str] = (),
 ) -> np.ndarray:
-    """(H, W, 3) uint8: rows of the capture, the object alone and the background alone."""
+    """(H, W, 3) uint8: rows of the capture, the object alone and the background alone; below them ``words``, a line
+    each.
+    """
     frames = [_bytes(render_gaussians(cloud, camera).colour.numpy()) for camera in cameras]
     for part in (thing, background):
         frames += [_bytes(render_gaussians(part, camera, background=_BACKDROP).colour.numpy()) for camera in cameras]
     labels = [""] * len(frames)
     for row, text in enumerate(("capture", "object", "background")):
         labels[row * len(cameras)] = text
-    return contact_sheet(frames, len(cameras), labels)
+    sheet = contact_sheet(frames, len(cameras), labels)
+    if not words:
+        return sheet
+    # As a cell of its own, so that lines may be as wide as the sheet.
+    strips = [np.full((_LINE, sheet.shape[1], 3), 255, np.uint8)] * len(words)
+    return np.concatenate([sheet, contact_sheet(strips, 1, list(words))])
 
 
 def _bytes(picture: np.ndarray) -> np.ndarray:

@@ -35,12 +35,16 @@ def labels_of_votes(votes: Votes, *, background_bias: float = 0.0) -> tuple[np.n
     return wanted, ~seen
 
 
-def smoothed_labels(cloud: GaussianCloud, votes: Votes, nodes: np.ndarray, clicks: Sequence[Click] = ()) -> np.ndarray:
+def smoothed_labels(
+    cloud: GaussianCloud, votes: Votes, nodes: np.ndarray, clicks: Sequence[Click] = (), *, views: int = 1
+) -> np.ndarray:
     """(m,) bool labels of the ``nodes`` (m,), indices of ``cloud``: each leans as its votes say, one that no view shows
     not at all; what ``clicks`` hit is sure; and the cut between the two labels is the least one.
+
+    What several ``views`` say is surer by their number's root, as errors of masks drawn one by one average out.
     """
     pixels = (votes.inside + votes.outside)[nodes]
-    leaning = (2.0 * votes.share_inside()[nodes] - 1.0) * np.minimum(pixels / _SURE, 1.0)
+    leaning = (2.0 * votes.share_inside()[nodes] - 1.0) * np.minimum(pixels / _SURE, 1.0) * np.sqrt(views)
     leaning[votes.share_seen()[nodes] < _SEEN] = 0.0
     held, dropped = (hits_among(nodes, clicks, inside=inside) for inside in (True, False))
     return SplatGraph.of(cloud, nodes).cut(leaning, held & ~dropped, dropped, smoothness=_SMOOTHNESS)

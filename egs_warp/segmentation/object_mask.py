@@ -33,6 +33,8 @@ _HOLLOW = 0.35
 """Of the object's size: a point in the middle of a hollow body is this far from its skin, or less."""
 _ROUGHEST = 0.02
 """Of the object's size: a floor is not taken to scatter more than this."""
+TOUCHING = 0.1
+"""Of the object's size: what hangs higher above a plane does not stand on it."""
 FOOTPRINT_HEIGHT = 0.08
 """Of the object's size: what it has below this height hides the floor."""
 _HALO = 0.1
@@ -109,14 +111,19 @@ class Segmentation:
 
 
 def segment(
-    cloud: GaussianCloud, plane: Plane | HeightField, spec: ObjectSpec, *, size: float | None = None
+    cloud: GaussianCloud,
+    plane: Plane | HeightField,
+    spec: ObjectSpec,
+    *,
+    size: float | None = None,
+    hover: float = TOUCHING,
 ) -> Segmentation:
     """Find the object that ``spec`` means and that stands on ``plane``, or on ground that is not flat.
 
     Around a point the object is first taken to be half as large as the capture; where nothing so large stands on the
-    plane, as in a room, half as large again, and so on; ``size`` (scene units) tells better. Raises ``UserError`` where
-    masks are empty, miss the object or have the wrong size, where box or point hold nothing, and where the object does
-    not touch the plane.
+    plane, as in a room, half as large again, and so on; ``size`` (scene units) tells better. ``hover`` is how high, of
+    its size, it may hang above the plane. Raises ``UserError`` where masks are empty, miss the object or have the wrong
+    size, where box or point hold nothing, and where the object does not touch the plane.
     """
     scene = AbovePlane.of(cloud, plane)
     if spec.masks:
@@ -126,14 +133,14 @@ def segment(
         unknown = np.zeros(cloud.count, bool)
     size = size or _first_size(scene, wanted, spec)
     try:
-        return _of_size(scene, wanted, unknown, spec, size)
+        return _of_size(scene, wanted, unknown, spec, size, hover)
     except UserError:
         if spec.point is None:
             raise
         for halvings in range(1, _HALVINGS + 1):
             smaller = size * 0.5**halvings
             with contextlib.suppress(UserError):
-                found = _of_size(scene, wanted, unknown, spec, smaller)
+                found = _of_size(scene, wanted, unknown, spec, smaller, hover)
                 # A shred of what is meant is found by a wrong guess as well.
                 if found.size > _LIKELY * smaller:
                     return found
@@ -152,11 +159,13 @@ def _masked(scene: AbovePlane, spec: ObjectSpec) -> tuple[np.ndarray, np.ndarray
     standing &= scene.heights > _FOOT * size
     nodes = np.flatnonzero(standing & _within(scene.means, wanted & standing, size))
     unknown &= ~standing
-    wanted[nodes] = smoothed_labels(scene.cloud, votes, nodes, spec.clicks)
+    wanted[nodes] = smoothed_labels(scene.cloud, votes, nodes, spec.clicks, views=len(spec.masks))
     return wanted, unknown
 
 
-def _of_size(scene: AbovePlane, wanted: np.ndarray, unknown: np.ndarray, spec: ObjectSpec, size: float) -> Segmentation:
+def _of_size(
+    scene: AbovePlane, wanted: np.ndarray, unknown: np.ndarray, spec: ObjectSpec, size: float, hover: float
+) -> Segmentation:
     """The object, if it is roughly of ``size`` (scene units)."""
     foot, floor = _FOOT * size, 0.0
     chosen, small, cut_off = np.zeros((3, len(wanted)), bool)
@@ -180,7 +189,7 @@ def _of_size(scene: AbovePlane, wanted: np.ndarray, unknown: np.ndarray, spec: O
     for click in spec.clicks:
         object_mask[click.hits] = click.inside & (scene.heights[click.hits] > 0.0) & ~cut_off[click.hits]
     lowest = float(np.quantile(scene.heights[object_mask], 0.002))
-    if lowest > 0.1 * size:
+    if lowest > hover * size:
         raise UserError(
             f"object: it touches no plane: its lowest part is {lowest / size:.2f} of its size above this one; "
             "mark all of the object, or give its plane",
