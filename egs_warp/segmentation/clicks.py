@@ -10,7 +10,6 @@ from scipy.spatial import KDTree
 
 from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
-from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.graph_cut import SplatGraph
 from egs_warp.segmentation.votes import MaskedView, blending_votes
 
@@ -18,6 +17,8 @@ _RADIUS = 0.004
 """Of the picture's longer side: so far about a click counts as clicked."""
 _HIT = 0.1
 """Of the largest blending weight under a click: what shows less there was not meant."""
+_FIRST = 0.25
+"""Of the light of a click: what it comes from is what is clicked on."""
 _DEEP = 0.03
 """Of the distance: what is so far before or behind the surface that is clicked on is another."""
 _SURE = 0.5
@@ -45,21 +46,20 @@ class Click:
 def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside: bool = True) -> Click | None:
     """What pixel (``u``, ``v``), from the top left corner of ``camera``'s picture, hits; None where it shows nothing.
 
-    Only a window about the click is drawn. What it shows is as far away as half of the light says, and hits are what
-    paints it there: not what shines through.
+    Only a window about the click is drawn. What it shows is as far away as the first quarter of its light comes from:
+    between leaves one sees through to the wall, and means the leaves. Hits are what paints it there.
     """
     reach = max(1, round(_RADIUS * max(camera.width, camera.height)))
     left, top, side = int(u) - reach, int(v) - reach, 2 * reach + 1
     window = replace(camera, width=side, height=side, cx=camera.cx - left, cy=camera.cy - top)
-    image = render_gaussians(cloud, window, geometry=True)
-    assert image.median_depth is not None
-    depth = float(image.median_depth.numpy()[reach, reach])
-    if image.alpha.numpy()[reach, reach] < 0.5 or depth <= 0.0:
-        return None
     across, down = np.meshgrid(np.arange(side) - reach, np.arange(side) - reach)
     disc = across**2 + down**2 <= reach**2
     weights = blending_votes(cloud, [MaskedView(window, disc, "click")]).inside
+    if weights.sum() < 0.5 * disc.sum():
+        return None
     depths = cloud.means.numpy().astype(np.float64) @ camera.rotation[2] + camera.translation[2]
+    order = np.argsort(depths, kind="stable")
+    depth = float(depths[order[np.searchsorted(np.cumsum(weights[order]), _FIRST * weights.sum())]])
     hits = (np.abs(depths - depth) < _DEEP * depth) & (weights > 0.0)
     hits &= weights > _HIT * weights[hits].max(initial=0.0)
     return Click(camera.centre + depth * camera_rays(window)[reach, reach], np.flatnonzero(hits), inside)
@@ -71,17 +71,48 @@ def hits_among(nodes: np.ndarray, clicks: Sequence[Click], *, inside: bool) -> n
     return np.isin(nodes, np.concatenate(hits)) if hits else np.zeros(len(nodes), bool)
 
 
-def cut_apart(cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click]) -> np.ndarray:
-    """(m,) bool: which of the ``nodes`` (m,), indices of ``cloud``, the ``clicks`` leave.
+def cut_off_by(
+    cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click], heights: np.ndarray, low: float
+) -> np.ndarray:
+    """(m,) bool: which of the ``nodes`` (m,), indices of ``cloud``, ``clicks`` take away; ``heights`` (m,) of them over
+    the ground, scene units.
+
+    A click beside the object that is lower than ``low`` means what lies on the ground, such as a shadow: it takes
+    nothing away that is more than twice as high as it, or as half of ``low``.
+    """
+    gone = np.zeros(len(nodes), bool)
+    mine = [click for click in clicks if click.inside]
+    flat = {}
+    for click in clicks:
+        at = heights[np.isin(nodes, click.hits)]
+        if not click.inside and len(at):
+            flat[id(click)] = float(at.max())
+    on_ground = [click for click in clicks if flat.get(id(click), np.inf) < low]
+    others = [click for click in clicks if not click.inside and click not in on_ground]
+    if others:
+        gone |= ~cut_apart(cloud, nodes, [*mine, *others])
+    for click in on_ground:
+        left = np.flatnonzero(~gone)
+        higher = heights[left] > 2.0 * max(flat[id(click)], 0.5 * low)
+        gone[left[~cut_apart(cloud, nodes[left], [*mine, click], held=higher)]] = True
+    return gone
+
+
+def cut_apart(
+    cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click], *, held: np.ndarray | None = None
+) -> np.ndarray:
+    """(m,) bool: which of the ``nodes`` (m,), indices of ``cloud``, the ``clicks`` leave; of them those that are
+    ``held`` (m,) bool in any case.
 
     Each Gaussian leans to the clicks that are nearer, along links between neighbours that are the longer the more
     their colours differ; and to the side that has its colour more often. The cut between them is the least one. Nothing
     is cut where no click hits what is not to go along.
     """
-    held, out = (hits_among(nodes, clicks, inside=inside) for inside in (True, False))
+    hit, out = (hits_among(nodes, clicks, inside=inside) for inside in (True, False))
     # Hit by both, as what lies between: it says nothing.
-    held, out = held & ~out, out & ~held
-    kept, dropped = np.flatnonzero(held), np.flatnonzero(out)
+    hit, out = hit & ~out, out & ~hit
+    sure = hit if held is None else (hit | held) & ~out
+    kept, dropped = np.flatnonzero(sure), np.flatnonzero(out)
     if not len(kept) or not len(dropped):
         return np.ones(len(nodes), bool)
     graph = SplatGraph.of(cloud, nodes)
@@ -93,7 +124,7 @@ def cut_apart(cloud: GaussianCloud, nodes: np.ndarray, clicks: Sequence[Click]) 
     leaning[reached] = (to_dropped - to_kept) / np.maximum(to_dropped + to_kept, 1e-12)
     leaning[np.isfinite(far) & ~np.isfinite(near)] = -1.0
     leaning = leaning + _BY_COLOUR * _by_colour(cloud, nodes, leaning)
-    inside = graph.cut(leaning, held, out)
+    inside = graph.cut(leaning, sure, out)
     parts = graph.parts(inside)
     sizes = np.bincount(parts[inside], minlength=parts.max() + 1)
     clicked = np.isin(np.arange(len(sizes)), parts[kept])

@@ -17,7 +17,7 @@ from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.above_plane import CELLS, AbovePlane, clicked_parts, hanging_parts
-from egs_warp.segmentation.clicks import Click, cut_apart
+from egs_warp.segmentation.clicks import Click, cut_off_by
 from egs_warp.segmentation.connectivity import close_to, connected_parts, enclosed, nearer_to
 from egs_warp.segmentation.labels import labels_of_votes, smoothed_labels
 from egs_warp.segmentation.votes import MaskedView, votes_of_masks
@@ -248,7 +248,8 @@ def _body(
         chosen[indices[np.isin(parts, hanging_parts(scene, indices, parts, meant, size))]] = True
         small &= ~chosen
     nodes = np.flatnonzero(chosen)
-    cut_off[nodes[~cut_apart(scene.cloud, nodes, spec.clicks)]] = True
+    low = FOOTPRINT_HEIGHT * min(size, _diagonal(scene.means[chosen]))
+    cut_off[nodes[cut_off_by(scene.cloud, nodes, spec.clicks, scene.heights[nodes], low)]] = True
     chosen &= ~cut_off
     # Strays far out, joined by some huge one, would stretch what follows over the whole room.
     chosen &= _within(scene.means, chosen, size)

@@ -125,3 +125,21 @@ def test_clicks_as_the_user_writes_them(tmp_path: Path) -> None:
             read_object(texts, cloud, posed)
     with pytest.raises(UserError, match="a pixel needs cameras"):
         read_object("+32,32@b", cloud, [])
+
+
+def test_a_click_on_a_shadow_takes_no_leg_along() -> None:
+    """A tongue of the floor, a twentieth high, hangs together with the ball's foot: a click on its tip takes its outer
+    half away and leaves the ball as it is, though the ball's own click is as far from its foot.
+    """
+    across, out = np.meshgrid(np.linspace(-0.12, 0.12, 9), np.linspace(-0.72, -0.2, 19))
+    tongue = [np.column_stack([across.ravel(), out.ravel(), np.full(across.size, z)]) for z in (0.03, 0.05)]
+    things = round_ones(np.concatenate([shell(), *tongue]), 0.025)
+    cloud = joined(things, lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05)))
+    top, tip = click(cloud, (0.0, -0.35, 0.85)), click(cloud, (0.0, -0.7, 0.06), inside=False)
+    along = segment(cloud, FLOOR, ObjectSpec.of_clicks([top]))
+    found = segment(cloud, FLOOR, ObjectSpec.of_clicks([top, tip]))
+    outer = np.flatnonzero(cloud.means.numpy()[: things.count, 1] < -0.6)
+    assert along.object_mask[outer].mean() > 0.9
+    assert found.object_mask[outer].mean() < 0.05
+    high = cloud.means.numpy()[:1500, 2] > 0.16
+    assert found.object_mask[:1500][high].all()
