@@ -99,6 +99,20 @@ def test_what_is_written_is_what_was_given(tmp_path: Path) -> None:
     assert vars(again) | {"config": None} == vars(chosen)
 
 
+def test_clicks_are_a_list_and_those_given_beside_the_file_go_alone(tmp_path: Path) -> None:
+    parser, commands = cli._parsers()
+    clicks = ["--object", "+1,2@a.jpg", "--object=-3,4@b.jpg"]
+    chosen = parser.parse_args(["animate", "a.ply", *clicks, "--out", "x"])
+    write_config(tmp_path / "run.yaml", chosen, commands["animate"])
+    given = _given(["--config", str(tmp_path / "run.yaml")])
+    assert given["object"] == ["+1,2@a.jpg", "-3,4@b.jpg"]
+    other = _given(["--config", str(tmp_path / "run.yaml"), "--object", "0,0,1"])
+    assert other["object"] == ["0,0,1"]
+    (tmp_path / "run.yaml").write_text("object: [[1, 2]]")
+    with pytest.raises(UserError, match=r"object is \[\[1, 2\]\]; give a text or a list of texts"):
+        _given(["--config", str(tmp_path / "run.yaml")])
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -287,3 +287,14 @@ def test_how_far_a_floor_scatters_is_judged_beside_the_object() -> None:
     scene_ = module.AbovePlane.of(whole, FLOOR)
     top = module._floor_top(scene_, np.arange(whole.count) < len(thing), np.sqrt(2.0))
     assert top == pytest.approx(0.003, rel=0.15)
+
+
+def test_what_hovers_over_the_only_floor_is_taken_and_said() -> None:
+    """A ball a fifth of its size, the diagonal of its box, above it; twice as high it is refused."""
+    cloud, truth = ball_on_floor(lift=0.35)
+    located = locate_plane(cloud, ObjectSpec(point=np.array([0.0, -0.5, 0.85])), up=FLOOR.normal)
+    assert located.segmentation.object_mask[truth].mean() > 0.99
+    assert any("its lowest part hangs 0.2" in note for note in located.notes)
+    higher, _ = ball_on_floor(lift=0.7)
+    with pytest.raises(UserError, match=r"it touches no plane: its lowest part is 0\.4"):
+        locate_plane(higher, ObjectSpec(point=np.array([0.0, -0.5, 1.2])), up=FLOOR.normal)
