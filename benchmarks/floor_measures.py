@@ -45,11 +45,11 @@ def coarse_psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float
 def gradient_energy(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
     """Mean squared gradient in ``mask`` (H, W), seam left out, over the truth's: below 1 is too smooth, above too
     busy."""
-    inner = ndimage.binary_erosion(mask, iterations=3)
+    inner = np.asarray(ndimage.binary_erosion(mask, iterations=3), dtype=bool)
 
     def energy(picture: np.ndarray) -> float:
         down, right = (np.gradient(picture.astype(np.float64), axis=axis) for axis in (0, 1))
-        return float(np.mean((down**2 + right**2)[inner]))
+        return float(((down**2 + right**2)[inner]).mean())
 
     return energy(image) / energy(truth)
 
