@@ -17,6 +17,7 @@ from egs_warp.deformation.peers import CarryMethod, carry
 from egs_warp.render import render_gaussians
 from egs_warp.training.likeness import psnr
 from harness import Table, flags, report
+from painted_meshes import bar
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -27,7 +28,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--growth", type=float, default=20.0, help="at most this many times as many Gaussians")
     options = parser.parse_args(arguments)
     size = 128 if options.quick else 256
-    mesh = scenes.bar()
+    mesh = bar()
     cloud = scenes.trained(
         mesh,
         size=2 * size,

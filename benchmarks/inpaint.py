@@ -29,7 +29,7 @@ from scipy import ndimage
 
 from egs_warp.assets import scene
 from egs_warp.geometry.camera import Camera, camera_rays
-from egs_warp.geometry.gaussians import GaussianCloud, joined
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud, joined
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.holes import Hole, disc, footprint
 from egs_warp.inpainting.inpaint import InpaintOptions, InpaintResult, inpaint
@@ -156,7 +156,7 @@ def without_plane(
     pixels = at[random.integers(len(at), size=count)][:, ::-1] + random.uniform(0, 1, (count, 2))
     rise = random.uniform(-0.25, 0.5, (count, 1)) * side
     sh = np.zeros((count, kept.sh.shape[1], 3))
-    sh[:, 0] = np.median(result.painted[result.hole], axis=0) / 0.2820948 - 0.5 / 0.2820948
+    sh[:, 0] = (np.median(result.painted[result.hole], axis=0) - 0.5) / SH_BAND_0
     scattered = GaussianCloud.from_numpy(
         result.window.points(pixels) + rise * case.hole.plane.normal,
         random.normal(size=(count, 4)),
