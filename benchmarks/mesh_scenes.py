@@ -107,14 +107,20 @@ def photograph(
                 ],
                 outputs=[where, hit, light, gloss],
             )
-            covered = np.asarray(hit.numpy(), dtype=bool)
-            colour = np.ones((count, samples**2, 3))
-            painted = mesh.paint(where.numpy()[covered].astype(np.float64))
+            hits = np.asarray(hit.numpy(), dtype=bool)
+            # Most pixels see nothing; what is left of the samples is small.
+            pixels = np.flatnonzero(hits.any(axis=1))
+            covered = hits[pixels]
+            sampled = np.ones((len(pixels), samples**2, 3))
+            painted = mesh.paint(where.numpy()[pixels][covered].astype(np.float64))
             if mesh.glossy:
-                painted = np.clip(painted * light.numpy()[covered] + gloss.numpy()[covered], 0.0, 1.0)
-            colour[covered] = painted
+                lit, shone = (one.numpy()[pixels][covered] for one in (light, gloss))
+                painted = np.clip(painted * lit + shone, 0.0, 1.0)
+            sampled[covered] = painted
+            colour, coverage = np.ones((count, 3)), np.zeros(count)
+            colour[pixels], coverage[pixels] = sampled.mean(axis=1), covered.mean(axis=1)
             shape = (camera.height, camera.width)
-            pictures.append((colour.mean(axis=1).reshape(*shape, 3), covered.mean(axis=1).reshape(shape)))
+            pictures.append((colour.reshape(*shape, 3), coverage.reshape(shape)))
     return pictures
 
 

@@ -203,6 +203,11 @@ class View:
         }, picture
 
 
+def _told(scores: Mapping[str, float]) -> dict[str, float | None]:
+    """As JSON has it: no number that is none."""
+    return {key: None if np.isnan(value) else value for key, value in scores.items()}
+
+
 def judged(cloud: GaussianCloud, views: list[View]) -> tuple[dict[str, float], np.ndarray]:
     """Mean scores over the views, and the first picture."""
     results = [view.judge(cloud) for view in views]
@@ -254,7 +259,7 @@ def object_rows(
                     "method": row.method.value,
                     "capture": row.capture,
                     "gaussians": carried.count,
-                    **{key: None if np.isnan(value) else value for key, value in scores.items()},
+                    **_told(scores),
                     "psnr_at_rest": at_rest.get(row.capture),
                 }
             )
@@ -276,6 +281,8 @@ def settings_rows(mesh: PaintedMesh, options: argparse.Namespace, settings: Mapp
         for name, splitting in settings.items():
             (carried,) = carry(splitting.apply(cloud, subject.cage, nodes), subject.cage, [nodes], method=WHOLE)
             scores, _ = judged(carried, views)
-            rows.append({"object": mesh.name, "motion": motion, "setting": name, "gaussians": carried.count, **scores})
+            rows.append(
+                {"object": mesh.name, "motion": motion, "setting": name, "gaussians": carried.count, **_told(scores)}
+            )
             table.row(motion, name, scores["psnr"], scores["ssim"], scores["flip"], carried.count)
     return rows
