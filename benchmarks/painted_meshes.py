@@ -73,12 +73,18 @@ def _read_glb(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return vertices, rows(part["indices"], "<u4", 1).reshape(-1, 3).astype(np.int32)
 
 
-def _standing(vertices: np.ndarray) -> np.ndarray:
+def standing(vertices: np.ndarray) -> tuple[np.ndarray, float]:
+    """What to take off ``vertices`` (V, 3) and what to multiply the rest with, so that they stand on z = 0, 1 high."""
     lower, upper = vertices.min(axis=0), vertices.max(axis=0)
-    return (vertices - [*((lower + upper)[:2] / 2), lower[2]]) / (upper[2] - lower[2])
+    return np.array([*((lower + upper)[:2] / 2), lower[2]]), 1.0 / float(upper[2] - lower[2])
 
 
-def _subdivided(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _standing(vertices: np.ndarray) -> np.ndarray:
+    middle, scale = standing(vertices)
+    return (vertices - middle) * scale
+
+
+def subdivided(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Edges are halved until none is longer than ``LONGEST_EDGE``:
     a deformed mesh is the truth, and a long straight edge is not.
     """
@@ -125,7 +131,7 @@ def _turned_profile(profile: np.ndarray, around: int = 64) -> tuple[np.ndarray, 
 def chair() -> PaintedMesh:
     """The armchair, in checkered cloth."""
     vertices, faces = _read_obj(data_folder() / "meshes" / "armchair" / "armchair.obj")
-    vertices, faces = _subdivided(_standing(vertices[:, [0, 2, 1]] * [1, -1, 1]), faces)
+    vertices, faces = subdivided(_standing(vertices[:, [0, 2, 1]] * [1, -1, 1]), faces)
     return PaintedMesh("chair", vertices, faces, checkers(0.07, ((0.75, 0.3, 0.2), (0.9, 0.8, 0.6))))
 
 
@@ -134,7 +140,7 @@ def plant() -> PaintedMesh:
     parts = [_read_obj(path) for path in sorted((data_folder() / "meshes" / "plant").glob("*.obj"))]
     starts = np.cumsum([0, *[len(v) for v, _ in parts]])
     faces = np.concatenate([f + start for (_, f), start in zip(parts, starts, strict=False)])
-    vertices, faces = _subdivided(_standing(np.concatenate([v for v, _ in parts])), faces.astype(np.int32))
+    vertices, faces = subdivided(_standing(np.concatenate([v for v, _ in parts])), faces.astype(np.int32))
     return PaintedMesh("plant", vertices, faces, checkers(0.06, ((0.15, 0.5, 0.2), (0.65, 0.85, 0.4))))
 
 
@@ -144,28 +150,28 @@ def microphone() -> PaintedMesh:
     stem = [(0.03, z) for z in np.linspace(0.08, 0.66, 30)]
     arc = np.linspace(-1.2, np.pi / 2, 24)
     ball = [(0.17 * np.cos(t), 0.83 + 0.17 * np.sin(t)) for t in arc]
-    vertices, faces = _subdivided(*_turned_profile(np.array([*foot, *stem, *ball])))
+    vertices, faces = subdivided(*_turned_profile(np.array([*foot, *stem, *ball])))
     return PaintedMesh("microphone", vertices, faces, checkers(0.06, ((0.15, 0.15, 0.2), (0.75, 0.75, 0.8))))
 
 
 def spot() -> PaintedMesh:
     """Keenan Crane's cow."""
     vertices, faces = _read_obj(data_folder() / "meshes" / "spot" / "spot_triangulated.obj")
-    vertices, faces = _subdivided(_standing(vertices[:, [0, 2, 1]] * [1, -1, 1]), faces)
+    vertices, faces = subdivided(_standing(vertices[:, [0, 2, 1]] * [1, -1, 1]), faces)
     return PaintedMesh("spot", vertices, faces, checkers(0.07, ((0.9, 0.9, 0.85), (0.35, 0.25, 0.2))))
 
 
 def stool() -> PaintedMesh:
     """The bar stool."""
     vertices, faces = _read_obj(data_folder() / "meshes" / "stool" / "stools_stool_model_0.obj")
-    vertices, faces = _subdivided(_standing(vertices), faces)
+    vertices, faces = subdivided(_standing(vertices), faces)
     return PaintedMesh("stool", vertices, faces, checkers(0.07, ((0.3, 0.35, 0.6), (0.85, 0.75, 0.5))))
 
 
 def cat() -> PaintedMesh:
     """The Egyptian cat."""
     vertices, faces = _read_glb(data_folder() / "meshes" / "cat" / "cat.glb")
-    vertices, faces = _subdivided(_standing(vertices[:, [0, 2, 1]] * [1, -1, 1]), faces)
+    vertices, faces = subdivided(_standing(vertices[:, [0, 2, 1]] * [1, -1, 1]), faces)
     return PaintedMesh("cat", vertices, faces, checkers(0.06, ((0.3, 0.3, 0.35), (0.8, 0.65, 0.35))))
 
 
@@ -173,7 +179,7 @@ def vase() -> PaintedMesh:
     """A generated vase with a thin neck."""
     height = np.linspace(0.0, 1.0, 60)
     radius = 0.06 + 0.16 * np.exp(-(((height - 0.3) / 0.18) ** 2)) + 0.05 * height**4
-    vertices, faces = _subdivided(*_turned_profile(np.array([(0.0, 0.0), *zip(radius, height, strict=True)])))
+    vertices, faces = subdivided(*_turned_profile(np.array([(0.0, 0.0), *zip(radius, height, strict=True)])))
     return PaintedMesh("vase", vertices, faces, checkers(0.08, ((0.2, 0.35, 0.6), (0.85, 0.85, 0.8))))
 
 
@@ -183,7 +189,7 @@ def table() -> PaintedMesh:
     legs = [((x - 0.03, y - 0.03, 0.0), (x + 0.03, y + 0.03, 0.95)) for x in (-0.4, 0.4) for y in (-0.25, 0.25)]
     parts = [_box(*corners) for corners in (slab, *legs)]
     faces = np.concatenate([part + 8 * number for number, (_, part) in enumerate(parts)])
-    vertices, faces = _subdivided(np.concatenate([corners for corners, _ in parts]), faces)
+    vertices, faces = subdivided(np.concatenate([corners for corners, _ in parts]), faces)
     return PaintedMesh("table", vertices, faces, checkers(0.07, ((0.5, 0.3, 0.15), (0.8, 0.6, 0.4))))
 
 
@@ -202,7 +208,7 @@ def bar() -> PaintedMesh:
     as long Gaussians want.
     """
     corners, faces = _box((-0.125, -0.125, 0.0), (0.125, 0.125, 1.0))
-    vertices, faces = _subdivided(corners, faces)
+    vertices, faces = subdivided(corners, faces)
 
     def paint(points: np.ndarray) -> np.ndarray:
         # Faces lie on borders between cells; looked up a little inside, so that rounding does not choose their colour.
