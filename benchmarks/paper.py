@@ -68,6 +68,7 @@ STAGES = (
     Stage("figure7", "Figure 7: an object taken out", "benchmarks/figure7.py"),
     Stage("figure8", "Figure 8: spikes of a twisted bar", "benchmarks/figure8.py"),
     Stage("inpaint", "section 3.7 and Figure 6: the filled floor", "benchmarks/inpaint.py"),
+    Stage("supplement", "Supplement: the examples in numbers", "benchmarks/examples.py", device="cpu"),
     animated("jump", 1),
     animated("walk", 4),
     animated("twist", 5),
