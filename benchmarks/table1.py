@@ -133,7 +133,7 @@ def choose(options: argparse.Namespace) -> list[Row]:
         name: Splitting(degrees, misfit, options.depth, options.growth) for name, (degrees, misfit) in SETTINGS.items()
     }
     rows: list[Row] = []
-    for name in CHOOSING:
+    for name in options.objects:
         rows += settings_rows(getattr(painted_meshes, name)(), options, settings)
     print("\nmean over objects and motions")
     table = Table(setting="<24", dB=".3f", SSIM=".4f", FLIP=".4f", Gaussians="7.0f")
@@ -154,6 +154,11 @@ def taken(rows: list[Row]) -> str:
     return next(name for name, value in found.items() if value >= max(found.values()) - ENOUGH)
 
 
+def rows_in(paths: Sequence[Path]) -> list[Row]:
+    """The rows of several JSON files."""
+    return [row for path in paths for row in json.loads(path.read_text())["rows"]]
+
+
 def mesh_of(name: str, options: argparse.Namespace) -> painted_meshes.PaintedMesh:
     """The object of this name."""
     if name != FROM_PHOTOS:
@@ -171,11 +176,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print, write."""
     parser = flags(__doc__, quick="128 x 128, few training steps")
     parser.add_argument(
-        "--objects", nargs="+", choices=[*OBJECTS, *HELD_OUT, FROM_PHOTOS], help="all; --quick: the table's"
+        "--objects",
+        nargs="+",
+        choices=[*OBJECTS, *HELD_OUT, FROM_PHOTOS, *CHOOSING],
+        help="all meshes of the table and beside it",
     )
     parser.add_argument("--held-out", dest="objects", action="store_const", const=HELD_OUT, help=f"{HELD_OUT} instead")
     parser.add_argument("--choose", action="store_true", help=f"compare settings of splitting on {CHOOSING}")
-    parser.add_argument("--chosen", type=Path, help="JSON of --choose: split as its rule takes it")
+    parser.add_argument("--chosen", nargs="+", type=Path, help="JSON of --choose: split as its rule takes it")
     parser.add_argument("--matt", action="store_true", help="no lamps, no gloss, SH of degree 0")
     parser.add_argument("--size", type=int, help="pixels, both sides (800)")
     parser.add_argument("--gaussians", type=int, help="of a capture (4000)")
@@ -189,13 +197,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--growth", type=float, help=f"at most this many times as many Gaussians ({GROWTH:g})")
     options = parser.parse_args(arguments)
     quick = options.quick
-    options.objects = options.objects or (OBJECTS if quick else (*OBJECTS, *HELD_OUT))
+    shown = OBJECTS if quick else (*OBJECTS, *HELD_OUT)
+    options.objects = options.objects or (CHOOSING if options.choose else shown)
+    if options.choose != (options.objects[0] in CHOOSING):
+        parser.error(f"--choose is for {', '.join(CHOOSING)}; they are not shown in the table")
     options.size = options.size or (128 if quick else 800)
     options.views, options.judges = (24, 6) if quick else (60, 12)
     options.gaussians = options.gaussians or (1500 if quick else 4000)
     options.iterations = options.iterations or (1000 if quick else 7000)
     if options.chosen:
-        options.degrees, options.misfit = SETTINGS[taken(json.loads(options.chosen.read_text())["rows"])]
+        options.degrees, options.misfit = SETTINGS[taken(rows_in(options.chosen))]
     options.growth = options.growth or (5.0 if quick else GROWTH)
     if options.clouds:
         options.clouds.mkdir(parents=True, exist_ok=True)
@@ -206,8 +217,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         aims = dict.fromkeys(judge([], quick=True)[0])
         why_null = dict.fromkeys(aims, "--choose compares settings on objects that no table shows")
     else:
-        for path in options.rows or []:
-            rows += json.loads(path.read_text())["rows"]
+        rows += rows_in(options.rows or [])
         splitting = Splitting(options.degrees, options.misfit, options.depth, options.growth)
         for name in [] if options.rows else options.objects:
             more, pictures = object_rows(mesh_of(name, options), options, splitting)

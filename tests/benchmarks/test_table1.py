@@ -114,3 +114,28 @@ def test_what_was_not_measured_is_null_with_a_reason(table1: ModuleType) -> None
     assert why["paper_margins_held_out"] == "without stool; give the JSON of all runs to --rows"
     aims, why = table1.judge(rows(table1, {"ours": 2.0}), quick=True)
     assert set(why) == {"margin_over_vrgs", "paper_margins_held_out"} == {n for n, v in aims.items() if v is None}
+
+
+def test_the_coarsest_setting_near_to_the_best_is_taken(table1: ModuleType) -> None:
+    """Within ``ENOUGH`` of the best mean over objects and motions; order is from coarse to fine."""
+    names = list(table1.SETTINGS)
+
+    def scored(*psnr: float) -> list[dict[str, Any]]:
+        return [
+            {"setting": name, "psnr": value + off}
+            for name, value in zip(names, psnr, strict=False)
+            for off in (-1.0, 1.0)
+        ]
+
+    assert table1.taken(scored(20.0, 20.1, 20.115, 20.11)) == names[1]
+    assert table1.taken(scored(20.1, 20.1, 20.115)) == names[0]
+    assert table1.taken(scored(20.0, 20.0, 20.0, 20.0, 20.021)) == names[4]
+
+
+def test_objects_that_choose_are_not_in_the_table(table1: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+    for asked in (["--objects", "cat"], ["--choose", "--objects", "chair"]):
+        with pytest.raises(SystemExit):
+            table1.main(asked)
+        told = " ".join(capsys.readouterr().err.split())
+        assert "--choose is for cat, vase, table; they are not shown in the table" in told
+    assert not {*table1.CHOOSING} & {*table1.OBJECTS, *table1.HELD_OUT}
