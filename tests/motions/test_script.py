@@ -9,7 +9,7 @@ import pytest
 from egs_warp.errors import UserError
 from egs_warp.motions.script import motion
 
-KNOWN = "jump, hop, twist, walk, walk to, walk along, turn, stand, dance, trajectory"
+KNOWN = "jump, hop, twist, walk, walk to, walk along, run, turn, drive, stand, get up, dance, trajectory"
 
 
 def test_a_line_of_motions() -> None:
