@@ -14,7 +14,7 @@ PROCESSES ?= 2
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test test-rest test-all fuzz mutation coverage release setup lint types docs pictures build web examples clean
+.PHONY: demo test test-rest test-all fuzz mutation coverage release setup lint types docs pictures paper build web examples clean
 
 demo: $(VENV)/demo.stamp
 	$(BIN)/python examples/jump.py --out out/jump $(FRAMES:%=--frames %)
@@ -70,6 +70,11 @@ docs: setup
 # What docs/assets holds, from the built-in captures, and the pages of the gallery, which are not in git; half an hour on two cores.
 pictures: setup
 	$(BIN)/python docs/make_pictures.py
+
+# Every table and figure of the paper into out/paper, from nothing; KEEP=1 goes on with a run that was broken off.
+DEVICE ?= cuda:0
+paper: setup
+	$(BIN)/python benchmarks/paper.py $(if $(QUICK),--quick --device cpu,--device $(DEVICE)) $(if $(KEEP),--keep)
 
 # The page of egs-warp view, from its TypeScript sources; needs node 20 or newer. The wheel and the sdist hold it built.
 PAGE := egs_warp/web/client

@@ -86,11 +86,31 @@ def copy_kernel(
     store_row(target_out, row, load_row(source, row))
 
 
+LAMP_COUNT = wp.constant(2)
+GLOSS_POWER = wp.constant(8.0)
+
+
+@wp.func
+def lamp_direction(lamp: wp.int32) -> wp.vec3:
+    """Towards the lamp, in the axes of the body at rest."""
+    if lamp == 0:
+        return wp.normalize(wp.vec3(0.5, -0.6, 0.62))
+    return wp.normalize(wp.vec3(-0.7, 0.4, 0.3))
+
+
+@wp.func
+def lamp_colour(lamp: wp.int32) -> wp.vec3:
+    if lamp == 0:
+        return wp.vec3(1.0, 0.92, 0.8)
+    return wp.vec3(0.5, 0.65, 0.9)
+
+
 @wp.kernel
 def trace_kernel(
     # In:
     mesh: wp.uint64,
     rest: wp.array[wp.vec3],
+    rest_from_world: wp.array[wp.mat33],
     world_from_camera: wp.mat33,
     eye: wp.vec3,
     focal: wp.vec2,
@@ -100,8 +120,15 @@ def trace_kernel(
     # Out:
     rest_out: wp.array2d[wp.vec3],
     hit_out: wp.array2d[wp.bool],
+    light_out: wp.array2d[wp.vec3],
+    gloss_out: wp.array2d[wp.vec3],
 ):
-    """Where each sample of each pixel meets the mesh, as the place at rest."""
+    """Where each sample of each pixel meets the mesh, as the place at rest; the light there, which the paint is
+    multiplied with, and the gloss that is added (Phong).
+
+    Lamps turn with each face (``rest_from_world``): a capture holds no lamps, only colour by direction. Faces have two
+    sides.
+    """
     pixel, sample = wp.tid()
     x = float(pixel % width) + (float(sample % samples) + 0.5) / float(samples)
     y = float(pixel // width) + (float(sample // samples) + 0.5) / float(samples)
@@ -109,7 +136,21 @@ def trace_kernel(
     hit = wp.mesh_query_ray(mesh, eye, ray, 1.0e6)
     hit_out[pixel, sample] = hit.result
     if hit.result:
-        a = wp.mesh_get_index(mesh, 3 * hit.face)
-        b = wp.mesh_get_index(mesh, 3 * hit.face + 1)
-        c = wp.mesh_get_index(mesh, 3 * hit.face + 2)
-        rest_out[pixel, sample] = hit.u * rest[a] + hit.v * rest[b] + (1.0 - hit.u - hit.v) * rest[c]
+        a = rest[wp.mesh_get_index(mesh, 3 * hit.face)]
+        b = rest[wp.mesh_get_index(mesh, 3 * hit.face + 1)]
+        c = rest[wp.mesh_get_index(mesh, 3 * hit.face + 2)]
+        rest_out[pixel, sample] = hit.u * a + hit.v * b + (1.0 - hit.u - hit.v) * c
+        towards = -(rest_from_world[hit.face] * ray)
+        normal = wp.normalize(wp.cross(b - a, c - a))
+        if wp.dot(normal, towards) < 0.0:
+            normal = -normal
+        light = wp.vec3(0.5, 0.5, 0.5)
+        gloss = wp.vec3(0.0, 0.0, 0.0)
+        for lamp in range(LAMP_COUNT):
+            facing = wp.dot(normal, lamp_direction(lamp))
+            if facing > 0.0:
+                mirrored = 2.0 * facing * normal - lamp_direction(lamp)
+                light += 0.45 * facing * lamp_colour(lamp)
+                gloss += 0.45 * wp.pow(wp.max(wp.dot(mirrored, towards), 0.0), GLOSS_POWER) * lamp_colour(lamp)
+        light_out[pixel, sample] = light
+        gloss_out[pixel, sample] = gloss

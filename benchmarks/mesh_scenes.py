@@ -1,10 +1,8 @@
-"""Objects with true meshes for Table 1 and Figure 8: solid textures, a ray caster, known deformations, training."""
+"""Scenes with a truth for Table 1 and Figure 8: cages, known deformations, a ray caster, training."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -13,166 +11,15 @@ from scipy.spatial import Delaunay
 
 from egs_warp.deformation.embedding import CageLocator
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.precision import Vec3
 from egs_warp.training.finetune import Densification, FinetuneOptions, TrainingView, finetune
-from harness import data_folder
 from kernels import trace_kernel
+from painted_meshes import PaintedMesh
 
-Paint = Callable[[np.ndarray], np.ndarray]
-"""Colour (P, 3), 0 to 1, of points (P, 3) of the rest shape: a texture that goes through the solid."""
 Motion = Callable[[np.ndarray], np.ndarray]
 """Deformed places (P, 3) of rest points (P, 3)."""
-
-
-LONGEST_EDGE = 0.02
-"""Of an object 1 high: bent by 80 degrees, the middle of such an edge is off by 7e-5."""
-
-
-@dataclass(frozen=True)
-class PaintedMesh:
-    """A triangle mesh, z up, on the plane z = 0, 1 high, with a solid texture."""
-
-    name: str
-    vertices: np.ndarray
-    """(V, 3) float64."""
-    faces: np.ndarray
-    """(F, 3) int32."""
-    paint: Paint
-
-
-def checkers(cell: float, colours: tuple[tuple[float, ...], ...]) -> Paint:
-    """Cubes of side ``cell`` in two colours, tinted with height."""
-
-    def paint(points: np.ndarray) -> np.ndarray:
-        parity = np.floor(points / cell + 1e-6).astype(int).sum(axis=1) % 2
-        tint = 0.12 * np.sin(7.0 * points[:, 2:3] + np.array([0.0, 2.0, 4.0]))
-        return np.clip(np.array(colours)[parity] + tint, 0.0, 1.0)
-
-    return paint
-
-
-def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    vertices, faces = [], []
-    for line in path.read_text().splitlines():
-        words = line.split()
-        if words[:1] == ["v"]:
-            vertices.append([float(word) for word in words[1:4]])
-        elif words[:1] == ["f"]:
-            corners = [int(word.split("/")[0]) - 1 for word in words[1:]]
-            faces += [[corners[0], corners[i], corners[i + 1]] for i in range(1, len(corners) - 1)]
-    return np.array(vertices), np.array(faces, dtype=np.int32)
-
-
-def _standing(vertices: np.ndarray) -> np.ndarray:
-    lower, upper = vertices.min(axis=0), vertices.max(axis=0)
-    return (vertices - [*((lower + upper)[:2] / 2), lower[2]]) / (upper[2] - lower[2])
-
-
-def _subdivided(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges are halved until none is longer than ``LONGEST_EDGE``:
-    a deformed mesh is the truth, and a long straight edge is not.
-    """
-    while True:
-        sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2)
-        long = np.linalg.norm(vertices[sides[..., 0]] - vertices[sides[..., 1]], axis=2) > LONGEST_EDGE
-        if not long.any():
-            return vertices, faces.astype(np.int32)
-        edges, edge_from_side = np.unique(np.sort(sides[long], axis=1), axis=0, return_inverse=True)
-        middle = np.full(faces.shape, -1)
-        middle[long] = len(vertices) + edge_from_side.ravel()
-        vertices = np.concatenate([vertices, vertices[edges].mean(axis=1)])
-        count = long.sum(axis=1)
-        parts = [faces[count == 0]]
-        # Turned until the halved side is the first, or the whole one the last.
-        for halved in (1, 2, 3):
-            chosen = count == halved
-            first = {1: long.argmax(axis=1), 2: (~long).argmax(axis=1) + 1, 3: np.zeros(len(faces), dtype=int)}[halved][
-                chosen
-            ]
-            turned = (first[:, None] + np.arange(3)) % 3
-            x, y, z = np.take_along_axis(faces[chosen], turned, axis=1).T
-            a, b, c = np.take_along_axis(middle[chosen], turned, axis=1).T
-            pieces = {
-                1: ((x, a, z), (a, y, z)),
-                2: ((x, a, z), (a, y, b), (a, b, z)),
-                3: ((x, a, c), (a, y, b), (c, b, z), (a, b, c)),
-            }[halved]
-            parts += [np.stack(piece, axis=1) for piece in pieces]
-        faces = np.concatenate(parts)
-
-
-def _turned_profile(profile: np.ndarray, around: int = 64) -> tuple[np.ndarray, np.ndarray]:
-    """Surface of revolution of the (radius, z) polyline ``profile`` about z."""
-    angle = np.linspace(0.0, 2 * np.pi, around, endpoint=False)
-    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    vertices = np.concatenate([np.column_stack([r * ring, np.full(around, z)]) for r, z in profile])
-    i, j = np.meshgrid(np.arange(len(profile) - 1), np.arange(around), indexing="ij")
-    a, b = i * around + j, i * around + (j + 1) % around
-    faces = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((a, b, b + around), (a, b + around, a + around))])
-    return vertices, faces.astype(np.int32)
-
-
-def chair() -> PaintedMesh:
-    """The armchair, in checkered cloth."""
-    vertices, faces = _read_obj(data_folder() / "meshes" / "armchair" / "armchair.obj")
-    vertices, faces = _subdivided(_standing(vertices[:, [0, 2, 1]] * [1, -1, 1]), faces)
-    return PaintedMesh("chair", vertices, faces, checkers(0.07, ((0.75, 0.3, 0.2), (0.9, 0.8, 0.6))))
-
-
-def plant() -> PaintedMesh:
-    """The potted aloe: green leaves, a banded pot."""
-    parts = [_read_obj(path) for path in sorted((data_folder() / "meshes" / "plant").glob("*.obj"))]
-    starts = np.cumsum([0, *[len(v) for v, _ in parts]])
-    faces = np.concatenate([f + start for (_, f), start in zip(parts, starts, strict=False)])
-    vertices, faces = _subdivided(_standing(np.concatenate([v for v, _ in parts])), faces.astype(np.int32))
-    return PaintedMesh("plant", vertices, faces, checkers(0.06, ((0.15, 0.5, 0.2), (0.65, 0.85, 0.4))))
-
-
-def microphone() -> PaintedMesh:
-    """A generated table microphone: round foot, thin stem, ball."""
-    foot = [(0.0, 0.0), (0.22, 0.0), (0.22, 0.03), (0.06, 0.06)]
-    stem = [(0.03, z) for z in np.linspace(0.08, 0.66, 30)]
-    arc = np.linspace(-1.2, np.pi / 2, 24)
-    ball = [(0.17 * np.cos(t), 0.83 + 0.17 * np.sin(t)) for t in arc]
-    vertices, faces = _subdivided(*_turned_profile(np.array([*foot, *stem, *ball])))
-    return PaintedMesh("microphone", vertices, faces, checkers(0.06, ((0.15, 0.15, 0.2), (0.75, 0.75, 0.8))))
-
-
-def spot() -> PaintedMesh:
-    """Keenan Crane's cow."""
-    vertices, faces = _read_obj(data_folder() / "meshes" / "spot" / "spot_triangulated.obj")
-    vertices, faces = _subdivided(_standing(vertices[:, [0, 2, 1]] * [1, -1, 1]), faces)
-    return PaintedMesh("spot", vertices, faces, checkers(0.07, ((0.9, 0.9, 0.85), (0.35, 0.25, 0.2))))
-
-
-def stool() -> PaintedMesh:
-    """The bar stool."""
-    vertices, faces = _read_obj(data_folder() / "meshes" / "stool" / "stools_stool_model_0.obj")
-    vertices, faces = _subdivided(_standing(vertices), faces)
-    return PaintedMesh("stool", vertices, faces, checkers(0.07, ((0.3, 0.35, 0.6), (0.85, 0.75, 0.5))))
-
-
-def bar() -> PaintedMesh:
-    """The checkered bar of Figure 8: a quarter as thick as it is high, in bricks of long sides,
-    as long Gaussians want.
-    """
-    corners = np.array([[x, y, z] for x in (-0.125, 0.125) for y in (-0.125, 0.125) for z in (0.0, 1.0)])
-    faces = np.array(
-        [[0, 1, 3], [0, 3, 2], [4, 7, 5], [4, 6, 7], [0, 5, 1], [0, 4, 5], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4]]
-        + [[1, 5, 7], [1, 7, 3]],
-        dtype=np.int32,
-    )
-    vertices, faces = _subdivided(corners, faces)
-
-    def paint(points: np.ndarray) -> np.ndarray:
-        # Faces lie on borders between cells; looked up a little inside, so that rounding does not choose their colour.
-        inside = (points - [0.0, 0.0, 0.5]) * 0.99 + [0.0, 0.0, 0.5]
-        parity = np.floor(inside / [0.125, 0.125, 0.25]).astype(int).sum(axis=1) % 2
-        return np.where(parity[:, None] == 0, [[0.9, 0.9, 0.85]], [[0.15, 0.2, 0.45]])
-
-    return PaintedMesh("bar", vertices, faces, paint)
 
 
 def box_cage(vertices: np.ndarray, cells: int) -> TetMesh:
@@ -237,17 +84,20 @@ def photograph(
     with wp.ScopedDevice(device):
         solid = wp.Mesh(wp.array(vertices, dtype=wp.vec3), wp.array(mesh.faces.ravel(), dtype=wp.int32))
         rest = wp.array(mesh.vertices, dtype=wp.vec3)
+        turns = wp.array(face_turns(mesh, vertices).transpose(0, 2, 1), dtype=wp.mat33)
         pictures = []
         for camera in cameras:
             count = camera.width * camera.height
             where = wp.zeros((count, samples**2), dtype=wp.vec3)
             hit = wp.zeros((count, samples**2), dtype=wp.bool)
+            light, gloss = wp.zeros_like(where), wp.zeros_like(where)
             wp.launch(
                 trace_kernel,
                 dim=(count, samples**2),
                 inputs=[
                     solid.id,
                     rest,
+                    turns,
                     wp.mat33(*camera.rotation.T.ravel()),
                     wp.vec3(*camera.centre),
                     wp.vec2(camera.fx, camera.fy),
@@ -255,14 +105,43 @@ def photograph(
                     camera.width,
                     samples,
                 ],
-                outputs=[where, hit],
+                outputs=[where, hit, light, gloss],
             )
-            covered = np.asarray(hit.numpy(), dtype=bool)
-            colour = np.ones((count, samples**2, 3))
-            colour[covered] = mesh.paint(where.numpy()[covered].astype(np.float64))
+            hits = np.asarray(hit.numpy(), dtype=bool)
+            # Most pixels see nothing; what is left of the samples is small.
+            pixels = np.flatnonzero(hits.any(axis=1))
+            covered = hits[pixels]
+            sampled = np.ones((len(pixels), samples**2, 3))
+            painted = mesh.paint(where.numpy()[pixels][covered].astype(np.float64))
+            if mesh.glossy:
+                lit, shone = (one.numpy()[pixels][covered] for one in (light, gloss))
+                painted = np.clip(painted * lit + shone, 0.0, 1.0)
+            sampled[covered] = painted
+            colour, coverage = np.ones((count, 3)), np.zeros(count)
+            colour[pixels], coverage[pixels] = sampled.mean(axis=1), covered.mean(axis=1)
             shape = (camera.height, camera.width)
-            pictures.append((colour.mean(axis=1).reshape(*shape, 3), covered.mean(axis=1).reshape(shape)))
+            pictures.append((colour.reshape(*shape, 3), coverage.reshape(shape)))
     return pictures
+
+
+def face_turns(mesh: PaintedMesh, vertices: np.ndarray) -> np.ndarray:
+    """(F, 3, 3) rotation of each face from rest to where its corners are at ``vertices`` (V, 3): the polar one of the
+    map of its plane, which takes normal to normal.
+    """
+
+    def frames(points: np.ndarray) -> np.ndarray:
+        a, b, c = points[mesh.faces].transpose(1, 0, 2)
+        normal = np.cross(b - a, c - a)
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+        return np.stack([b - a, c - a, normal], axis=2)
+
+    before, after = frames(mesh.vertices), frames(vertices)
+    # A face without area has no turn; nothing of it is seen.
+    sound = (np.linalg.det(before) > 1e-14) & (np.linalg.det(after) > 1e-14)
+    turns = np.tile(np.eye(3), (len(mesh.faces), 1, 1))
+    u, _, v = np.linalg.svd(after[sound] @ np.linalg.inv(before[sound]))
+    turns[sound] = u @ v
+    return turns
 
 
 def carried_vertices(mesh: PaintedMesh, cage: TetMesh, nodes: np.ndarray, device: str) -> np.ndarray:
@@ -297,36 +176,66 @@ def surface_cloud(mesh: PaintedMesh, count: int, *, device: str) -> GaussianClou
 
 
 def trained(
-    mesh: PaintedMesh, *, size: int, views: int, gaussians: int, iterations: int, seed: int, device: str
+    mesh: PaintedMesh,
+    *,
+    size: int,
+    views: int,
+    gaussians: int,
+    iterations: int,
+    seed: int,
+    device: str,
+    degree: int = 0,
 ) -> GaussianCloud:
     """Gaussians trained from ``views`` photographs of the mesh at rest, by the project's own trainer."""
+    return trained_on(
+        mesh, photographs(mesh, size, views, device), gaussians, iterations, seed=seed, degree=degree, device=device
+    )
+
+
+def photographs(mesh: PaintedMesh, size: int, views: int, device: str) -> list[TrainingView]:
+    """The mesh at rest from all around, cut out."""
+    # From below and from above too: a deformation turns what was hidden towards the eye.
+    cameras = ring(mesh.vertices, views, size, elevations=(15.0, 50.0, -15.0, 75.0, -50.0))
+    photos = photograph(mesh, mesh.vertices, cameras, device)
+    return [
+        TrainingView(camera, (colour - (1.0 - cover[..., None])) / np.maximum(cover[..., None], 1e-6), cover)
+        for camera, (colour, cover) in zip(cameras, photos, strict=True)
+    ]
+
+
+def trained_on(
+    mesh: PaintedMesh,
+    photos: list[TrainingView],
+    gaussians: int,
+    iterations: int,
+    *,
+    seed: int,
+    degree: int,
+    device: str,
+) -> GaussianCloud:
+    """``gaussians`` of SH ``degree`` trained from ``photos``, at first spread over the true surface."""
     points = surface_points(mesh, gaussians, seed)
     corners = mesh.vertices[mesh.faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    sh = np.zeros((gaussians, (degree + 1) ** 2, 3))
+    sh[:, 0] = (mesh.paint(points) - 0.5) / SH_BAND_0
     cloud = GaussianCloud.from_numpy(
         points,
         np.tile([1.0, 0.0, 0.0, 0.0], (gaussians, 1)),
         np.full((gaussians, 3), np.log(0.6 * np.sqrt(area / gaussians))),
         np.full(gaussians, 0.5),
-        ((mesh.paint(points) - 0.5) / 0.28209479177387814)[:, None],
+        sh,
         device=device,
     )
-    # From below and from above too: a deformation turns what was hidden towards the eye.
-    cameras = ring(mesh.vertices, views, size, elevations=(15.0, 50.0, -15.0, 75.0, -50.0))
-    photos = photograph(mesh, mesh.vertices, cameras, device)
-    # Before white alone, white haze around the object would cost nothing, and a deformation would show it.
-    training = [
-        TrainingView(camera, (colour - (1.0 - cover[..., None])) / np.maximum(cover[..., None], 1e-6), cover)
-        for camera, (colour, cover) in zip(cameras, photos, strict=True)
-    ]
     options = FinetuneOptions(
         iterations=iterations,
         densification=Densification.RELOCATION if iterations >= 1000 else Densification.NONE,
         max_gaussians=gaussians,
+        # Before white alone, white haze around the object would cost nothing, and a deformation would show it.
         background=None,
         seed=seed,
     )
-    return finetune(cloud, training, options=options).cloud
+    return finetune(cloud, photos, options=options).cloud
 
 
 def outside(alpha: np.ndarray, coverage: np.ndarray, threshold: float = 0.1) -> float:

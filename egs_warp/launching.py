@@ -12,13 +12,13 @@ import sys
 import tempfile
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, nullcontext
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import warp as wp
@@ -26,6 +26,8 @@ import warp as wp
 from egs_warp.errors import ArgumentError, UserError
 
 Shape: TypeAlias = int | tuple[int, ...]
+T = TypeVar("T")
+U = TypeVar("U")
 Device: TypeAlias = wp.Device | str | None
 """A device or its name; None is Warp's current one."""
 
@@ -149,7 +151,7 @@ _recorded = _Recorded()
 
 
 def launch_again(kernel: Any, dim: int, *, inputs: Sequence[Any], outputs: Sequence[Any], device: wp.Device) -> None:
-    """``wp.launch`` on a GPU at half its cost, for kernels that run many times a second.
+    """``wp.launch`` at half its cost, for kernels that run many times a second.
 
     The first launch of a thread is kept; the next ones only put in those arguments that are others than last time,
     whose types are not checked again.
@@ -202,6 +204,18 @@ def _chunk_edges(row_count: int, threads: int, work: np.ndarray | None) -> list[
         done = np.concatenate([[0.0], np.cumsum(np.asarray(work, dtype=np.float64) + 1e-3)])
         inner = np.searchsorted(done, np.array(shares) * done[-1])
     return np.unique(np.concatenate([[0], inner, [row_count]]).astype(int)).tolist()
+
+
+def beside(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
+    """Both results; ``second`` runs in another thread where one is free."""
+    helper = _pool().submit(second)
+    try:
+        done = first()
+    except BaseException:
+        helper.cancel()
+        raise
+    # One that has not begun is done here; in a forked process none ever begins.
+    return done, second() if helper.cancel() else helper.result()
 
 
 @cache
@@ -282,6 +296,15 @@ def with_room(count: int) -> int:
     """At least ``count``, at most a quarter more: counts that differ a little then ask for arrays of one size."""
     step = 1 << max(count.bit_length() - 3, 0)
     return -(-max(count, 1) // step) * step
+
+
+def put(target: wp.array, values: np.ndarray) -> None:
+    """Copy ``values`` of the same shape and kind into ``target``; on a CPU without Warp's own way, which takes longer
+    than a small copy."""
+    if device_of(target).is_cpu:
+        np.copyto(target.numpy(), values)
+    else:
+        target.assign(np.ascontiguousarray(values, dtype=np.float64))
 
 
 def zeros(shape: Shape, dtype: Any, device: Device) -> wp.array:

@@ -47,8 +47,8 @@ class ContactResponse:
     def of(cls, tangent: Tangent, contacts: ContactSet, columns: np.ndarray | None = None) -> ContactResponse:
         """Of ``contacts``; ``columns`` if they are known."""
         if columns is None:
-            columns = tangent.problem.dt * tangent.solve(contacts.frame.T.toarray())
-        delassus = np.asarray(contacts.frame @ columns)
+            columns = tangent.problem.dt * tangent.solve(contacts.frame.T)
+        delassus = contacts.frame @ columns
         return cls(tangent, contacts, columns, delassus)
 
     def forces(self, free: np.ndarray, shift: np.ndarray, friction: float, start: np.ndarray) -> np.ndarray:
@@ -123,7 +123,7 @@ class CoupledSolver:
             if not result.converged or len(added) == 0 or number == _ROUNDS - 1:
                 break
             contacts = self.detector.contact_set(np.concatenate([contacts.points, added]), problem.state.positions)
-            new = contacts.frame[3 * len(forces) :].T.toarray()
+            new = contacts.frame[3 * len(forces) :].T
             columns = np.hstack([response.columns, problem.dt * response.tangent.solve(new)])
             response = ContactResponse.of(response.tangent, contacts, columns)
             forces = np.vstack([forces, np.zeros((len(added), 3))])
@@ -154,15 +154,13 @@ class CoupledSolver:
             length, better = 1.0, False
             while length > _SHORTEST:
                 trial, trial_forces = velocities + length * change, forces + length * (wanted - forces)
-                if problem.feasible(trial):
-                    trial_free, trial_size = missing(trial, trial_forces)
-                    # Contacts that open, close or begin to slide change the forces at once: the residual need not fall
-                    # in every step.
-                    better = iteration == 1 or trial_size < max(
-                        (1.0 - 1e-4 * length) * max(recent, default=np.inf), self.tolerance
-                    )
-                    if better:
-                        break
+                trial_free, trial_size = missing(trial, trial_forces)
+                # Contacts that open, close or begin to slide change the forces at once: the residual need not fall in
+                # every step. It is no number where an element is inverted.
+                least = max((1.0 - 1e-4 * length) * max(recent, default=np.inf), self.tolerance)
+                better = np.isfinite(trial_size) and (iteration == 1 or trial_size < least)
+                if better:
+                    break
                 length *= 0.5
             if better:
                 before, velocities, forces, free, size = size, trial, trial_forces, trial_free, trial_size

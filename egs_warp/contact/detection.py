@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sparse
 import warp as wp
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
@@ -80,7 +79,7 @@ class ContactSet:
     """(n, 3, 3): rows are the normal and two tangents, unit."""
     gaps: np.ndarray
     """(n,) signed distance at the start of the step, metres."""
-    frame: sparse.csr_matrix
+    frame: np.ndarray
     """(3n, 3N): rows 3i, 3i+1, 3i+2 give the velocity of contact i along its normal and two tangents."""
     faces: np.ndarray
     """(n,) int32: which of the geometry's planes each is held to; 0 is the ground, flat or not."""
@@ -302,13 +301,10 @@ class ContactDetector:
             uneven = faces == 0
             places = np.einsum("nw,nwi->ni", weights[uneven], positions[nodes[uneven]])
             axes[uneven] = self.geometry.field.frames(places)
-        values = weights.reshape(-1, 1, 4, 1) * axes[:, :, None, :]
-        columns = np.broadcast_to(3 * nodes[:, None, :, None] + np.arange(3), values.shape)
-        frame = sparse.csr_matrix(
-            (values.ravel(), columns.ravel(), np.arange(0, 36 * count + 1, 12)),
-            shape=(3 * count, positions.size),
-        )
-        return ContactSet(points, nodes, weights, axes, gaps[points], frame, faces)
+        frame = np.zeros((count, 3, *positions.shape))
+        frame[np.arange(count)[:, None], :, nodes] = weights[:, :, None, None] * axes[:, None]
+        rows = frame.reshape(3 * count, positions.size)
+        return ContactSet(points, nodes, weights, axes, gaps[points], rows, faces)
 
 
 def push_out_speeds(gaps: np.ndarray, dt: float, cap: float, factor: float, slop: float) -> np.ndarray:

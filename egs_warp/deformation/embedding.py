@@ -77,10 +77,7 @@ class CageLocator:
             self._box_lowers = wp.array((corners.min(axis=1) - margin).astype(np.float32), dtype=wp.vec3)
             self._box_uppers = wp.array((corners.max(axis=1) + margin).astype(np.float32), dtype=wp.vec3)
             self._boxes = wp.Bvh(self._box_lowers, self._box_uppers)
-            self._surface = wp.Mesh(
-                points=wp.array(local.astype(np.float32), dtype=wp.vec3),
-                indices=wp.array(mesh.boundary_faces().ravel(), dtype=wp.int32),
-            )
+        self._surface = self.local_surface(mesh.nodes, mesh.boundary_faces())
 
     def locate(self, points: wp.array) -> PointEmbedding:
         """Embed finite ``points`` (P,) vec3d of this device; see ``embed_points``."""
@@ -114,17 +111,27 @@ class CageLocator:
         )
         return embedding, arms
 
-    def nearest_faces(self, points: wp.array) -> wp.array:
-        """(P,) int32, the row of ``mesh.boundary_faces()`` nearest to each of ``points`` (P,) vec3, in float32."""
+    def nearest_faces(self, points: wp.array, surface: wp.Mesh | None = None) -> wp.array:
+        """(P,) int32, the triangle nearest to each of ``points`` (P,) vec3, in float32: a row of
+        ``mesh.boundary_faces()``, or of another ``surface`` that ``local_surface`` has made.
+        """
         faces = empty(points.shape[0], wp.int32, self.device)
         launch_rows(
             kernels.nearest_face_kernel,
             points.shape[0],
-            inputs=[points, Vec3(*self._origin), self.extent, self._surface.id],
+            inputs=[points, Vec3(*self._origin), self.extent, (surface or self._surface).id],
             outputs=[faces],
             device=self.device,
         )
         return faces
+
+    def local_surface(self, vertices: np.ndarray, faces: np.ndarray) -> wp.Mesh:
+        """Triangles ``faces`` (F, 3) of ``vertices`` (V, 3), metres, to be searched from the middle of the cage."""
+        with wp.ScopedDevice(self.device):
+            return wp.Mesh(
+                points=wp.array((vertices - self._origin).astype(np.float32), dtype=wp.vec3),
+                indices=wp.array(np.ascontiguousarray(faces).ravel(), dtype=wp.int32),
+            )
 
     def _empty_embedding(self, count: int) -> PointEmbedding:
         return PointEmbedding(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
@@ -12,6 +13,7 @@ import warp as wp
 from egs_warp.deformation.deformer import CageCarrier, DeformedGaussians, Deformer, node_positions
 from egs_warp.deformation.embedding import CageLocator, PointEmbedding, embed_gaussians
 from egs_warp.deformation.splitting import SPLIT_DEGREES, SplitRule, split_for_motion
+from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.kernels.deformation import peers as kernels
@@ -38,12 +40,30 @@ class CarryMethod(Enum):
     """From T+ and T-, splitting what bends (Eq. 14-17)."""
 
 
+@dataclass(frozen=True)
+class BoundSurface:
+    """Triangles at rest that ``CarryMethod.SURFACE`` binds Gaussians to; the cage carries their corners."""
+
+    vertices: np.ndarray
+    """(V, 3) float64, metres."""
+    faces: np.ndarray
+    """(F, 3) int32, none without area."""
+
+    def __post_init__(self) -> None:
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        flat = np.flatnonzero(~(np.linalg.norm(np.cross(b - a, c - a), axis=1) > 0.0))
+        if len(self.faces) == 0 or len(flat):
+            bad = f"triangle {flat[0]} has no area" if len(flat) else "it has no triangles"
+            raise UserError(f"surface: {bad}; give triangles with three corners apart")
+
+
 def carry(
     cloud: GaussianCloud,
     mesh: TetMesh | CageLocator,
     frames: Sequence[wp.array | np.ndarray],
     *,
     method: CarryMethod = CarryMethod.BIDIRECTIONAL,
+    surface: BoundSurface | None = None,
     rule: SplitRule = SplitRule.MEASURED,
     threshold_degrees: float = SPLIT_DEGREES,
     min_error: float | None = None,
@@ -52,6 +72,7 @@ def carry(
 ) -> list[GaussianCloud]:
     """The cloud in each of ``frames``: node positions (N, 3) or (N,) vec3d, metres, of the cage ``mesh``.
 
+    ``surface`` is what ``SURFACE`` binds to, the cage's own if there is none.
     ``rule``, ``threshold_degrees``, ``min_error``, ``max_depth`` and ``max_growth`` are those of ``split_for_motion``
     and matter to ``BIDIRECTIONAL``.
     """
@@ -72,20 +93,26 @@ def carry(
             cloud, embedding = split.cloud, split.embedding
         # A Deformer of its own for each frame, since all results are kept.
         return [Deformer(cloud, embedding).deform(positions).cloud for positions in frames]
-    peer = _Peer(cloud, cage, method)
+    peer = _Peer(cloud, cage, method, surface)
     return [peer.deform(positions).cloud for positions in frames]
 
 
 class _Peer:
     """One embedding of another paper, made once and used for every frame."""
 
-    def __init__(self, cloud: GaussianCloud, cage: CageLocator, method: CarryMethod) -> None:
+    def __init__(
+        self, cloud: GaussianCloud, cage: CageLocator, method: CarryMethod, surface: BoundSurface | None
+    ) -> None:
         self._cloud, self._cage, self._method = cloud, cage, method
         with wp.ScopedDevice(cloud.device):
             if method is CarryMethod.SURFACE:
-                self._faces = wp.array(cage.mesh.boundary_faces(), dtype=wp.vec3i)
-                self._rest = wp.array(cage.mesh.nodes, dtype=Vec3)
-                self._face_from_gaussian = cage.nearest_faces(cloud.means)
+                vertices = cage.mesh.nodes if surface is None else surface.vertices
+                faces = cage.mesh.boundary_faces() if surface is None else surface.faces
+                self._faces = wp.array(faces, dtype=wp.vec3i)
+                self._rest = wp.array(vertices, dtype=Vec3)
+                self._vertices = None if surface is None else cage.locate(self._rest)
+                searched = None if surface is None else cage.local_surface(vertices, faces)
+                self._face_from_gaussian = cage.nearest_faces(cloud.means, searched)
             elif method is CarryMethod.LOCAL_TETRAHEDRON:
                 corners = empty(4 * cloud.count, Vec3, cloud.device)
                 self._launch(
@@ -121,7 +148,8 @@ class _Peer:
         outputs = [cloud.means, cloud.rotations, cloud.log_scales, turns]
         shape = [rest.rotations, rest.log_scales]
         if self._method is CarryMethod.SURFACE:
-            bound = [self._rest, uploaded, self._faces, self._face_from_gaussian]
+            corners = uploaded if self._vertices is None else self._vertices.interpolate(uploaded)
+            bound = [self._rest, corners, self._faces, self._face_from_gaussian]
             self._launch(kernels.carry_surface_kernel, [rest.means, *shape, *bound], outputs)
         elif self._method is CarryMethod.LOCAL_TETRAHEDRON:
             corners = self._corners.interpolate(uploaded)

@@ -10,7 +10,7 @@ import warp as wp
 
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.kernels.fem import elasticity as kernels
-from egs_warp.launching import empty
+from egs_warp.launching import empty, launch_again, put
 from egs_warp.precision import Mat33, Vec3, real
 
 
@@ -55,7 +55,7 @@ class ElasticAssembly:
     """Kernels, index maps and scratch memory for one mesh. Node arrays go in and out as (N, 3) float64 on the host."""
 
     def __init__(self, mesh: TetMesh, material: Material, *, device: str | None = None) -> None:
-        self.mesh, self.material, self.device = mesh, material, device
+        self.mesh, self.material, self.device = mesh, material, wp.get_device(device)
         node_count, tet_count = len(mesh.nodes), len(mesh.tets)
         corners = mesh.nodes[mesh.tets]
         edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
@@ -110,9 +110,6 @@ class ElasticAssembly:
         self._entry_from_block = wp.array(entry_from_block, dtype=int, device=self.device)
         self._entries = wp.zeros(pattern.nnz, dtype=real, device=self.device)
 
-    def _upload(self, target: wp.array, values: np.ndarray) -> None:
-        target.assign(np.ascontiguousarray(values, dtype=np.float64))
-
     @property
     def _model(self) -> list:
         material = self.material
@@ -121,10 +118,10 @@ class ElasticAssembly:
     def damping(self, positions: np.ndarray, dt: float) -> Damping:
         """Of a step of ``dt`` seconds that starts at ``positions`` (N, 3)."""
         gradients = empty(len(self.mesh.tets), Mat33, self.device)
-        self._upload(self._positions, positions)
-        wp.launch(
+        put(self._positions, positions)
+        launch_again(
             kernels.deformation_gradients_kernel,
-            dim=len(self.mesh.tets),
+            len(self.mesh.tets),
             inputs=[self._tets, self._rest_inverses, self._positions],
             outputs=[gradients],
             device=self.device,
@@ -150,10 +147,10 @@ class ElasticAssembly:
         With ``damping``, plus dt beta/2 sum V E':C:E', where E' = (F^T F - F0^T F0) / (2 dt) is the mean strain rate of
         the step.
         """
-        self._upload(self._positions, positions)
-        wp.launch(
+        put(self._positions, positions)
+        launch_again(
             kernels.element_energies_kernel,
-            dim=len(self.mesh.tets),
+            len(self.mesh.tets),
             inputs=[*self._model, *self._damping_inputs(damping)],
             outputs=[self._energies, self._determinants],
             device=self.device,
@@ -162,17 +159,17 @@ class ElasticAssembly:
 
     def gradient(self, positions: np.ndarray, damping: Damping | None = None) -> np.ndarray:
         """(N, 3) newtons: the derivative of ``energy`` by the positions, minus the internal force."""
-        self._upload(self._positions, positions)
-        wp.launch(
+        put(self._positions, positions)
+        launch_again(
             kernels.element_gradients_kernel,
-            dim=len(self.mesh.tets),
+            len(self.mesh.tets),
             inputs=[*self._model, *self._damping_inputs(damping)],
             outputs=[self._corner_gradients],
             device=self.device,
         )
-        wp.launch(
+        launch_again(
             kernels.gather_corners_kernel,
-            dim=len(self.mesh.nodes),
+            len(self.mesh.nodes),
             inputs=[self._corner_offsets, self._corner_from_slot, self._corner_gradients],
             outputs=[self._node_gradients],
             device=self.device,
@@ -186,18 +183,18 @@ class ElasticAssembly:
 
         ``projected``: each element's part is made positive semi-definite.
         """
-        self._upload(self._positions, positions)
+        put(self._positions, positions)
         hessian = kernels.element_projected_hessians_kernel if projected else kernels.element_hessians_kernel
-        wp.launch(
+        launch_again(
             hessian,
-            dim=len(self.mesh.tets),
+            len(self.mesh.tets),
             inputs=[*self._model, *self._damping_inputs(damping)],
             outputs=[self._blocks],
             device=self.device,
         )
-        wp.launch(
+        launch_again(
             kernels.gather_matrix_kernel,
-            dim=len(self._block_keys),
+            len(self._block_keys),
             inputs=[
                 self._contribution_offsets,
                 self._block_from_contribution,

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 import rslab
 import scipy.sparse as sparse
+
+from egs_warp.launching import beside
 
 _SPLIT = 32
 """Right-hand sides from which on half of them are solved in a second thread."""
@@ -55,13 +55,16 @@ class SparseFactors:
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """Solve for ``right`` (n,) or for each column of (n, m)."""
-        assert self._factors is not None, "update() comes first"
+        factors = self._factors
+        assert factors is not None, "update() comes first"
         if right.ndim == 1:
-            return np.asarray(self._factors.solve(right))
+            return np.asarray(factors.solve(right))
+        if right.shape[1] == 0:
+            return right
+        # Column by column in memory: as the factors take them.
+        right = np.asfortranarray(right)
         if right.shape[1] < _SPLIT:
-            return np.asarray(self._factors.solve_many(right)) if right.shape[1] else right
+            return np.asarray(factors.solve_many(right))
         half = right.shape[1] // 2
-        with ThreadPoolExecutor(1) as other:
-            second = other.submit(self._factors.solve_many, right[:, half:])
-            first = self._factors.solve_many(right[:, :half])
-            return np.hstack([first, second.result()])
+        first, second = beside(lambda: factors.solve_many(right[:, :half]), lambda: factors.solve_many(right[:, half:]))
+        return np.hstack([first, second])

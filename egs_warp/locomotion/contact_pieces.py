@@ -200,7 +200,9 @@ def solve_piece(
     lower = np.minimum(-b, np.maximum(A @ start[:m], -b - _BROKEN)) if len(A) else np.zeros(0)
     qp = quadratic_program(0.5 * (P + P.T), q, np.vstack([np.eye(m), A]), solver=solver)
     found = qp.solve(
-        np.concatenate([program.lower, lower]), np.concatenate([program.upper, np.full(len(lower), np.inf)])
+        np.concatenate([program.lower, lower]),
+        np.concatenate([program.upper, np.full(len(lower), np.inf)]),
+        start[:m],
     )
     if not found.usable:
         return None

@@ -326,7 +326,7 @@ def held_contacts(contacts: ContactSet, loads: np.ndarray, weight: float) -> Obj
     """That no contact slides, each weighted by its share of the weight in ``loads`` (n,)."""
     shares = np.sqrt(np.repeat(loads, 3))
     shares[::3] = 0.0
-    rows = sparse.csr_matrix(sparse.diags(shares) @ contacts.frame)
+    rows = sparse.csr_matrix(shares[:, None] * contacts.frame)
     return Objective("hold", rows, np.zeros(3 * contacts.count), weight)
 
 

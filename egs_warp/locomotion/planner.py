@@ -121,7 +121,10 @@ class StepPlanner:
         each = muscle_columns(self.muscles, problem.end_positions(foreseen)).toarray() * self.muscles.bounds
         # Without muscles and contact.
         free = problem.residual(foreseen, None).ravel()
-        solved = response.tangent.solve(np.column_stack([problem.dt * (members.T @ each.T).T, free]))
+        impulses = np.empty((len(free), m + 1), order="F")
+        impulses[:, :-1] = problem.dt * (members.T @ each.T).T
+        impulses[:, -1] = free
+        solved = response.tangent.solve(impulses)
         torques = problem.dt * weight * (contacts.frame @ problem.turns).T
         linear = LinearStep(
             foreseen.ravel() - solved[:, -1],
@@ -165,7 +168,7 @@ class StageClock:
     """Milliseconds of each stage of a step."""
 
     milliseconds: dict[str, float] = field(default_factory=dict)
-    _last: float = field(default_factory=time.perf_counter)
+    _last: float = field(default_factory=lambda: time.perf_counter())
 
     def lap(self, name: str) -> None:
         """Since the lap before was ``name``."""

@@ -8,13 +8,21 @@ from typing import Any, Protocol
 
 import numpy as np
 import osqp
-import scipy.linalg as dense
 import scipy.sparse as sparse
 
 from egs_warp.errors import UserError
+from egs_warp.locomotion.active_set import ReducedRows, optimum_near
 
 LARGEST_BREACH = 3e-3
 """By which a point of OSQP's iteration limit may leave its bounds and still be used."""
+_CODES: Any = osqp.SolverStatus
+_ITERATIONS = 50
+"""Of OSQP, before the rows that it holds to be active lead to the optimum."""
+_MOST_ITERATIONS = 4000
+_ROOM = 0.3
+"""Of the accuracy, by which bounds are moved apart."""
+_HELD, _NEAR = 1e-12, 1e-4
+"""Between the bounds of a row that is held; from a bound, where the search starts, of a row that may hold it."""
 
 
 class QpStatus(Enum):
@@ -60,8 +68,8 @@ class QpSolution:
 class QuadraticProgram(Protocol):
     """min 1/2 x^T P x + q^T x subject to l <= A x <= u, set up once; a re-solve changes only l and u."""
 
-    def solve(self, lower: np.ndarray, upper: np.ndarray) -> QpSolution:
-        """Solve with these bounds (m,), warm-started from the last solution."""
+    def solve(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None) -> QpSolution:
+        """Solve with these bounds (m,), warm-started from ``start`` (n,), or from the last solution."""
         ...
 
 
@@ -73,58 +81,120 @@ def quadratic_program(
 
 
 class OsqpProgram:
-    """A ``QuadraticProgram`` for OSQP."""
+    """A ``QuadraticProgram`` for OSQP: a few iterations on the rows that matter tell which of them hold the optimum,
+    from where ``active_set`` finds it to rounding. Where rounding leads that astray, OSQP goes on with all rows, to its
+    own ``accuracy``.
+    """
 
     def __init__(self, P: np.ndarray, q: np.ndarray, A: np.ndarray, *, accuracy: float = 3e-5) -> None:
         self._P, self._q, self._A = P, q, A
         self._accuracy = accuracy
-        self._solver: osqp.OSQP | None = None
-        self._free_minimum = dense.cho_solve(dense.cho_factor(P), -q)
+        self._rows = ReducedRows.of(P, q, A)
+        self._upper_P: sparse.csc_matrix | None = None
+        self._whole: osqp.OSQP | None = None
+        self._start: np.ndarray | None = None
 
-    def solve(self, lower: np.ndarray, upper: np.ndarray) -> QpSolution:
+    def solve(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None) -> QpSolution:
         """See ``QuadraticProgram``."""
-        free = self._A @ self._free_minimum
-        if (free >= lower).all() and (free <= upper).all():
+        start = self._start if start is None else start
+        if (upper - lower < _HELD).any():
+            # Rows that are held, as those of contact states are, repeat each other: met to an accuracy, not exactly.
+            return self._by_iterations(lower, upper, start)
+        rows = self._rows
+        # What has next to no room between its bounds is as good as without any: room to the accuracy that is asked.
+        room = _ROOM * self._accuracy
+        lower, upper = lower - room, upper + room
+        chosen = (rows.free < lower) | (rows.free > upper)
+        if not chosen.any():
             # As in flight: there is nothing to iterate on.
-            return _solution(QpStatus.SOLVED, self._P, self._q, self._free_minimum, np.zeros(len(free)), len(free))
-        if self._solver is None:
-            self._solver = osqp.OSQP(algebra="builtin")
-            self._solver.setup(
-                P=sparse.csc_matrix(np.triu(self._P)),
-                q=self._q,
-                A=sparse.csc_matrix(self._A),
-                l=lower,
-                u=upper,
-                verbose=False,
-                eps_abs=self._accuracy,
-                eps_rel=self._accuracy,
-                max_iter=4000,
-                scaling=4,
-                polishing=False,  # it fails on redundant rows and took half of the time
-                warm_starting=True,
-                adaptive_rho=True,
-                adaptive_rho_interval=50,
-                check_termination=25,
-            )
+            return self._exact(rows.minimum, np.zeros(len(lower)))
+        if start is not None:
+            at = self._A @ start
+            chosen |= (at < lower + _NEAR) | (at > upper - _NEAR)
+        index = np.flatnonzero(chosen)
+        solver = self._solver(self._A[index], lower[index], upper[index], _ITERATIONS)
+        if start is not None:
+            solver.warm_start(x=start)
+        result = _answer(solver)
+        if result.info.status_val == _CODES.OSQP_PRIMAL_INFEASIBLE:
+            return _solution(QpStatus.INFEASIBLE, self._P, self._q, None, None, len(lower))
+        if not np.isfinite(result.x).all() or not np.isfinite(result.y).all():
+            return self._by_iterations(lower, upper, start)
+        multipliers = np.zeros(len(lower))
+        multipliers[index] = result.y
+        return self._finished(result.x, multipliers, lower, upper) or self._by_iterations(lower, upper, result.x)
+
+    def _finished(
+        self, x: np.ndarray, multipliers: np.ndarray, lower: np.ndarray, upper: np.ndarray
+    ) -> QpSolution | None:
+        """The optimum, from the rows that OSQP holds to be active; None where rounding leads astray."""
+        at = self._A @ x
+        low = at - lower < -multipliers
+        found = optimum_near(self._rows, lower, upper, low, (upper - at < multipliers) & ~low)
+        if found is None:
+            return None
+        if not found.feasible:
+            return _solution(QpStatus.INFEASIBLE, self._P, self._q, None, None, len(lower))
+        return self._exact(found.x, found.multipliers)
+
+    def _exact(self, x: np.ndarray, multipliers: np.ndarray) -> QpSolution:
+        self._start = x
+        return _solution(QpStatus.SOLVED, self._P, self._q, x, multipliers, len(multipliers))
+
+    def _solver(self, A: np.ndarray, lower: np.ndarray, upper: np.ndarray, iterations: int) -> osqp.OSQP:
+        if self._upper_P is None:
+            self._upper_P = sparse.csc_matrix(np.triu(self._P))
+        solver = osqp.OSQP(algebra="builtin")
+        solver.setup(
+            P=self._upper_P,
+            q=self._q,
+            A=sparse.csc_matrix(A),
+            l=lower,
+            u=upper,
+            verbose=False,
+            eps_abs=self._accuracy,
+            eps_rel=self._accuracy,
+            max_iter=iterations,
+            scaling=4,
+            polishing=False,  # it fails on redundant rows and took half of the time
+            warm_starting=True,
+            adaptive_rho=True,
+            adaptive_rho_interval=50,
+            check_termination=25,
+        )
+        return solver
+
+    def _by_iterations(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> QpSolution:
+        """With all rows, set up once: OSQP's own accuracy."""
+        if self._whole is None:
+            self._whole = self._solver(self._A, lower, upper, _MOST_ITERATIONS)
         else:
-            self._solver.update(l=lower, u=upper)
-        result = self._solver.solve(raise_error=False)
-        codes: Any = osqp.SolverStatus
-        if result.info.status_val == codes.OSQP_SIGINT:
-            # OSQP takes Ctrl-C for itself while it runs; the program would go on with what it had found by then.
-            raise KeyboardInterrupt
+            self._whole.update(l=lower, u=upper)
+        if start is not None:
+            self._whole.warm_start(x=start)
+        result = _answer(self._whole)
         status = {
-            codes.OSQP_SOLVED: QpStatus.SOLVED,
-            codes.OSQP_SOLVED_INACCURATE: QpStatus.INEXACT,
-            codes.OSQP_MAX_ITER_REACHED: QpStatus.ITERATION_LIMIT,
-            codes.OSQP_PRIMAL_INFEASIBLE: QpStatus.INFEASIBLE,
-            codes.OSQP_PRIMAL_INFEASIBLE_INACCURATE: QpStatus.INFEASIBLE,
+            _CODES.OSQP_SOLVED: QpStatus.SOLVED,
+            _CODES.OSQP_SOLVED_INACCURATE: QpStatus.INEXACT,
+            _CODES.OSQP_MAX_ITER_REACHED: QpStatus.ITERATION_LIMIT,
+            _CODES.OSQP_PRIMAL_INFEASIBLE: QpStatus.INFEASIBLE,
+            _CODES.OSQP_PRIMAL_INFEASIBLE_INACCURATE: QpStatus.INFEASIBLE,
         }.get(result.info.status_val, QpStatus.FAILED)
         if status is QpStatus.ITERATION_LIMIT:
             rows = self._A @ result.x
             broken = max(float((lower - rows).max()), float((rows - upper).max()))
             status = status if broken <= LARGEST_BREACH else QpStatus.FAILED
-        return _solution(status, self._P, self._q, result.x, result.y, len(lower))
+        found = _solution(status, self._P, self._q, result.x, result.y, len(lower))
+        self._start = found.x if found.usable else None
+        return found
+
+
+def _answer(solver: osqp.OSQP) -> Any:
+    result = solver.solve(raise_error=False)
+    if result.info.status_val == _CODES.OSQP_SIGINT:
+        # OSQP takes Ctrl-C for itself while it runs; the program would go on with what it had found by then.
+        raise KeyboardInterrupt
+    return result
 
 
 class DaqpProgram:
@@ -145,8 +215,8 @@ class DaqpProgram:
         self._model.settings = {"eq_reduction": 1}
         self._ready = False
 
-    def solve(self, lower: np.ndarray, upper: np.ndarray) -> QpSolution:
-        """See ``QuadraticProgram``."""
+    def solve(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None) -> QpSolution:
+        """See ``QuadraticProgram``; it starts from its own last active set."""
         low, high = np.maximum(lower, -1e30), np.minimum(upper, 1e30)
         held = np.where(high - low < 1e-13, 5, 0).astype(np.int32)
         # Setting up already finds held rows that contradict each other.

@@ -25,8 +25,8 @@ from egs_warp.muscles.tension import MuscleTension, muscle_columns
 _MOST_HALVINGS = 4
 _AMISS, _LITTLE = 1.2, 0.01
 """A step whose end costs more than this factor of what its program expected, and this much more, is asked for again."""
-_LOOKS = 3
-"""Newton steps in which a step is foreseen: the first starts from afar."""
+_LOOKS = 2
+"""Newton steps with contact in which a step is foreseen."""
 
 
 @dataclass(frozen=True)
@@ -234,11 +234,16 @@ class LocomotionStepper:
         velocities, known = problem.start, self.points.matched(contacts.points, memory.points, memory.forces)
         tension = MuscleTension.of(self.muscles, activations)
         shift = self.solver.shift(contacts, problem.dt)
-        for _ in range(_LOOKS):
-            # What tension adds to the stiffness is left to the solve: with it a look takes twice as long, and what is
-            # foreseen serves no better.
+        # What tension adds to the stiffness is left to the solve: what is foreseen serves no better with it.
+        tangent = problem.tangent(self._factors, velocities, None)
+        pushes = problem.dt * (contacts.frame.T @ known.ravel())
+        missing = problem.residual(velocities, tension).ravel() - pushes
+        ahead = velocities - tangent.solve(missing).reshape(velocities.shape)
+        if problem.feasible(ahead):
+            velocities = ahead
             tangent = problem.tangent(self._factors, velocities, None)
-            response = ContactResponse.of(tangent, contacts)
+        response = ContactResponse.of(tangent, contacts)
+        for _ in range(_LOOKS):
             free = velocities.ravel() - tangent.solve(problem.residual(velocities, tension).ravel())
             forces = response.forces(free, shift, self.geometry.friction, known)
             ahead = (free + response.columns @ forces.ravel()).reshape(velocities.shape)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egs_warp.deformation.peers import CarryMethod, carry
+from egs_warp.deformation.peers import BoundSurface, CarryMethod, carry
+from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from tests.support.carrying_scenes import bent, box, covariances, random_cloud
 
@@ -60,3 +61,32 @@ def test_only_splitting_follows_a_bend() -> None:
     # Two standard deviations out along the tangent, less the mean's own shift s^2 / 2 radius.
     assert whole == pytest.approx(np.hypot(radius, 0.8) - radius - 0.4**2 / (2 * radius), rel=0.25)
     assert off_circle(CarryMethod.BIDIRECTIONAL) < 0.6 * whole
+
+
+def test_gaussians_bound_to_a_surface_within_the_cage_follow_it_and_not_the_cages_faces(device: str) -> None:
+    """SuGaR: under a shear of the cage Gaussians on a level sheet get the sheet's own in-plane map, its normal, and no
+    change of thickness."""
+    mesh = box()
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    level = 0.5 * (low[2] + high[2])
+    sheet = BoundSurface(
+        np.array([[low[0], low[1], level], [high[0], low[1], level], [high[0], high[1], level]]),
+        np.array([[0, 1, 2]], dtype=np.int32),
+    )
+    cloud = random_cloud(50, degree=0, device=device)
+    gradient = np.array([[1.2, 0.5, 0.3], [0.0, 0.8, 0.0], [0.0, 0.0, 1.5]])
+    (result,) = carry(cloud, mesh, [mesh.nodes @ gradient.T], method=CarryMethod.SURFACE, surface=sheet)
+    bound = gradient.copy()
+    bound[:, 2] = [0.0, 0.0, 1.0]
+    origin = np.array([low[0], low[1], level])
+    expected = (cloud.means.numpy() - origin) @ bound.T + origin @ gradient.T
+    np.testing.assert_allclose(result.means.numpy(), expected, atol=2e-5)
+    np.testing.assert_allclose(covariances(result), bound @ covariances(cloud) @ bound.T, atol=2e-6)
+
+
+def test_a_surface_needs_triangles_with_area() -> None:
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    with pytest.raises(UserError, match="surface: triangle 0 has no area; give triangles with three corners apart"):
+        BoundSurface(corners, np.array([[0, 1, 2]], dtype=np.int32))
+    with pytest.raises(UserError, match="surface: it has no triangles"):
+        BoundSurface(corners, np.zeros((0, 3), dtype=np.int32))

@@ -93,11 +93,12 @@ def test_an_iteration_limit_is_told_apart(monkeypatch: pytest.MonkeyPatch) -> No
     """
     P, q, A = random_program(0)
     program = quadratic_program(P, q, A, accuracy=1e-30)
-    near = program.solve(np.zeros(30), np.full(30, np.inf))
+    # A row that is held is left to OSQP alone.
+    near = program.solve(np.zeros(30), np.r_[0.0, np.full(29, np.inf)])
     assert near.status is QpStatus.ITERATION_LIMIT and near.usable
     assert near.status.value == "the iteration limit was reached near the bounds; the last point is used"
     monkeypatch.setattr("egs_warp.locomotion.solvers.LARGEST_BREACH", 0.0)
-    far = program.solve(np.zeros(30), np.full(30, np.inf))
+    far = program.solve(np.zeros(30), np.r_[0.0, np.full(29, np.inf)])
     assert far.status is QpStatus.FAILED and not far.usable and far.objective == np.inf
 
 
@@ -148,4 +149,5 @@ def test_ctrl_c_while_osqp_runs_is_not_lost() -> None:
     with pytest.raises(KeyboardInterrupt):
         timer.start()
         while time.monotonic() - began < 30.0:
-            program.solve(np.full(400, -1e-3), np.full(400, 1e-3))
+            # A row that is held leaves it to OSQP alone.
+            program.solve(np.r_[0.0, np.full(399, -1e-3)], np.r_[0.0, np.full(399, 1e-3)])

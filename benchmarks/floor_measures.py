@@ -1,0 +1,74 @@
+"""How like the true floor a filled hole is: pixel by pixel, in the large, in its detail; and how like itself the true
+floor is, which bounds what any filling with sharp texture can score.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy import ndimage
+
+from egs_warp.training.likeness import psnr
+
+COARSE = 0.05
+"""Standard deviation of the blur before which pictures are compared in the large, of the hole's side."""
+SHIFTS = np.array([(r * np.cos(t), r * np.sin(t)) for r in (0.5, 0.75, 1.0) for t in np.radians(np.arange(0, 360, 15))])
+"""(72, 2) of the hole's side: where floor from beside the hole is taken from."""
+
+
+def similarity(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(H, W) structural similarity of two pictures: Gaussian window of 11 x 11, sigma 1.5, mean over channels."""
+
+    def blur(values: np.ndarray) -> np.ndarray:
+        return cv2.GaussianBlur(values.astype(np.float64), (11, 11), 1.5)
+
+    mean_a, mean_b = blur(a), blur(b)
+    covariance = blur(a * b) - mean_a * mean_b
+    variances = blur(a * a) - mean_a**2 + blur(b * b) - mean_b**2
+    c1, c2 = 0.01**2, 0.03**2
+    return (
+        (2 * mean_a * mean_b + c1) * (2 * covariance + c2) / ((mean_a**2 + mean_b**2 + c1) * (variances + c2))
+    ).mean(axis=2)
+
+
+def coarse_psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
+    """PSNR in ``mask`` (H, W) of what is left of both pictures (H, W, 3) after a blur that looks at the mask alone."""
+    sigma = COARSE * np.sqrt(mask.sum())
+
+    def blurred(picture: np.ndarray) -> np.ndarray:
+        held = ndimage.gaussian_filter(picture * mask[..., None].astype(float), (sigma, sigma, 0.0))
+        return np.asarray(held)[mask] / np.asarray(ndimage.gaussian_filter(mask.astype(float), sigma))[mask][:, None]
+
+    return psnr(blurred(image), blurred(truth))
+
+
+def gradient_energy(image: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
+    """Mean squared gradient in ``mask`` (H, W), seam left out, over the truth's: below 1 is too smooth, above too
+    busy."""
+    inner = np.asarray(ndimage.binary_erosion(mask, iterations=3), dtype=bool)
+
+    def energy(picture: np.ndarray) -> float:
+        down, right = (np.gradient(picture.astype(np.float64), axis=axis) for axis in (0, 1))
+        return float(((down**2 + right**2)[inner]).mean())
+
+    return energy(image) / energy(truth)
+
+
+def from_beside(truth: np.ndarray, known: np.ndarray, hole: np.ndarray) -> list[tuple[float, float]]:
+    """PSNR and PSNR after a blur (dB) in the ``hole`` of the true floor itself, moved there from half a side to a side
+    away, for each place that has floor.
+
+    ``truth`` (rows, columns, 3), ``known`` and ``hole`` (rows, columns) bool.
+    """
+    rows, columns = np.nonzero(hole)
+    side = max(np.ptp(rows), np.ptp(columns)) + 1
+    scores: list[tuple[float, float]] = []
+    for down, right in np.rint(SHIFTS * side).astype(int).tolist():
+        y, x = rows + down, columns + right
+        if min(y.min(), x.min()) < 0 or y.max() >= hole.shape[0] or x.max() >= hole.shape[1]:
+            continue
+        if known[y, x].mean() > 0.98:
+            moved = truth.copy()
+            moved[rows, columns] = truth[y, x]
+            scores.append((psnr(moved[hole], truth[hole]), coarse_psnr(moved, truth, hole)))
+    return scores

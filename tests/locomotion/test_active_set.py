@@ -1,0 +1,74 @@
+"""The optimum to rounding, from good and bad guesses of the rows that hold it, against the conditions of Karush, Kuhn
+and Tucker.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.locomotion.active_set import ReducedRows, optimum_near
+
+
+def random_program(seed: int) -> tuple[np.ndarray, ...]:
+    """P, q, A and bounds that some point satisfies; more rows than can hold at once, every fifth one twice."""
+    random = np.random.default_rng(seed)
+    count = int(random.integers(3, 25))
+    root = random.normal(size=(count, count))
+    P = root @ root.T + 0.1 * np.eye(count)
+    rows = random.normal(size=(3 * count, count)) * 10.0 ** random.uniform(-2.0, 2.0, (3 * count, 1))
+    A = np.vstack([np.eye(count), rows, rows[::5]])
+    at = A @ random.normal(size=count)
+    spread = np.abs(A).sum(axis=1) * random.exponential(0.05, len(A))
+    lower = np.where(random.random(len(A)) < 0.3, -np.inf, at - spread)
+    return P, 20.0 * random.normal(size=count), A, lower, at + spread
+
+
+@pytest.mark.parametrize("guess", ["none", "broken", "random"])
+def test_the_conditions_of_the_optimum_hold(guess: str) -> None:
+    """P x + q + A^T y = 0, bounds met, multipliers of the sign of the bound that pushes and zero elsewhere."""
+    for seed in range(60):
+        P, q, A, lower, upper = random_program(seed)
+        reduced = ReducedRows.of(P, q, A)
+        random = np.random.default_rng(seed)
+        low, high = reduced.free < lower, reduced.free > upper
+        if guess == "none":
+            low, high = np.zeros_like(low), np.zeros_like(high)
+        elif guess == "random":
+            low = random.random(len(low)) < 0.3
+            high = (random.random(len(low)) < 0.3) & ~low
+        found = optimum_near(reduced, lower, upper, low, high)
+        assert found is not None and found.feasible
+        y, at = found.multipliers, A @ found.x
+        assert np.abs(P @ found.x + q + A.T @ y).max() < 1e-6 * (1.0 + np.abs(y).max())
+        slack = 1e-7 * np.maximum(1.0, np.linalg.norm(A, axis=1))
+        assert (at > lower - slack).all() and (at < upper + slack).all()
+        least = 1e-6 * (1.0 + np.abs(y).max())
+        assert (np.abs(at - upper) < 10.0 * slack)[y > least].all()
+        assert (np.abs(at - lower) < 10.0 * slack)[y < -least].all()
+
+
+def test_bounds_that_no_point_satisfies_are_told_apart() -> None:
+    """Two rows that exclude each other, alone and among others; and the same a hair apart."""
+    for seed in range(20):
+        P, q, A, lower, upper = random_program(seed)
+        row = len(q) + 1
+        A, upper = np.vstack([A, A[row]]), np.r_[upper, np.inf]
+        lower = np.r_[lower, upper[row] + 0.1]
+        reduced = ReducedRows.of(P, q, A)
+        found = optimum_near(reduced, lower, upper, reduced.free < lower, reduced.free > upper)
+        assert found is not None and not found.feasible
+        lower[-1] = upper[row] - 1e-3
+        found = optimum_near(reduced, lower, upper, reduced.free < lower, reduced.free > upper)
+        if found is not None and found.feasible:
+            assert (A @ found.x)[-1] == pytest.approx(upper[row], abs=1.1e-3)
+
+
+def test_a_minimum_within_its_bounds_is_the_optimum() -> None:
+    """Nothing holds it, whatever was guessed."""
+    P, q, A, _, _ = random_program(3)
+    reduced = ReducedRows.of(P, q, A)
+    at = A @ np.linalg.solve(P, -q)
+    found = optimum_near(reduced, at - 1.0, at + 1.0, np.ones(len(at), bool), np.zeros(len(at), bool))
+    assert found is not None
+    assert np.allclose(found.x, np.linalg.solve(P, -q)) and not found.multipliers.any()
