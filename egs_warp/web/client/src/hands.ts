@@ -19,7 +19,7 @@ export function motionOf(action: Action, walks: boolean): string {
   }[action];
 }
 
-/** How it is driven while a key is held: sqrt(g H), radians in sqrt(H / g); it goes as fast as it can where that is less. */
+/** How it is driven while a key is held: sqrt(g H), radians in sqrt(H / g); as fast as it can where that is less. */
 const DRIVES: Partial<Record<Action, { forward?: number; turn?: number }>> = {
   forward: { forward: 0.3 },
   back: { forward: -0.3 },
