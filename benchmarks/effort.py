@@ -84,7 +84,7 @@ def _run(body: str, name: str, *, device: str, seed: int, frames: int | None) ->
         built_in = {"pawn": pawn, "figurine": figurine, "stool": stool}[body](seed=seed, device=device)
         subject = {"cloud": built_in.cloud, "plane": built_in.plane}
     try:
-        performance = simulate(make_creature(**subject), motion(name), frames=frames)
+        performance = simulate(make_creature(**subject), motion(name), frames=frames, get_up=False)
     except (UserError, ArithmeticError, np.linalg.LinAlgError) as error:
         return {"stopped": str(error)}
     trajectory = performance.trajectory

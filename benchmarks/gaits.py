@@ -1,13 +1,16 @@
 """Any body, any way: bodies x what they are told (walk ahead, walk to a point, turn, twist, jump, stand and be pushed),
 with one setting for all.
 
-python benchmarks/gaits.py [--quick] [--workers 2] [--bodies NAME ...] [--cells NAME ...] [--json PATH] [--join PATH]
+python benchmarks/gaits.py [--quick] [--workers 2] [--nodes 500] [--bodies NAME ...] [--cells NAME ...] [--json PATH]
+    [--join PATH]
 
 A walk succeeds if it ends within 0.1 body heights and 10 degrees of where it was told to, within 60 sqrt(H/g), upright;
 a twist within 10 degrees in at most two jumps, a standard jump within 15 %; one that stands and is pushed by 0.1
-m sqrt(g H) from the side, if it ends upright and no sole was ever 0.1 body heights from where it stood. Slip is that of
-a foot while it stands over the stride; the cost of transport the muscles' work over m g times the way. Bodies without
-feet or a flat base refuse to walk in one line: that counts as a failure here. Captures take part where they are found.
+m sqrt(g H) from the side, if it ends upright and no sole was ever 0.1 body heights from where it stood; one that is
+pushed by 1 m sqrt(g H) at 0.8 of its height, if it stands at the end, having got up where that threw it over. Slip is
+that of a foot while it stands over the stride; the cost of transport the muscles' work over m g times the way. What a
+body refuses in one line counts as a failure here. A ball is judged by its place and, where it does not roll, its
+heading. Captures take part where they are found.
 """
 
 from __future__ import annotations
@@ -24,15 +27,15 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from bodies import NAMES, body
-from egs_warp.errors import UserError
+from bodies import NAMES, Body, body
+from egs_warp.errors import ArgumentError, UserError
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.ledger import ledger
 from egs_warp.locomotion.trajectory import measure
-from egs_warp.motions.feet import Base, base_of
+from egs_warp.motions.feet import Base
 from egs_warp.motions.push import read_pushes
 from egs_warp.motions.script import motion
-from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.creature import Creature, make_creature
 from egs_warp.pipelines.performance import Performance, simulate
 from harness import Row, Table, flags, record, report, timed
 from modelled import MODELLED, modelled
@@ -45,12 +48,15 @@ CELLS = {
     "twist": "twist 90",
     "jump": "jump",
     "push": "stand 2",
+    "get up": "stand 1",
 }
 QUICK = {"walk": "walk 0.3", "turn": "turn 30"}
-PUSH = "0.5 0.1 left"
+PUSHES = {"push": "0.5 0.1 left", "get up": "0.2 1 left 0.8"}
 CAPTURED = ("plush dog", "monkey", "robot", "koala", "fox", "armchair", "cat", "spot")
 NEAR, ASIDE, LONGEST = 0.1, 10.0, 60.0
 """Body heights, degrees, sqrt(H / g)."""
+GET_UP = 15.0
+"""Degrees from upright within which it has got up."""
 
 
 def names() -> list[str]:
@@ -58,24 +64,30 @@ def names() -> list[str]:
     return ["pawn", "figurine", "stool", *(name for name in CAPTURED if name in NAMES), *MODELLED]
 
 
-def run(name: str, cell: str, text: str) -> Row:
+def run(name: str, cell: str, text: str, nodes: int) -> Row:
     """Simulate one cell and judge it."""
     wp.config.log_level = wp.LOG_WARNING
-    judged, milliseconds = timed(_run, name, cell, text)
+    judged, milliseconds = timed(_run, name, cell, text, nodes)
     return {"body": name, "cell": cell, "told": text, **judged, "seconds": 1e-3 * milliseconds}
 
 
-def _run(name: str, cell: str, text: str) -> Row:
+def _run(name: str, cell: str, text: str, nodes: int) -> Row:
     try:
         one = modelled(name) if name in MODELLED else body(name)
-        creature = make_creature(one.cloud, plane=one.plane)
-        performance = simulate(creature, motion(text), pushes=read_pushes(PUSH) if cell == "push" else ())
+        creature = _creature(one, nodes)
+        unit = float(np.sqrt(creature.body.height / np.linalg.norm(creature.body.gravity)))
+        performance = simulate(
+            creature,
+            motion(text),
+            pushes=read_pushes(PUSHES[cell]) if cell in PUSHES else (),
+            get_up=cell == "get up",
+            longest=(LONGEST + 1.0) * unit,
+        )
     except (UserError, FileNotFoundError, ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
         return {"success": False, "reason": f"stopped: {error}"}
     trajectory, place = performance.trajectory, performance.place
     feet = place.feet()
-    local = place.ground.local(place.standing)
-    stands = base_of(creature.body.mesh, local[:, 2], len(feet))
+    stands = place.base()
     height, gravity = creature.body.height, float(np.linalg.norm(creature.body.gravity))
     books = ledger(trajectory)
     work = float(books.muscle_work.sum() / books.unit)
@@ -84,10 +96,16 @@ def _run(name: str, cell: str, text: str) -> Row:
     (done,) = performance.sequence.done[:1]
     own = done.motion.reached(trajectory, 0, len(trajectory.time) - 1)
     reached: dict[str, Any] = asdict(measure(trajectory)) | (asdict(own) if own is not None else {})
+    if stands is Base.ROUND:
+        # A ball lies any way up, and has a heading only as long as it does not roll.
+        reached["tilt_degrees"] = 0.0
+        moved[2] = moved[2] if cell in ("turn", "twist") else 0.0
     checked = asdict(audit(trajectory, newton_unconverged=sum(not r.converged for r in performance.simulation.reports)))
     time = float(trajectory.time[-1]) * float(np.sqrt(gravity / height))
     reason = f"fell: {performance.fallen}" if performance.fallen else bounds_broken(checked)
-    if cell == "push":
+    if cell == "get up":
+        reason = reason or _lies(performance, reached)
+    elif cell == "push":
         reason = reason or _swept(reached)
     elif cell in ("twist", "jump"):
         reason = reason or judge(cell, {"distance": 0.0, "height": 0.2, **done.asked}, reached)
@@ -104,7 +122,16 @@ def _run(name: str, cell: str, text: str) -> Row:
         "work": work,
         "cost_of_transport": work / way if cell in ("walk", "walk to") and way > NEAR else None,
         "fallen": performance.fallen,
+        "got_up": [entry.fell for entry in performance.sequence.done if entry.got_up],
     }
+
+
+def _creature(one: Body, nodes: int) -> Creature:
+    """With a finer cage where so coarse a one falls apart."""
+    try:
+        return make_creature(one.cloud, plane=one.plane, nodes=nodes)
+    except ArgumentError:
+        return make_creature(one.cloud, plane=one.plane, nodes=2 * nodes)
 
 
 def _moved(performance: Performance) -> np.ndarray:
@@ -127,6 +154,13 @@ def _missed(asked: dict[str, float], moved: np.ndarray, reached: dict[str, Any],
     return f"took {time:.0f} sqrt(H/g)" if time > LONGEST else None
 
 
+def _lies(performance: Performance, reached: dict[str, Any]) -> str | None:
+    if reached["tilt_degrees"] >= GET_UP:
+        return f"leans: tilt {reached['tilt_degrees']:.0f} degrees"
+    rose = all(entry.got_up for entry in performance.sequence.done if entry.fell is not None)
+    return None if rose and performance.sequence.finished else "it has not got up within its time"
+
+
 def _swept(reached: dict[str, Any]) -> str | None:
     if reached["tilt_degrees"] >= ASIDE:
         return f"leans: tilt {reached['tilt_degrees']:.0f} degrees"
@@ -137,6 +171,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the cells."""
     parser = flags(__doc__, quick="three bodies, short ways", device="cpu")
     parser.add_argument("--workers", type=int, default=os.cpu_count())
+    parser.add_argument("--nodes", type=int, default=500, help="of the cages, about")
     parser.add_argument("--bodies", nargs="*", help="only these")
     parser.add_argument("--cells", nargs="*", help=f"only these of {', '.join(CELLS)}")
     parser.add_argument("--join", type=Path, help="JSON of an earlier run of the same code: its rows are not run again")
@@ -150,7 +185,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     table = Table(body="<10", cell="<8", seconds=".0f", time=".0f", slip=".1%", cost=".1f", outcome="<7")
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(options.workers, mp_context=context) as pool:
-        for future in as_completed([pool.submit(run, *cell) for cell in cells if cell not in known]):
+        for future in as_completed([pool.submit(run, *cell, options.nodes) for cell in cells if cell not in known]):
             rows.append(row := future.result())
             figures = [row.get(key) for key in ("time", "slip", "cost_of_transport")]
             table.row(row["body"], row["cell"], row["seconds"], *figures, row["reason"] or "success")

@@ -33,7 +33,7 @@ SHIFT, TILT = 0.05, 5.0
 
 def stood(creature: Creature, line: str) -> Row:
     """One push, and how the body stood it."""
-    performance = simulate(creature, motion(STAND), pushes=read_pushes(line))
+    performance = simulate(creature, motion(STAND), pushes=read_pushes(line), get_up=False)
     trajectory = performance.trajectory
     books = ledger(trajectory)
     (done,) = performance.sequence.done

@@ -137,7 +137,7 @@ def _run(case: Case, *, device: str, seed: int, frames: int | None) -> Row:
             tilted = np.cos(angle) * GROUND.normal + np.sin(angle) * ahead
             subject["gravity_up"] = level.frame.axes.T @ tilted
         creature = make_creature(**subject, friction=case.friction, sag=case.sag)
-        performance = simulate(creature, motion(case.motion), frames=frames, step=case.step)
+        performance = simulate(creature, motion(case.motion), frames=frames, step=case.step, get_up=False)
     except (UserError, ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
         return {"success": False, "reason": f"stopped: {error}"}
     trajectory, sequence = performance.trajectory, performance.sequence

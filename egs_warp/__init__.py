@@ -34,8 +34,9 @@ if TYPE_CHECKING:
     from egs_warp.locomotion.settings import LocomotionSettings
     from egs_warp.locomotion.strategies import Strategy
     from egs_warp.locomotion.trajectory import Trajectory
+    from egs_warp.motions.command import Drive
     from egs_warp.motions.push import Push, read_pushes
-    from egs_warp.motions.script import Script, motion
+    from egs_warp.motions.script import Script, driving, motion
     from egs_warp.motions.style import Style, read_style
     from egs_warp.pipelines.animate import AnimateOptions, animate
     from egs_warp.pipelines.creature import Creature, make_creature
@@ -84,8 +85,9 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "locomotion.settings": ("LocomotionSettings",),
     "locomotion.strategies": ("Strategy",),
     "locomotion.trajectory": ("Trajectory",),
+    "motions.command": ("Drive",),
     "motions.push": ("Push", "read_pushes"),
-    "motions.script": ("Script", "motion"),
+    "motions.script": ("Script", "driving", "motion"),
     "motions.style": ("Style", "read_style"),
     "pipelines.animate": ("AnimateOptions", "animate"),
     "pipelines.creature": ("Creature", "make_creature"),
@@ -118,6 +120,7 @@ __all__ = [
     "Creature",
     "Deformer",
     "Densification",
+    "Drive",
     "FinetuneOptions",
     "GaussianCloud",
     "HeightField",
@@ -150,6 +153,7 @@ __all__ = [
     "animate",
     "click_at",
     "contact_sheet",
+    "driving",
     "embed_gaussians",
     "finetune",
     "footprint",

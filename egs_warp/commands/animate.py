@@ -54,8 +54,9 @@ def add_parser(commands: Commands) -> None:
     motion.add_argument(
         "--motion",
         default="jump",
-        help='jump (default), hop, twist, walk, dance, several as "hop x3, twist 180", or a script.json',
+        help='jump (default), hop, twist, walk, run, dance, get up, several as "hop x3, twist 180", or a script.json',
     )
+    motion.add_argument("--no-get-up", action="store_true", help="leave a body that has fallen lying, and end")
     motion.add_argument("--distance", type=float, help="body heights: jump (0.5), hop (0.7), twist (0), walk (0.4)")
     motion.add_argument(
         "--height",
@@ -253,7 +254,7 @@ def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
 
     numbers = ("distance", "height", "heading_degrees", "frames", "seed", "metres_per_unit", "friction")
     given = {name: getattr(chosen, name) for name in numbers if getattr(chosen, name) is not None}
-    options = AnimateOptions(**given, shadow=not chosen.no_shadow)
+    options = AnimateOptions(**given, shadow=not chosen.no_shadow, get_up=not chosen.no_get_up)
     # The files of key frames are read, too.
     asked = motion(chosen.motion, beats=chosen.beats, **options.targets())
     asked.frames()

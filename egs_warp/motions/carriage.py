@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from egs_warp.motions.feet import Base, Foot, base_of, halves
+from egs_warp.motions.feet import Base, Foot, halves
 from egs_warp.motions.gait import carrying_time
 from egs_warp.motions.route import Pace
 from egs_warp.motions.sequence import Place
@@ -19,6 +19,8 @@ from egs_warp.motions.stance import SHEAR
 
 REACH = 0.5
 """Longest pace over the shortest leg's length."""
+SIDEWAYS = 0.5
+"""Of its longest pace: how far a body on legs goes to the side, where one leg comes up to the next."""
 LARGEST_TURN = float(np.radians(15.0))
 """Of one pace on legs."""
 LIFT = 0.03
@@ -68,7 +70,7 @@ class OnLegs:
         self._legs = np.array([foot.leg for foot in feet])
         self._leg_mass = self._legs @ body.node_mass / body.mass
         self._soles = np.array([self._arms[foot.sole].mean(axis=0) for foot in feet])
-        self.pace = Pace(REACH * min(foot.length for foot in feet), LARGEST_TURN)
+        self.pace = Pace(REACH * min(foot.length for foot in feet), LARGEST_TURN, SIDEWAYS)
         self.lift = LIFT * body.height
         self.catch = REACH * min(foot.length for foot in feet)
         self.hold = 1000.0
@@ -132,7 +134,7 @@ def carried_on(place: Place) -> tuple[tuple[Foot, ...], type[OnLegs] | type[OnBa
     base. No feet at all where it lies or rolls."""
     feet, standing, height = place.feet(), place.ground.local(place.standing), place.body.height
     heights = standing[:, 2] - standing[:, 2].min()
-    base = base_of(place.body.mesh, standing @ (place.ground.axes @ place.ground.surface_normal), len(feet))
+    base = place.base()
     if base is Base.FEET and min(foot.length for foot in feet) >= LEGS * height:
         return feet, OnLegs
     if base is Base.FEET and len(feet) == 2:

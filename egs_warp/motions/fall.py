@@ -10,9 +10,11 @@ from egs_warp.fem.body import BodyState
 from egs_warp.geometry.frames import best_turn
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
+from egs_warp.motions.feet import Base
 from egs_warp.motions.follow import Follow
+from egs_warp.motions.get_up import GetUp
 from egs_warp.motions.keyframes import Quantity
-from egs_warp.motions.sequence import BodyMotion, MotionSequence, Place
+from egs_warp.motions.sequence import BodyMotion, MotionSequence, Part, Place
 from egs_warp.motions.stance import sole_shares
 
 FALLEN_TILT = 60.0
@@ -21,23 +23,32 @@ FALLEN_TILT = 60.0
 LYING_LOAD = 0.5
 """Of the weight. Where the ground bears so much of a body and none of it by the base, it lies on something else; less
 is what brushes a riser or a wall."""
+MOST_RISES = 3
+"""In one run."""
 FALLEN_TIME = 0.5
 """Of sqrt(H / g): for how long either must last on the ground. A body falls by H / 8 meanwhile; what a landing does in
 passing is shorter."""
 
 
 class FallWatch:
-    """Runs a sequence until its body has fallen, then asks for nothing more: the muscles let go."""
+    """Runs a sequence until its body has fallen, then asks for nothing more: the muscles let go. Or it gets up, and
+    goes on with what is next. A ball cannot fall."""
 
-    def __init__(self, sequence: MotionSequence, place: Place) -> None:
-        """``place``: how the body stands."""
+    def __init__(self, sequence: MotionSequence, place: Place, *, gets_up: bool = False) -> None:
+        """``place``: how the body stands; ``gets_up``: whether it is to try that."""
         body = place.body
         self.sequence = sequence
         self._body, self._up = body, place.ground.axes[2]
         self._arms = place.standing - body.centre_of_mass(place.standing)
+        self._has_upright = place.base() is not Base.ROUND
         self._in_base = sole_shares(body, place.ground, place.standing) > 0.0
         self._longest = FALLEN_TIME * float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
         self._seen = self._lain = 0.0
+        self._gets_up, self._risen = gets_up, 0
+        self.spent = 0.0
+        """Seconds in which it has got up."""
+        self.time = 0.0
+        """Seconds of the state that it saw last."""
         self.fallen: str | None = None
         """How it was told, once the body has fallen."""
 
@@ -48,19 +59,44 @@ class FallWatch:
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Those of the sequence, none of a fallen body."""
-        if self.fallen is None and report is not None:
+        self.time = state.time
+        if self.fallen is None and report is not None and self._has_upright:
             self._look(state, report)
         return self.sequence.objectives(state, report, dt) if self.fallen is None else []
 
     def _look(self, state: BodyState, report: StepReport) -> None:
         past, self._seen = state.time - self._seen, state.time
+        motion = self.sequence.done[-1].motion
+        if isinstance(motion, GetUp):
+            self._look_at(motion, past)
+            return
         # What bounces on its side has not come to its feet in between.
         if report.forces[:, 0].sum() <= 0.0:
             return
         lies = self._lies(state, report) if not _tips(self.sequence.done[-1].motion) else None
         self._lain = 0.0 if lies is None else self._lain + past
         if self._lain >= self._longest:
-            self.fallen = f"{lies} at {state.time:.2f} s"
+            self._fell(f"{lies} at {state.time:.2f} s")
+
+    def _fell(self, why: str) -> None:
+        self._lain = 0.0
+        if not self._gets_up or self._risen == MOST_RISES:
+            self.fallen = why
+            return
+        self._risen += 1
+        self.sequence.rise(Part("get up", {}, GetUp), why)
+
+    def _look_at(self, getting_up: GetUp, past: float) -> None:
+        """How it gets on."""
+        self.spent += past
+        if not getting_up.resting:
+            return
+        before = self.sequence.done[-2] if len(self.sequence.done) > 1 else None
+        if getting_up.up and before is not None and before.fell is not None:
+            before.got_up = True
+        elif not getting_up.up:
+            told = before.fell if before is not None else None
+            self.fallen = told or f"it does not get up, at {self._seen:.2f} s"
 
     def _lies(self, state: BodyState, report: StepReport) -> str | None:
         """How a body on the ground lies that does not stand on it."""

@@ -14,7 +14,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from egs_warp.contact.detection import ContactSet
-from egs_warp.geometry.tetmesh import TetMesh, edge_graph
+from egs_warp.geometry.tetmesh import TetMesh, edge_graph, mean_edge_length
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.limbs import Limbs, Sections, find_limbs
 
@@ -121,9 +121,11 @@ def base_of(mesh: TetMesh, heights: np.ndarray, foot_count: int) -> Base:
     long, wide = _sides(flat[heights < heights.min() + _FOOT * size])
     if long > _LONG * max(wide, size):
         return Base.LONG
+    edge = 0.5 * mean_edge_length(mesh)
     sole, _ = _sides(flat[heights < heights.min() + _GROUND * size])
     away = np.linalg.norm(nodes - np.average(mesh.nodes, axis=0, weights=mesh.lumped_masses(1.0)), axis=1)
-    is_ball = float(away.std()) < _ROUND * float(away.mean()) and sole < _ROUND_SOLE * _sides(flat)[0]
+    # A coarse cage is flat where the body is round.
+    is_ball = float(away.std()) < _ROUND * float(away.mean()) and sole - edge < _ROUND_SOLE * _sides(flat)[0]
     return Base.ROUND if is_ball else Base.ONE
 
 

@@ -8,23 +8,28 @@ from dataclasses import dataclass
 import numpy as np
 
 from egs_warp.motions.beats import LATEST, MOST_BEATS, even_beats, read_beats
+from egs_warp.motions.command import DrivePlan, read_drive
 from egs_warp.motions.dance import Dance
+from egs_warp.motions.drive import DrivenBy
 from egs_warp.motions.follow import Follow
+from egs_warp.motions.get_up import GetUp
+from egs_warp.motions.going import going, going_round
 from egs_warp.motions.hop import Squares
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.keyframes import Key, read_keyframes
 from egs_warp.motions.request import LARGEST_TARGET, LARGEST_TURN, MotionRequest, Value
-from egs_warp.motions.route import Route, along, read_path, straight, turning
+from egs_warp.motions.route import Route, along, read_path, straight
 from egs_warp.motions.sequence import BodyMotion, Part, Place
 from egs_warp.motions.stand import StandFor
 from egs_warp.motions.turn import Turn
-from egs_warp.motions.walk import Walk
 
 _PACE = 0.1
 """Body heights."""
 _CALMING = 120
 """Frames after it has stood for its time within which a body that was pushed is at rest."""
+_CLOSING = 300
+"""Frames after it is told to stand within which a body that was driven has closed its feet and stands."""
 TRAJECTORY_TAIL = 200
 """Frames after the last key of a trajectory within which the body is at rest."""
 
@@ -50,7 +55,7 @@ class MotionKind:
     def usage(self, name: str) -> str:
         """What the motion called ``name`` takes, for messages."""
         names = ", ".join(value.name for value in self.takes)
-        takes = f"{name} takes {names}" if names else f"{name} takes a file"
+        takes = f"{name} takes {names or ('a file' if self.file else 'no numbers')}"
         return f"{takes} or a file of beats" if self.beats else takes
 
 
@@ -79,7 +84,7 @@ def _turns(request: MotionRequest, height: float) -> list[Part]:
 
 def _walking(request: MotionRequest, asked: Mapping[str, float], route: Route, height: float) -> list[Part]:
     length = asked.get("step_length", _PACE) * height
-    return _repeated(request, asked, lambda place: Walk(place, route, length, speed=asked["speed"]))
+    return _repeated(request, asked, lambda place: going(place, route, length, speed=asked["speed"]))
 
 
 def _walks(request: MotionRequest, height: float) -> list[Part]:
@@ -100,12 +105,22 @@ def _walks_along(request: MotionRequest, height: float) -> list[Part]:
 
 def _turns_on_the_spot(request: MotionRequest, height: float) -> list[Part]:
     angle = float(np.radians(request.asked["heading_degrees"]))
-    return _walking(request, {**request.asked, "distance": 0.0}, turning(angle), height)
+    asked, length = {**request.asked, "distance": 0.0}, _PACE * height
+    return _repeated(request, asked, lambda place: going_round(place, angle, length, speed=asked["speed"]))
 
 
 def _stands(request: MotionRequest, height: float) -> list[Part]:
     seconds = request.asked["seconds"]
     return _repeated(request, request.asked, lambda place: StandFor(place, seconds))
+
+
+def _gets_up(request: MotionRequest, height: float) -> list[Part]:
+    return _repeated(request, request.asked, GetUp)
+
+
+def _runs(request: MotionRequest, height: float) -> list[Part]:
+    route, length = straight(request.asked["distance"] * height), LARGEST_TARGET * height
+    return _repeated(request, request.asked, lambda place: going(place, route, length, speed=_SPEED.most))
 
 
 def _dances(request: MotionRequest, height: float) -> list[Part]:
@@ -137,6 +152,19 @@ def _frames_of_walk(way: float, request: MotionRequest) -> int:
     return 170 + int(np.ceil(36 * way / _SHORTEST / request.asked["speed"]))
 
 
+def _drives(request: MotionRequest, height: float) -> list[Part]:
+    plan = _commands(request)
+    asked = {"commands": float(len(plan.commands)), "duration": plan.seconds}
+    return _repeated(request, asked, lambda place: DrivenBy(place, plan))
+
+
+def _commands(request: MotionRequest) -> DrivePlan:
+    if request.drive is not None:
+        return request.drive
+    assert request.file is not None
+    return read_drive(request.file)
+
+
 def _follows(request: MotionRequest, height: float) -> list[Part]:
     keys = _keys(request)
     asked = {"keys": float(len(keys)), "duration": max(key.time for key in keys)}
@@ -152,6 +180,8 @@ _SPEED = Value("speed", 1.0, 0.3, 1.6, "times the usual")
 _STEP_LENGTH = Value("step_length", _PACE, 0.0, LARGEST_TARGET, "body heights", above=True)
 _ROUND = 2.5
 """Body heights of way that take as long as a turn on the spot all the way round."""
+_LONG_TURN = 10.0
+"""The same where nothing but a turn is asked: what crawls takes four times as long."""
 _SHORTEST = 0.02
 """Body heights: the pace of a narrow base; so many fill the frames of a walk."""
 
@@ -205,16 +235,28 @@ REPERTOIRE: Mapping[str, MotionKind] = {
         lambda request: _frames_of_walk(_way(_path(request)) + 2.0 * _ROUND, request),
         file="a file of points, as walk along way.csv",
     ),
+    "run": MotionKind(
+        (Value("distance", 1.0, -LARGEST_TARGET, LARGEST_TARGET, "body heights"),),
+        _runs,
+        lambda request: 170 + int(np.ceil(36 * abs(request.asked["distance"]) / _SHORTEST)),
+    ),
     "turn": MotionKind(
         (Value("heading_degrees", 90.0, -LARGEST_TURN, LARGEST_TURN, "degrees"), _SPEED),
         _turns_on_the_spot,
-        lambda request: _frames_of_walk(_ROUND * abs(request.asked["heading_degrees"]) / 360.0, request),
+        lambda request: _frames_of_walk(_LONG_TURN * abs(request.asked["heading_degrees"]) / 360.0, request),
+    ),
+    "drive": MotionKind(
+        (),
+        _drives,
+        lambda request: int(np.ceil(60.0 * _commands(request).seconds)) + _CLOSING,
+        file="a file of speeds, as drive speeds.csv",
     ),
     "stand": MotionKind(
         (Value("seconds", 2.0, 0.0, 60.0, "seconds", above=True),),
         _stands,
         lambda request: int(np.ceil(60.0 * request.asked["seconds"])) + _CALMING,
     ),
+    "get up": MotionKind((), _gets_up, lambda request: 900),
     "dance": MotionKind(
         (
             Value("tempo", 90.0, 10.0, 400.0, "beats a minute"),

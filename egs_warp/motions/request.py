@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from egs_warp.errors import UserError
+from egs_warp.motions.command import DrivePlan
 
 LARGEST_TARGET = 10.0
 """Body heights; a larger target is refused as a slip of the pen."""
@@ -52,4 +53,6 @@ class MotionRequest:
     """Values by name, lengths in body heights, as reports give them."""
     repeat: int = 1
     file: Path | None = None
-    """Key frames of a trajectory, points of a path."""
+    """Key frames of a trajectory, points of a path, speeds of a drive."""
+    drive: DrivePlan | None = None
+    """Speeds that come from no file."""

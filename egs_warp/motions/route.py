@@ -31,6 +31,10 @@ class Pace:
     """Metres."""
     turn: float
     """Radians."""
+    sideways: float = 0.0
+    """Part of ``length`` that it may go to its side."""
+    faces: bool = True
+    """Whether it turns the way it goes; what rolls or crawls goes any way as it is."""
 
 
 Route = Callable[[Pace], np.ndarray]
@@ -58,7 +62,8 @@ def turning(angle: float) -> Route:
 
 
 def along(points: np.ndarray) -> Route:
-    """Past each of ``points`` (n, 2), metres, to the last, turned the way it goes; it turns on the spot where it must.
+    """Past each of ``points`` (n, 2), metres, to the last, turned the way it goes if it ``faces`` that; it turns on the
+    spot where it must.
 
     Raises ``UserError`` where that takes more than ``MOST_PACES``.
     """
@@ -79,6 +84,9 @@ def along(points: np.ndarray) -> Route:
 def _nearer(place: np.ndarray, point: np.ndarray, pace: Pace) -> np.ndarray:
     """(3,) one pace on from ``place`` (3,) towards ``point`` (2,)."""
     arm = point - place[:2]
+    if not pace.faces:
+        way = float(np.linalg.norm(arm))
+        return np.array([*(place[:2] + min(1.0, pace.length / way) * arm), place[2]])
     off = np.arctan2(arm[1], arm[0]) - place[2]
     turn = float(np.clip((off + np.pi) % (2.0 * np.pi) - np.pi, -pace.turn, pace.turn))
     heading = place[2] + turn

@@ -17,6 +17,7 @@ from typing import Any
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.text import parse_json, read_text, whole_number
 from egs_warp.motions.beats import asked_beats
+from egs_warp.motions.command import Drive, DrivePlan
 from egs_warp.motions.repertoire import REPERTOIRE, MotionKind
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.sequence import Part, Place
@@ -94,6 +95,13 @@ def motion(text: str, *, beats: str | None = None, **values: float | None) -> Sc
         if not any(name in request.asked for request in requests):
             raise ArgumentError(name, f"no motion of {text.strip()!r} takes it")
     return Script(tuple(requests))
+
+
+def driving(*steps: tuple[float, Drive]) -> Script:
+    """To go by ``Drive`` commands, each from so many seconds after the start on, the last of them to stand. Raises
+    ``ArgumentError`` for times that do not grow."""
+    plan = DrivePlan(tuple(time for time, _ in steps), tuple(command for _, command in steps))
+    return Script((MotionRequest("drive", {}, drive=plan),))
 
 
 def _from_words(piece: str, defaults: Mapping[str, Any], where: str) -> MotionRequest:

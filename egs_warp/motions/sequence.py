@@ -10,10 +10,12 @@ import numpy as np
 
 from egs_warp.contact.terrain import Surface, surface_above
 from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.geometry.frames import best_turn
+from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.feet import Foot, find_feet
+from egs_warp.motions.feet import Base, Foot, base_of, find_feet
 from egs_warp.motions.limbs import Limbs
 from egs_warp.motions.stance import Ground, heading_between, sole_shares
 from egs_warp.motions.style import Style
@@ -21,6 +23,8 @@ from egs_warp.motions.style import Style
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+_ROLLED = 30.0
+"""Degrees: a ball that lies within this of how it lay has turned about up, else it has rolled."""
 LATE = 0.03
 """Of its time so far: what a motion is given that takes longer than expected."""
 
@@ -51,6 +55,31 @@ class Place:
         """What the body stands on (``find_feet``)."""
         heights = (self.standing - self.ground.origin) @ self.ground.surface_normal
         return find_feet(self.body.mesh, heights, self.body.height, self.limbs)
+
+    def base(self) -> Base:
+        """What kind of thing that is, of the body as it is without its weight."""
+        nodes = self.body.mesh.nodes
+        turn = self.body.best_fit_rotation(self.standing)
+        return base_of(self.body.mesh, nodes @ (turn.T @ self.ground.surface_normal), len(self.feet()))
+
+    def after(self, positions: np.ndarray, report: StepReport | None) -> Place:
+        """Where a motion begins that finds the nodes at ``positions`` (N, 3) at rest; ``report`` of the step before.
+
+        A ball stands on whatever it has rolled onto.
+        """
+        if report is None or report.contacts.count == 0 or self.base() is not Base.ROUND:
+            return self.now(positions)
+        body, contacts = self.body, report.contacts
+        com = body.centre_of_mass(positions)
+        arms = self.standing - body.centre_of_mass(self.standing)
+        turn = best_turn(body.node_mass, arms, positions - com)
+        axes = self.ground.axes
+        if axes[2] @ turn @ axes[2] > np.cos(np.radians(_ROLLED)):
+            axes = self.now(positions).ground.axes
+        normal = self.ground.surface_normal
+        under = Ground.on(Plane(normal, -float(normal @ self.ground.origin)), axes[0], com, up=axes[2])
+        touching = np.einsum("cw,cwi->ci", contacts.weights, positions[contacts.nodes])
+        return replace(self, ground=under, standing=positions.copy(), touching=touching)
 
     def now(self, positions: np.ndarray) -> Place:
         """The same stance turned about up and moved to where the feet of ``positions`` (N, 3) are."""
@@ -122,6 +151,10 @@ class Done:
     asked: Mapping[str, float]
     motion: BodyMotion
     start_time: float
+    fell: str | None = None
+    """How it was told that the body fell, where that ended it."""
+    got_up: bool = False
+    """Whether the body has got up after that."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +174,8 @@ class MotionSequence:
         self._parts = list(parts)
         self._count = len(self._parts)
         self.done: list[Done] = []
-        self._rested_since: float | None = None
+        self._dropped = self._rises = False
+        """Whether the present motion counts no more, and getting up is next."""
 
     @property
     def finished(self) -> bool:
@@ -150,19 +184,29 @@ class MotionSequence:
 
     @property
     def _resting(self) -> bool:
-        return bool(self.done) and self.done[-1].motion.resting
+        return bool(self.done) and (self._dropped or self.done[-1].motion.resting)
+
+    def rise(self, get_up: Part, why: str) -> None:
+        """The body has fallen, as ``why`` tells: what it does ends, and it is to ``get_up`` before it goes on."""
+        self.done[-1].fell = why
+        self._parts.insert(0, get_up)
+        self._dropped = self._rises = True
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``, from the motion whose turn it is."""
         if self._parts and (not self.done or self._resting):
-            place = self._place.now(state.positions) if self.done else self._place
+            place = self._place.after(state.positions, report) if self.done else self._place
+            if place.base() is Base.ROUND:
+                self._place = place
             part = self._parts.pop(0)
+            self._dropped = self._rises = False
             self.done.append(Done(part.name, part.asked, part.begin(place), state.time))
         return self.done[-1].motion.objectives(state, report, dt)
 
     def time_left(self, time: float, expected: Sequence[float]) -> float:
         """Seconds from ``time`` until the last motion is at rest; ``expected`` is what each of all takes, seconds."""
-        later = sum(expected[len(self.done) :])
+        to_come = len(self._parts) - self._rises
+        later = sum(expected[len(expected) - to_come :])
         if not self.done or self._resting:
             return later
         past = time - self.done[-1].start_time

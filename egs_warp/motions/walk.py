@@ -36,13 +36,12 @@ from egs_warp.motions.gait import Gait, smooth
 from egs_warp.motions.pendulum import PendulumPlan, drift, nearest_in_hull
 from egs_warp.motions.route import Pace, Route
 from egs_warp.motions.sequence import Place
+from egs_warp.motions.way import check_way
 
 LOADED = 0.01
 """Share of the weight that a foot must carry to count as landed."""
 SHORTEST = 0.002
 """Body heights: a shorter pace is none."""
-HIGHEST_STEP = 0.03
-"""Body heights: what is higher above the ground, or lower below it, stands in the way."""
 _SHIFT, _GATHER, _REST = 1.5, 3.0, 1.0
 """Of sqrt(H / g): how long the first and the last phase take, and how long the body stands then."""
 _PLAN_STEP, _PLANNED = 1.0 / 12.0, 8
@@ -140,7 +139,7 @@ class Walk:
             )
         self.places = route(pace)
         """(P+1, 3) the body before the first and after each pace: see ``motions.route``."""
-        self._check_way(place)
+        check_way(place, self.places)
         paces, lift = len(self.places) - 1, self._carriage.lift
         self.gait = Gait.of(len(feet), paces, lift, time_unit=self._time_unit / speed)
         self._pace = pace
@@ -160,16 +159,6 @@ class Walk:
         self._pressed: np.ndarray | None = None
         """(2,) the centre of pressure that was asked for last."""
         self._late = 0
-
-    def _check_way(self, place: Place) -> None:
-        for x, y, _ in self.places:
-            level = np.array([self._start_com[0] + x, self._start_com[1] + y, 0.0])
-            level[2] = self._slope @ level[:2]
-            rise = place.rise_at(self.ground.world(level)) / self.body.height
-            if abs(rise) > HIGHEST_STEP:
-                where = f"{x / self.body.height:.2f} ahead and {y / self.body.height:.2f} to the left"
-                found = f"what is there is {abs(rise):.2f} body heights {'higher' if rise > 0.0 else 'lower'}"
-                raise UserError(f"walk: the way leads over a step, {where}: {found}; walk round it, or jump or hop")
 
     @property
     def expected_time(self) -> float:
@@ -255,11 +244,15 @@ class Walk:
                     self._stands(index, local)
                 self._enter(self._after_swing(self.swing), time)
         elif self.phase in (WalkPhase.SHIFT, WalkPhase.STAND) and elapsed >= self._duration(self.phase):
+            self._plan_swing(self.swing + 1)
             self.swing += 1
             self.swinging, self._sidestep = gait.group(self.swing), np.zeros(2)
             self._enter(WalkPhase.SWING, time)
         elif self.phase is WalkPhase.GATHER and elapsed >= self._duration(self.phase):
             self._enter(WalkPhase.REST, time)
+
+    def _plan_swing(self, swing: int) -> None:
+        """``swing`` is to begin. What is driven (``motions.drive``) chooses now where it goes."""
 
     def _enter(self, phase: WalkPhase, time: float) -> None:
         self.phase, self._entered = phase, time

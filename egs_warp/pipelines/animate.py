@@ -56,6 +56,8 @@ class AnimateOptions:
     friction: float = 0.8
     shadow: bool = True
     """On the ground, under the object."""
+    get_up: bool = True
+    """Whether a body that has fallen gets up and goes on."""
 
     def __post_init__(self) -> None:
         for name, value in (("distance", self.distance), ("height", self.height)):
@@ -182,6 +184,7 @@ def animate(
                 frames=options.frames,
                 style=acted,
                 pushes=pushes,
+                get_up=options.get_up,
                 parts=lambda: run.file(PARTS),
                 resume=_recorded(run),
                 progress=told,

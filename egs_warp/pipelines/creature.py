@@ -24,6 +24,7 @@ from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.meshing.body_gaussians import body_gaussians, centred, find_body_frame
 from egs_warp.meshing.cage import Cage, cage_of_body
 from egs_warp.meshing.occupancy import solid_from_gaussians
+from egs_warp.motions.feet import Base, base_of
 from egs_warp.motions.limbs import Limbs, Sections, find_limbs
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.stance import Ground
@@ -246,7 +247,9 @@ def face(standing: Standing, front: np.ndarray | None = None, *, seen_from: np.n
     axes = standing.frame.axes
     if front is None:
         seen = None if seen_from is None else axes @ seen_from
-        found = find_front(standing.gaussians, standing.cage.mesh, seen_from=seen)
+        mesh = standing.cage.mesh
+        lies = base_of(mesh, mesh.nodes[:, 2], standing.limbs.count) is Base.LONG
+        found = find_front(standing.gaussians, mesh, seen_from=seen, lengthwise=lies)
         angle = _FRONT_GRID * np.rint(np.arctan2(found.direction[1], found.direction[0]) / _FRONT_GRID)
         return replace(found, direction=np.array([np.cos(angle), np.sin(angle), 0.0]))
     x, y, _ = axes @ front

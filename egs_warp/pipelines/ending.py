@@ -20,6 +20,8 @@ class State(Enum):
     DONE = "done"
     CUT_OFF = "cut off"
     """The frames that were asked for, or that a motion may take, were over first."""
+    GOT_UP = "got up"
+    """The body fell, which ended it, and has got up."""
     FALLEN = "fallen"
     STOPPED = "stopped"
     """A step could not be solved."""
@@ -48,6 +50,9 @@ class Ending:
         """State of one of the motions that were begun, and why, for the user; ``last``: whether it was the last."""
         if last and self.stopped:
             return State.STOPPED, ["stopped: the next step could not be solved, however short; this is all before it"]
+        if entry.fell is not None:
+            state, then = (State.GOT_UP, "got up again") if entry.got_up else (State.FALLEN, "did not get up")
+            return state, [f"fallen: {entry.fell}; it {then}"]
         if last and self.fallen is not None:
             return State.FALLEN, [f"fallen: {self.fallen}"]
         if not entry.motion.resting:

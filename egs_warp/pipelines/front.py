@@ -63,11 +63,13 @@ class Front:
         return f"front is {way}, as given" if self.reason is None else f"front is taken to be {way} ({self.reason})"
 
 
-def find_front(cloud: GaussianCloud, mesh: TetMesh, *, seen_from: np.ndarray | None = None) -> Front:
+def find_front(
+    cloud: GaussianCloud, mesh: TetMesh, *, seen_from: np.ndarray | None = None, lengthwise: bool = False
+) -> Front:
     """Which way the body of ``cloud`` and cage ``mesh`` faces, both in its own frame.
 
     ``seen_from`` (3,) is the mean of the unit vectors to the cameras of its photos, in that frame: nothing if they go
-    all around. The same body gives the same bits.
+    all around. What lies along the ground faces ``lengthwise``. The same body gives the same bits.
     """
     height = float(mesh.nodes[:, 2].max())
     pictures, pixels = _look_around(cloud, mesh)
@@ -82,12 +84,19 @@ def find_front(cloud: GaussianCloud, mesh: TetMesh, *, seen_from: np.ndarray | N
     richer = np.stack([richer, 0.5 * (richer + np.roll(richer, -1))], axis=1).ravel()
     photos = np.zeros(len(ways)) if seen_from is None else seen_from[:2] @ ways.T
     score = _SYMMETRY * symmetric + richer + _LEAN * lean + _PHOTOS * photos
-    best = int(np.argmax(score))
-    # A parabola through the best and its neighbours.
-    before, at, after = score[best - 1], score[best], score[(best + 1) % len(score)]
-    angle = angles[best] + 0.5 * (before - after) / min(before - 2.0 * at + after, -1e-12) * np.pi / _VIEWS
+    length = _length(mesh)
+    along = length @ ways.T
+    allowed = np.abs(along) > np.abs(along).max() - 1e-9 if lengthwise else np.full(len(ways), True)
+    best = int(np.argmax(np.where(allowed, score, -np.inf)))
+    if lengthwise:
+        angle = np.arctan2(*(np.sign(along[best]) * length)[::-1])
+    else:
+        # A parabola through the best and its neighbours.
+        before, at, after = score[best - 1], score[best], score[(best + 1) % len(score)]
+        angle = angles[best] + 0.5 * (before - after) / min(before - 2.0 * at + after, -1e-12) * np.pi / _VIEWS
+    alike = f"the body is {100.0 * mirrored[best % _VIEWS]:.0f} % alike when mirrored along it"
     reasons = [
-        f"the body is {100.0 * mirrored[best % _VIEWS]:.0f} % alike when mirrored along it",
+        "the body lies along it" if lengthwise else alike,
         f"has {np.exp(richer[best]):.2f} times the detail of behind",
         f"leans {lean[best]:+.2f} of its height ahead",
     ]
@@ -97,6 +106,13 @@ def find_front(cloud: GaussianCloud, mesh: TetMesh, *, seen_from: np.ndarray | N
     sure = "clearly" if ahead > _CLEAR else "narrowly"
     why = f"guessed: {', '.join(reasons)}; {sure} ahead of the back; if not, say which way is front"
     return Front(np.array([np.cos(angle), np.sin(angle), 0.0]), why)
+
+
+def _length(mesh: TetMesh) -> np.ndarray:
+    """(2,) unit, along the longest way through the body on the ground."""
+    middles, volumes = mesh.nodes[mesh.tets].mean(axis=1)[:, :2], mesh.volumes()
+    arms = middles - np.average(middles, axis=0, weights=volumes)
+    return np.linalg.eigh((arms * volumes[:, None]).T @ arms)[1][:, -1]
 
 
 def mean_view(cameras: Sequence[Camera], centre: np.ndarray) -> np.ndarray | None:

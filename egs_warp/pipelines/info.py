@@ -119,8 +119,8 @@ class BodyInfo:
             return f"{len(self.feet)} feet, numbered anticlockwise from straight ahead"
         return {
             Base.ONE: "one base",
-            Base.ROUND: "a round base: it can roll",
-            Base.LONG: "its length: it has no feet",
+            Base.ROUND: "a round base: it rolls",
+            Base.LONG: "its length: it crawls",
         }[self.base]
 
 

@@ -12,7 +12,7 @@ from egs_warp.errors import ArgumentError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.frames import box_corners
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.locomotion.rollout import FRAME_RATE, Simulation, roll_out
+from egs_warp.locomotion.rollout import FRAME_RATE, REST_FRAMES, Simulation, roll_out
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.fall import FallWatch
 from egs_warp.motions.push import Kicks, Push
@@ -26,6 +26,8 @@ from egs_warp.pipelines.planned import planned_com
 
 FILMED_FROM = (0.6, -1.0, 0.22)
 """From the body to the camera of a film: ahead, left and up; it shows the face and the way."""
+_RISING = 120.0
+"""sqrt(H / g) that getting up may take in one run."""
 LEAST_FRAMES = 2
 """Of a film; the first one is at rest."""
 _FROM_ABOVE = 0.5
@@ -134,9 +136,11 @@ def simulate(
     motion: Script,
     *,
     frames: int | None = None,
+    longest: float | None = None,
     step: float | None = None,
     style: Style | None = None,
     pushes: Sequence[Push] = (),
+    get_up: bool = True,
     parts: Callable[[], Path] | None = None,
     resume: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, expected: None,
@@ -144,35 +148,42 @@ def simulate(
     """Run ``motion`` for ``frames`` pictures at 60 Hz, the first of them at rest, or else until the body has come to
     rest or fallen, or the motion is cut off.
 
-    ``step``: the seconds of a solver step, if not the usual; ``style``: how it jumps; ``pushes``: what hits it
-    meanwhile; ``parts`` tells the folder that takes the steps as they are done, ``resume`` is that of a run that was
-    cut off and goes on. ``progress`` is told after each frame how many are done, and how many are expected in all by
-    now. Raises ``UserError`` for a motion that the body cannot do, and a folder that another run has left.
+    ``longest``: seconds after which it is cut off, if that is earlier; ``step``: those of a solver step, if not the
+    usual; ``style``: how it jumps; ``pushes``: what hits it meanwhile; ``get_up``: whether a body that has fallen is to
+    get up and go on; ``parts`` tells the folder that takes the steps as they are done, ``resume`` is that of a run that
+    was cut off and goes on. ``progress`` is told after each frame how many are done, and how many are expected in all
+    by now. Raises ``UserError`` for a motion that the body cannot do, and a folder that another run has left.
     """
     check_frames(frames)
     place = first_place(creature, step=step, style=style)
     expected = motion.check(place)
     sequence = MotionSequence(place, motion.parts(creature.body.height))
-    watch = FallWatch(sequence, place)
+    watch = FallWatch(sequence, place, gets_up=get_up)
     # A frame is as long as a step that is longer than it.
     frame = max(1.0 / FRAME_RATE, step or 0.0)
-    limit = round(motion.frames(creature.body.height) / (FRAME_RATE * frame))
+    limit = round(min(motion.frames(creature.body.height) / FRAME_RATE, longest or np.inf) / frame)
     most = limit if frames is None else frames - 1
+    # What getting up takes comes on top.
+    rising = round(_RISING * creature.body.time_unit / frame) if get_up and frames is None else 0
+
+    def over() -> bool:
+        return watch.finished or watch.time + 1e-9 >= (limit - REST_FRAMES) * frame + watch.spent
+
     outlook = Outlook(sequence, expected, frame=frame, most=most)
     simulation = roll_out(
         creature.stepper,
         creature.geometry,
         creature.start,
         watch,
-        frames=most,
+        frames=most + rising,
         step=step,
         place=creature.frame,
         parts=parts,
         resume=resume,
-        finished=lambda: frames is None and watch.finished,
+        finished=lambda: frames is None and over(),
         kicks=Kicks(place, pushes),
         progress=lambda last: progress(
-            last + 1, outlook.frames(last + 1, finished=watch.finished) if frames is None else most
+            last + 1, max(last + 1, outlook.frames(last + 1, finished=watch.finished)) if frames is None else most
         ),
     )
     trajectory = simulation.trajectory

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+from egs_warp.motions.command import FASTEST, Drive
 from egs_warp.motions.push import LARGEST
 from egs_warp.motions.script import Script, motion
 
@@ -37,6 +38,13 @@ class Go:
 
     point: tuple[float, float]
     """Metres, frame of the body."""
+
+
+@dataclass(frozen=True)
+class Steer:
+    """Go so until told otherwise, in place of what was to come; told to stand, it stops."""
+
+    command: Drive
 
 
 @dataclass(frozen=True)
@@ -108,7 +116,7 @@ class TellScript:
 
 
 Message: TypeAlias = (
-    Perform | Go | Pull | Release | Hit | Change | Pause | Step | Cancel | StandUp | Record | TellScript
+    Perform | Go | Steer | Pull | Release | Hit | Change | Pause | Step | Cancel | StandUp | Record | TellScript
 )
 
 
@@ -139,6 +147,11 @@ def _perform(message: Mapping[str, Any], reach: float, node_count: int) -> Messa
 
 def _go(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
     return Go((_number(message, "x", -reach, reach), _number(message, "y", -reach, reach)))
+
+
+def _steer(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
+    names = ("forward", "sideways", "turn")
+    return Steer(Drive(*(_number(message, name, -FASTEST, FASTEST) if name in message else 0.0 for name in names)))
 
 
 def _pull(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
@@ -184,6 +197,7 @@ _Reader: TypeAlias = Callable[[Mapping[str, Any], float, int], Message]
 _READERS: dict[str, tuple[tuple[str, ...], _Reader]] = {
     "motion": (("text",), _perform),
     "go": (("x", "y"), _go),
+    "drive": (("forward", "sideways", "turn"), _steer),
     "pull": (("node", "x", "y", "z"), _pull),
     "release": ((), lambda *_: Release()),
     "push": (("x", "y", "z", "height"), _hit),

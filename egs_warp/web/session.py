@@ -35,6 +35,7 @@ from egs_warp.web.messages import (
     Record,
     Release,
     StandUp,
+    Steer,
     Step,
     TellScript,
 )
@@ -247,6 +248,8 @@ class Session:
                 self.steering.perform(script)
             case Go(point):
                 self.steering.go(np.array(point))
+            case Steer(command):
+                self.steering.drive(command)
             case Cancel():
                 self.steering.cancel()
             case Pull(node, target):
@@ -330,6 +333,7 @@ class Session:
                 self.steering.requests,
                 source=self.options.source,
                 asked={"live": True, "friction": self.friction, "sag": self.sag},
+                driven=[time for time in self.steering.driven if time >= take.start.time],
             )
             self._tell(f"wrote {path} ({take.seconds:.1f} s); egs-warp view {path}")
         except (UserError, OSError) as error:

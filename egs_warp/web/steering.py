@@ -19,6 +19,10 @@ from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.carriage import carried_on
+from egs_warp.motions.command import Drive
+from egs_warp.motions.drive import Driven
+from egs_warp.motions.feet import Base
+from egs_warp.motions.get_up import GetUp
 from egs_warp.motions.repertoire import REPERTOIRE
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.script import Script, motion
@@ -146,6 +150,10 @@ class Steering:
         self._tell = tell
         self._tasks: deque[Task] = deque()
         self._journey: Journey | None = None
+        self._drive = Drive()
+        """How it is to go."""
+        self.driven: list[float] = []
+        """Seconds at which it began to be driven."""
         self.stand(place)
         self.walks = _walks(place)
 
@@ -153,6 +161,7 @@ class Steering:
         """Stand at ``place``, and drop all else."""
         self.cancel()
         self.place = place
+        self._is_ball = place.base() is Base.ROUND
         self._act: _Act = _Act("stand", Stand(place), Posture.STANDING)
         self._tilted_since: float | None = None
 
@@ -166,8 +175,14 @@ class Steering:
         self.cancel()
         self._journey = Journey(goal, walks=self.walks)
 
+    def drive(self, command: Drive) -> None:
+        """Go so from now on, once what it does is done; until another command, or anything else that is asked."""
+        self.cancel()
+        self._drive = command
+
     def cancel(self) -> None:
-        """Drop what was to come."""
+        """Drop what was to come; what is driven stops."""
+        self._drive = Drive()
         self._tasks.clear()
         self._journey = None
 
@@ -179,7 +194,11 @@ class Steering:
     @property
     def queued(self) -> str | None:
         """Name of what comes next."""
-        return self._tasks[0].part.name if self._tasks else "go" if self._journey else None
+        if self._tasks:
+            return self._tasks[0].part.name
+        if self._journey:
+            return "go"
+        return None if self._drive.stands or isinstance(self._act.motion, Driven) else "drive"
 
     @property
     def idle(self) -> bool:
@@ -193,22 +212,36 @@ class Steering:
 
     def facing(self, positions: np.ndarray) -> np.ndarray:
         """(2,) unit vector of its way forward, with its nodes at ``positions`` (N, 3)."""
-        forward = self.place.now(positions).ground.axes[0, :2]
+        place = self.place if self._is_ball else self.place.now(positions)
+        forward = place.ground.axes[0, :2]
         return forward / max(float(np.linalg.norm(forward)), 1e-12)
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``, from the motion whose turn it is."""
         if self._has_fallen(state):
-            if self._act.posture is not Posture.LYING:
-                self._act = _Act("fallen", Lie(), Posture.LYING)
-                self._tell("it has fallen; Backspace stands it up again")
-            self.cancel()
-        elif self._act.motion.resting:
-            self._begin_next(state)
+            self._lie(state, report)
+        elif self._act.motion.resting and not (isinstance(self._act.motion, Driven) and not self._drive.stands):
+            self._begin_next(state, report)
+        if isinstance(self._act.motion, Driven):
+            self._act.motion.command = self._drive
         return self._act.motion.objectives(state, report, dt)
 
-    def _begin_next(self, state: BodyState) -> None:
-        place = self.place.now(state.positions)
+    def _lie(self, state: BodyState, report: StepReport | None) -> None:
+        """It lies, but for getting up where that is asked."""
+        if isinstance(self._act.motion, GetUp) and not self._act.motion.resting:
+            return
+        if self._tasks and self._tasks[0].part.name == "get up":
+            self._begin_next(state, report)
+            return
+        if self._act.posture is not Posture.LYING:
+            self._act = _Act("fallen", Lie(), Posture.LYING)
+            self._tell("it has fallen; tell it to get up, or Backspace stands it up again")
+        self.cancel()
+
+    def _begin_next(self, state: BodyState, report: StepReport | None) -> None:
+        place = self.place.after(state.positions, report)
+        if self._is_ball:
+            self.place = place
         try:
             task = self._tasks.popleft() if self._tasks else self._journey.leg(place) if self._journey else None
             begun = task.part.begin(place) if task is not None else None
@@ -216,6 +249,8 @@ class Steering:
             self.cancel()
             self._tell(str(error))
             task = begun = None
+        if task is None and not self._drive.stands and self._begin_drive(place, state.time):
+            return
         if task is None or begun is None:
             self._journey = None
             if self._act.posture is not Posture.STANDING:
@@ -227,12 +262,25 @@ class Steering:
         self.begun.append(Done(task.part.name, task.part.asked, begun, state.time))
         self.requests.append(task.request)
 
+    def _begin_drive(self, place: Place, time: float) -> bool:
+        try:
+            driven = Driven(place)
+        except UserError as error:
+            self.cancel()
+            self._tell(str(error))
+            return False
+        self._say_notes()
+        self._act = _Act("drive", driven, Posture.MOVING)
+        self.driven.append(time)
+        return True
+
     def _say_notes(self) -> None:
         for note in self._act.motion.notes():
             self._tell(f"{self.doing}: {note}")
 
     def _has_fallen(self, state: BodyState) -> bool:
-        if tilt_degrees(self.place, state.positions) <= FALLEN:
+        # A ball cannot fall.
+        if self._is_ball or tilt_degrees(self.place, state.positions) <= FALLEN:
             self._tilted_since = None
             return False
         if self._tilted_since is None:
@@ -243,4 +291,4 @@ class Steering:
 
 
 def _walks(place: Place) -> bool:
-    return len(carried_on(place)[0]) > 0
+    return place.base() in (Base.LONG, Base.ROUND) or len(carried_on(place)[0]) > 0

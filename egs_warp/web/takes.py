@@ -74,10 +74,12 @@ class Take:
         *,
         source: str,
         asked: Mapping[str, Any],
+        driven: Sequence[float] = (),
     ) -> Path:
         """Write trajectory, creature, report and script into the first free ``folder/take-N``, which it returns.
 
-        ``begun`` are the motions of the session, ``requests`` how a script asks for them.
+        ``begun`` are the motions of the session, ``requests`` how a script asks for them;
+        ``driven`` the times, seconds, at which it was steered by speeds.
         """
         trajectory = self._recorder.trajectory()
         chosen = [
@@ -87,6 +89,8 @@ class Take:
         ]
         touched = len(trajectory.kick_step) > 0
         notes = [f"the user pulled at it or pushed it, which {SCRIPT} does not repeat"] if touched else []
+        if driven:
+            notes.append(f"the user drove it, which {SCRIPT} does not repeat")
         report = report_of_run(
             *(self.creature, trajectory, self.reports, np.arange(len(trajectory.time))),
             *([entry for entry, _ in chosen], ledger(trajectory)),

@@ -18,6 +18,7 @@ from egs_warp.locomotion.rollout import REST_FRAMES, roll_out
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.motions.fall import FALLEN_TILT, FALLEN_TIME, FallWatch
 from egs_warp.motions.follow import Follow
+from egs_warp.motions.get_up import GetUpPhase
 from egs_warp.motions.keyframes import Key, Quantity
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence, Part
@@ -85,6 +86,20 @@ def test_a_fallen_body_is_asked_for_nothing(made: CoarseCreature) -> None:
     assert len(watch.objectives(made.start, None, DT)) == 1
     seen(made, watch, degrees=90.0, load=1.0, seconds=1.0)
     assert watch.objectives(made.start, None, DT) == []
+
+
+def test_a_body_that_gets_up_is_not_watched_meanwhile(made: CoarseCreature) -> None:
+    """The motion that fell is marked, getting up takes its place, and only its giving up is a fall."""
+    sequence = MotionSequence(made.place, [Part("stand", {}, cast(Any, Stands))])
+    watch = FallWatch(sequence, made.place, gets_up=True)
+    seen(made, watch, degrees=90.0, load=1.0, seconds=1.0)
+    assert watch.fallen is None and not watch.finished
+    fell, get_up = sequence.done
+    assert fell.fell == "tilted by 90 degrees at 0.17 s" and not fell.got_up and get_up.name == "get up"
+    assert sequence.time_left(1.0, [5.0]) > 0.0 and sequence.not_begun() == []
+    get_up.motion.phase = GetUpPhase.GIVEN_UP  # type: ignore[attr-defined]
+    watch.objectives(replace(made.start, time=1.1), cast(Any, SimpleNamespace()), DT)
+    assert watch.fallen == fell.fell and watch.finished
 
 
 def test_keys_may_tip_the_body(made: CoarseCreature) -> None:

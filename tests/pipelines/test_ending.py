@@ -28,8 +28,9 @@ def reached(distance: float = 0.0, turn: float = 0.0) -> Reached:
     return Reached(distance, 0.1, turn, 0.0, 0.0)
 
 
-def entry(*, resting: bool = True, **asked: float) -> Any:
-    return cast(Any, SimpleNamespace(asked=asked, motion=SimpleNamespace(resting=resting)))
+def entry(*, resting: bool = True, fell: str | None = None, got_up: bool = False, **asked: float) -> Any:
+    motion = SimpleNamespace(resting=resting)
+    return cast(Any, SimpleNamespace(asked=asked, motion=motion, fell=fell, got_up=got_up))
 
 
 @pytest.mark.parametrize(
@@ -46,6 +47,14 @@ def entry(*, resting: bool = True, **asked: float) -> Any:
             ["fallen: no progress, heading 8 of -90 degrees"],
         ),
         (Ending(), entry(heading_degrees=-90.0, distance=0.0), reached(0.0, -9.1), True, State.DONE, []),
+        (
+            *(Ending(), entry(resting=False, fell="tilted", got_up=True), reached(), False, State.GOT_UP),
+            ["fallen: tilted; it got up again"],
+        ),
+        (
+            *(Ending("tilted"), entry(resting=False, fell="tilted"), reached(), False, State.FALLEN),
+            ["fallen: tilted; it did not get up"],
+        ),
         (Ending("tilted"), entry(resting=False), reached(), True, State.FALLEN, ["fallen: tilted"]),
         (Ending("tilted"), entry(), reached(), False, State.DONE, []),
         (
@@ -64,7 +73,7 @@ def test_a_run_ends_in_the_worst_state_of_its_motions() -> None:
     assert State.worst(()) is State.DONE
     assert State.worst((State.FALLEN, State.DONE)) is State.FALLEN
     assert State.worst((State.FALLEN, State.STOPPED, State.CUT_OFF)) is State.STOPPED
-    assert [state.bad for state in State] == [False, False, True, True]
+    assert [state.bad for state in State] == [False, False, False, True, True]
 
 
 @pytest.mark.parametrize("after", [0, 3, "fall"])
@@ -84,7 +93,7 @@ def test_a_run_that_stops_or_falls_writes_all_of_its_files(
         monkeypatch.setattr(FallWatch, "_lies", lambda *_: "tilted by 90 degrees")
     write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=1000, device="cpu").cloud)
     out = tmp_path / "out"
-    flags = ["--up", "z", "--size", "32", "--motion", "jump, twist", "--out", str(out)]
+    flags = ["--up", "z", "--size", "32", "--motion", "jump, twist", "--no-get-up", "--out", str(out)]
     assert cli.main(["animate", str(tmp_path / "pawn.ply"), *flags]) == 3
     said = capsys.readouterr().out
     state = "fallen" if after == "fall" else "stopped"

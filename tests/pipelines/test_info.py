@@ -81,7 +81,9 @@ def snake() -> GaussianCloud:
 def test_what_lies_has_no_feet_and_is_drawn(tmp_path: Path) -> None:
     info = look_into(snake(), up=np.array([0.0, 0.0, 1.0]), nodes=300)
     assert info.feet == () and info.base is Base.LONG
-    assert "stands   on its length: it has no feet" in info.lines()
+    assert "stands   on its length: it crawls" in info.lines()
+    assert info.motions()["walk"] is None and info.motions()["turn"] is None
+    assert abs(info.front.direction[0]) > 0.99 and "the body lies along it" in str(info.front.reason)
     draw_info(tmp_path / "info.png", info)
     assert (tmp_path / "info.png").stat().st_size > 20_000
 

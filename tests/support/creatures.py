@@ -38,15 +38,18 @@ def coarse_creature(
     strength: float = 4.0,
     settled: bool = True,
     field: HeightField | None = None,
+    all_round: bool = False,
 ) -> CoarseCreature:
     """A body of ``mesh`` on its lowest nodes, facing ``forward`` (3,); ``up`` (3,) is against gravity. On ``field`` in
-    place of the floor it may stand on all of its base."""
+    place of the floor it may stand on all of its base, ``all_round`` on any node of its surface."""
     body = make_body(mesh, FLOOR, up=up, sag=sag, device="cpu")
     muscles = automatic_muscles(
         mesh, UP, body_weight=body.weight, height=body.height, young_modulus=body.young_modulus, strength=strength
     )
     places = mesh.nodes[mesh.nodes[:, 2] == 0.0]
-    if field is not None:
+    if all_round:
+        places = mesh.nodes[np.unique(mesh.boundary_faces())]
+    elif field is not None:
         sides = [np.linspace(low, high, 11) for low, high in zip(places.min(axis=0), places.max(axis=0), strict=True)]
         places = np.stack(np.meshgrid(*sides[:2], [0.0]), axis=-1).reshape(-1, 3)
     soles = embed_points(mesh, places, device="cpu")

@@ -95,3 +95,24 @@ def figure() -> TetMesh:
         return legs | trunk | arms
 
     return carved((1.6, 0.2, 1.4), 0.1, keep)
+
+
+def ball_mesh(cells: int = 4) -> TetMesh:
+    """A ball of diameter 1 on z = 0: a cube of so many cells each way, drawn out smoothly to a ball."""
+    cube = box_mesh((cells, cells, cells), (2.0, 2.0, 2.0))
+    x, y, z = (cube.nodes - [0.0, 0.0, 1.0]).T
+    squares = x * x, y * y, z * z
+
+    def drawn(along: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return along * np.sqrt(1.0 - 0.5 * a - 0.5 * b + a * b / 3.0)
+
+    nodes = np.stack(
+        [drawn(x, squares[1], squares[2]), drawn(y, squares[2], squares[0]), drawn(z, squares[0], squares[1])], axis=1
+    )
+    nodes = 0.5 * nodes
+    return TetMesh(nodes - [0.0, 0.0, nodes[:, 2].min()], cube.tets)
+
+
+def worm_mesh(cells: int = 14) -> TetMesh:
+    """A bar on z = 0, 1 high and wide, along x: longer than three times that."""
+    return box_mesh((cells, 2, 2), (0.5 * cells, 1.0, 1.0))

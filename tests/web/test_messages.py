@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from egs_warp.motions.command import Drive
 from egs_warp.web.messages import (
     Cancel,
     Change,
@@ -18,6 +19,7 @@ from egs_warp.web.messages import (
     Record,
     Release,
     StandUp,
+    Steer,
     Step,
     TellScript,
     read_message,
@@ -40,6 +42,8 @@ def _read(**message: Any) -> Message:
         ({"type": "set", "sag": 0.02, "friction": 0}, Change(friction=0.0, sag=0.02)),
         ({"type": "pause", "on": True}, Pause(True)),
         ({"type": "step"}, Step()),
+        ({"type": "drive", "forward": 0.1, "turn": -0.2}, Steer(Drive(0.1, 0.0, -0.2))),
+        ({"type": "drive"}, Steer(Drive())),
         ({"type": "cancel"}, Cancel()),
         ({"type": "stand"}, StandUp()),
         ({"type": "record", "on": False}, Record(False)),
@@ -64,6 +68,7 @@ def test_motions_are_those_of_scripts():
         ({"type": ["go"]}, r"type \"\['go'\]\""),
         ({"type": "fly"}, "type 'fly'"),
         ({"type": "step", "count": 3}, "step has no 'count'"),
+        ({"type": "drive", "forward": 3}, "forward: give a number from -2 to 2"),
         ({"type": "motion"}, "text: give motions in at most 200"),
         ({"type": "motion", "text": "hop, " * 100}, "text: give motions in at most 200"),
         ({"type": "motion", "text": "fly"}, "unknown motion 'fly'"),

@@ -50,10 +50,16 @@ def test_one_that_is_thrown_over_lies_relaxed_and_stands_up_when_told(tmp_path: 
     lying[:, 2] -= lying[:, 2].min()
     session.state = BodyState(lying, np.tile([0.0, 0.0, -0.2], (len(lying), 1)), session.state.time)
     played.until(lambda: session.steering.doing == "fallen", most=5)
-    assert played.told == ["it has fallen; Backspace stands it up again"]
+    assert played.told == ["it has fallen; tell it to get up, or Backspace stands it up again"]
     played.ask("motion", text="jump")
     played.step(10)
     assert played.session.steering.doing == "fallen" and played.session.steering.queued is None
+    played.ask("motion", text="get up")
+    played.step()
+    assert played.session.steering.doing == "get up"
+    assert [entry.name for entry in session.steering.begun] == ["get up"]
+    played.step(10)
+    assert played.session.steering.doing == "get up" and len(played.told) == 1
     played.ask("stand")
     np.testing.assert_allclose(played.session.state.positions, played.session.creature.start.positions)
     played.step(5)

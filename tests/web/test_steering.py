@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from egs_warp.errors import UserError
+from egs_warp.motions.command import Drive
+from egs_warp.motions.drive import Driven
 from egs_warp.motions.script import motion
 from egs_warp.motions.stance import sole_shares
 from egs_warp.pipelines.creature import first_place
@@ -32,6 +34,34 @@ def test_what_is_asked_meanwhile_takes_the_place_of_what_was_to_come(tmp_path: P
     played.step()
     assert (played.session.steering.doing, played.session.steering.queued) == ("twist", None)
     assert [entry.name for entry in played.session.steering.begun] == ["jump", "twist"]
+
+
+def test_it_is_driven_until_something_else_is_asked(tmp_path: Path):
+    """A command waits for the motion that goes on; the next command, or motion, takes its place."""
+    played = Played(coarse_pawn(), tmp_path)
+    steering = played.session.steering
+    played.ask("drive", forward=0.1)
+    assert steering.queued == "drive" and not steering.idle
+    played.step(2)
+    driven = steering._act.motion
+    assert steering.doing == "drive" and steering.queued is None and isinstance(driven, Driven)
+    assert driven.command == Drive(0.1) and steering.driven == [0.0] and steering.begun == []
+    played.ask("drive", turn=0.1)
+    played.step()
+    assert driven.command == Drive(turn=0.1) and steering._act.motion is driven
+    played.ask("motion", text="jump 0 0.1")
+    played.step()
+    assert driven.command.stands and (steering.doing, steering.queued) == ("drive", "jump")
+
+
+@pytest.mark.slow
+def test_what_was_driven_stands_once_it_is_told_to(tmp_path: Path):
+    played = Played(coarse_pawn(), tmp_path)
+    played.ask("drive", forward=0.1)
+    played.step(60)
+    played.ask("drive")
+    played.until_idle()
+    assert played.session.steering.doing == "stand" and played.told == []
 
 
 def test_a_motion_that_the_body_cannot_do_is_told(tmp_path: Path):

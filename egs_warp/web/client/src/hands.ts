@@ -19,6 +19,14 @@ export function motionOf(action: Action, walks: boolean): string {
   }[action];
 }
 
+/** How it is driven while a key is held: sqrt(g H), radians in sqrt(H / g); as fast as it can where that is less. */
+const DRIVES: Partial<Record<Action, { forward?: number; turn?: number }>> = {
+  forward: { forward: 0.3 },
+  back: { forward: -0.3 },
+  left: { turn: 0.3 },
+  right: { turn: -0.3 },
+};
+
 const KEYS: Record<string, Action> = {
   ArrowUp: "forward",
   KeyW: "forward",
@@ -70,7 +78,7 @@ export class Hands {
   release(source: string): void {
     if (this.held?.source !== source) return;
     // What was asked for by holding on, beyond the first, is not to be done any more.
-    if (this.held.again) this.source.send({ type: "cancel" });
+    if (this.held.again) this.source.send({ type: this.drives(this.held.action) ? "drive" : "cancel" });
     this.held = undefined;
   }
 
@@ -95,9 +103,19 @@ export class Hands {
     this.lookAtPad();
     const now = performance.now() / 1000;
     const { held } = this;
+    const drive = held === undefined ? undefined : this.drives(held.action);
+    if (held !== undefined && drive !== undefined) {
+      if (!held.again && now - held.since >= HELD) this.source.send({ type: "drive", ...drive });
+      held.again ||= now - held.since >= HELD;
+      return;
+    }
     if (held === undefined || now - held.since < HELD || this.queued !== null || now - this.sent < 0.3) return;
     held.again = true;
     this.ask(held.action);
+  }
+
+  private drives(action: Action): { forward?: number; turn?: number } | undefined {
+    return this.walks ? DRIVES[action] : undefined;
   }
 
   private ask(action: Action): void {

@@ -1,0 +1,144 @@
+"""Driven bodies: the way is made as it goes, no pace is longer than may be, and told to stand they stand."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from egs_warp.errors import ArgumentError, UserError
+from egs_warp.fem.body import DEFAULT_SAG
+from egs_warp.locomotion.stepper import StepReport
+from egs_warp.motions.command import Drive, DrivePlan, read_drive
+from egs_warp.motions.drive import Driven, DrivenBy, DrivenWalk, onward
+from egs_warp.motions.route import Pace
+from egs_warp.motions.stand import Stand
+from egs_warp.motions.walk import WalkPhase
+from tests.support.creatures import CoarseCreature, coarse_creature
+from tests.support.meshes import ball_mesh, coarse_stool, worm_mesh
+from tests.support.places import DT, FORWARD
+
+PACE = Pace(0.2, 0.25, sideways=0.5)
+_SPEED = st.floats(-2.0, 2.0)
+
+
+@cache
+def stool() -> CoarseCreature:
+    return coarse_creature(coarse_stool(), forward=FORWARD, sag=DEFAULT_SAG)
+
+
+@given(_SPEED, _SPEED, _SPEED, st.floats(0.01, 3.0))
+def test_no_pace_is_longer_than_may_be(forward: float, sideways: float, turn: float, time: float) -> None:
+    """What is asked goes as far as it may, in the mix that was asked."""
+    command, start = Drive(forward, sideways, turn), np.array([0.3, -0.2, 0.7])
+    change = onward(start, command, time, PACE, unit=0.5, height=0.8) - start
+    middle = start[2] + 0.5 * change[2]
+    ahead = np.cos(middle) * change[0] + np.sin(middle) * change[1]
+    left = np.cos(middle) * change[1] - np.sin(middle) * change[0]
+    effort = np.hypot(ahead, left / PACE.sideways) / PACE.length + abs(change[2]) / PACE.turn
+    assert effort <= 1.0 + 1e-9
+    asked = time / 0.5 * np.array([0.8 * forward, 0.8 * sideways, turn])
+    share = min(1.0, 1.0 / max(np.hypot(asked[0], asked[1] / 0.5) / 0.2 + abs(asked[2]) / 0.25, 1e-12))
+    assert [ahead, left, change[2]] == pytest.approx(share * asked, abs=1e-9)
+
+
+def test_a_base_goes_to_no_side() -> None:
+    change = onward(np.zeros(3), Drive(0.1, 0.1, 0.0), 1.0, Pace(1.0, 1.0), unit=1.0, height=1.0)
+    assert change == pytest.approx([0.1, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("value", [float("nan"), 2.1, -3.0])
+def test_what_is_no_speed_is_refused(value: float) -> None:
+    with pytest.raises(ArgumentError, match=r"sideways .*: give a speed from -2 to 2"):
+        Drive(sideways=value)
+
+
+def test_a_file_of_speeds_is_read(tmp_path: Path) -> None:
+    file = tmp_path / "speeds.csv"
+    file.write_text("time,forward,sideways,turn\n# ahead\n0,0.1,0,0\n1.5, 0.1,0,0.2\n3,0,0,0\n")
+    plan = read_drive(file)
+    assert plan.seconds == 3.0 and plan.at(0.0) == plan.at(1.4) == Drive(0.1)
+    assert plan.at(2.0) == Drive(0.1, 0.0, 0.2) and plan.at(9.0).stands
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("0,0.1,0\n", "line 1: '0,0.1,0': give four numbers, time,forward,sideways,turn"),
+        ("1,0,0,0\n0.5,0,0,0\n", "line 2: time 0.5: give seconds that grow, from 0 to 60"),
+        ("0,9,0,0\n", "line 1: forward 9.0: give a speed from -2 to 2"),
+        ("0,0.1,0,0\n", "commands: the last one does not stand; end with 0,0,0"),
+        ("\n", "no commands; give lines of four numbers, time,forward,sideways,turn"),
+    ],
+)
+def test_a_bad_file_is_told_in_a_line(tmp_path: Path, text: str, told: str) -> None:
+    file = tmp_path / "speeds.csv"
+    file.write_text(text)
+    with pytest.raises(UserError) as error:
+        read_drive(file)
+    assert told in str(error.value) and "\n" not in str(error.value)
+
+
+def test_the_way_is_made_from_the_command_of_the_moment() -> None:
+    """What has been gone stays, what is to come turns with the command, and told to stand it closes its feet."""
+    walk = DrivenWalk(stool().place, Drive(0.1))
+    before = walk.places.copy()
+    assert walk.gait.paces == len(before) - 1 > 2 and np.all(np.diff(before[:, 0]) > 0.0) and not before[:, 2].any()
+    walk.command = Drive(0.1, 0.0, 0.1)
+    walk._plan_swing(2)
+    assert walk.places[:3] == pytest.approx(before[:3]) and walk.places[3, 2] > 0.0
+    walk.command = Drive()
+    walk._plan_swing(3)
+    assert len(walk.places) == 4 and walk.gait.swings == 3 + len(walk.gait.groups) - 1
+    walk.command = Drive(-0.1)
+    walk._plan_swing(4)
+    assert walk.places[4] == pytest.approx(walk.places[3]) and walk.places[5, 0] < walk.places[4, 0]
+
+
+def test_a_quick_command_makes_the_gait_quicker() -> None:
+    slow, quick = (DrivenWalk(stool().place, Drive(speed)) for speed in (0.02, 1.0))
+    assert quick.gait.swing_time == pytest.approx(slow.gait.swing_time / 1.6)
+    longest = np.linalg.norm(np.diff(quick.places[:, :2], axis=0), axis=1)
+    assert longest == pytest.approx(quick._pace.length)
+
+
+@pytest.mark.slow
+def test_a_stool_is_driven_and_stands_again() -> None:
+    """Ahead for a second and a half, the first half second of which it shifts its weight: it comes as far as its speed
+    says, within a pace, and stands."""
+    made, speed = stool(), 0.06
+    plan = DrivePlan((0.0, 1.5), (Drive(speed), Drive()))
+    driven = DrivenBy(made.place, plan)
+    state, memory, reports = made.start, made.stepper.initial_memory(), list[StepReport]()
+    body = made.place.body
+    for _ in range(420):
+        wishes = driven.objectives(state, reports[-1] if reports else None, DT)
+        state, memory, fresh = made.stepper.advance(state, memory, wishes, DT)
+        reports += fresh
+        if driven.resting:
+            break
+    assert driven.resting
+    moved = body.centre_of_mass(state.positions) - body.centre_of_mass(made.start.positions)
+    pace = speed * 1.72 * body.height
+    assert moved[0] == pytest.approx(speed * body.speed_unit * (1.5 - 1.5 * body.time_unit), abs=pace)
+    assert abs(moved[1]) < 0.03
+    assert moved[2] == pytest.approx(0.0, abs=0.03)
+
+
+def test_every_kind_of_body_can_be_driven() -> None:
+    ball = coarse_creature(ball_mesh(), forward=FORWARD, all_round=True)
+    worm = coarse_creature(worm_mesh(), forward=FORWARD)
+    for made in (stool(), ball, worm):
+        driven = Driven(made.place)
+        assert driven.resting and isinstance(driven._motion, Stand)
+        driven.command = Drive(0.1)
+        assert not driven.resting
+        assert driven.objectives(made.start, None, DT) and not isinstance(driven._motion, Stand)
+    walk = Driven(stool().place)
+    walk.command = Drive(0.1)
+    walk.objectives(stool().start, None, DT)
+    assert isinstance(walk._motion, DrivenWalk) and walk._motion.phase is WalkPhase.SHIFT

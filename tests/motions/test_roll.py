@@ -1,0 +1,126 @@
+"""A ball rolls: it comes where it is told without slipping, and goes on from whatever side it has come to lie on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+
+from egs_warp.contact.terrain import step
+from egs_warp.errors import UserError
+from egs_warp.fem.body import DEFAULT_SAG, BodyState
+from egs_warp.geometry.plane import Plane
+from egs_warp.locomotion.audit import audit
+from egs_warp.locomotion.recorder import Recorder
+from egs_warp.locomotion.stepper import StepReport
+from egs_warp.locomotion.trajectory import Trajectory, measure
+from egs_warp.motions.fall import FallWatch
+from egs_warp.motions.feet import Base
+from egs_warp.motions.going import going, going_round
+from egs_warp.motions.roll import Roll
+from egs_warp.motions.route import along, straight
+from egs_warp.motions.sequence import MotionSequence, Part, Place
+from egs_warp.motions.turn import Turn
+from tests.support.creatures import CoarseCreature, coarse_creature
+from tests.support.meshes import UP, ball_mesh
+from tests.support.places import DT, FORWARD
+
+WAY = np.array([[0.3, 0.2]])
+
+
+@cache
+def ball() -> CoarseCreature:
+    return coarse_creature(ball_mesh(), forward=FORWARD, sag=DEFAULT_SAG, all_round=True)
+
+
+@dataclass(frozen=True)
+class Rolled:
+    """What came of it."""
+
+    roll: Roll
+    trajectory: Trajectory
+    reports: list[StepReport]
+    end: BodyState
+    fallen: str | None
+
+
+@cache
+def rolled() -> Rolled:
+    """Past a point ahead and to the left."""
+    made = ball()
+    sequence = MotionSequence(made.place, [Part("walk to", {}, lambda place: going(place, along(WAY), 0.1))])
+    watch = FallWatch(sequence, made.place)
+    state, memory, reports = made.start, made.stepper.initial_memory(), []
+    for _ in range(260):
+        wishes = watch.objectives(state, reports[-1] if reports else None, DT)
+        state, memory, fresh = made.stepper.advance(state, memory, wishes, DT)
+        reports += fresh
+        if watch.finished:
+            break
+    recorder = Recorder(made.stepper.body, made.stepper.muscles, made.stepper.geometry, made.start, 0.0, drag=0.0)
+    recorder.add(reports)
+    roll = sequence.done[0].motion
+    assert isinstance(roll, Roll) and roll.resting
+    return Rolled(roll, recorder.trajectory(), reports, state, watch.fallen)
+
+
+def test_a_ball_is_told_from_what_stands() -> None:
+    place = ball().place
+    assert place.base() is Base.ROUND
+    assert isinstance(going(place, straight(1.0), 0.1), Roll) and isinstance(going_round(place, 1.0, 0.1), Turn)
+
+
+def test_a_ball_that_has_turned_over_is_still_one() -> None:
+    """Told by its shape as it lies, not by the side that it once stood on."""
+    made = ball()
+    turn = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    com = made.place.body.centre_of_mass(made.place.standing)
+    report = _report(made)
+    over = made.place.after(com + (made.place.standing - com) @ turn.T, report)
+    assert over.base() is Base.ROUND and over.ground.axes == pytest.approx(made.place.ground.axes)
+
+
+def test_a_ball_that_has_turned_about_up_faces_elsewhere() -> None:
+    made = ball()
+    com = made.place.body.centre_of_mass(made.place.standing)
+    turned = com + (made.place.standing - com) @ made.place.ground.turn(0.6).T
+    ahead = made.place.after(turned, _report(made)).ground.axes[0]
+    assert ahead == pytest.approx([np.cos(0.6), np.sin(0.6), 0.0], abs=1e-6)
+
+
+def _report(made: CoarseCreature) -> StepReport:
+    _, _, reports = made.stepper.advance(made.start, made.stepper.initial_memory(), [], DT)
+    return reports[-1]
+
+
+def test_a_step_in_its_way_is_refused() -> None:
+    place = ball().place
+    wall = (step(Plane(UP, 0.0), 0.5 * FORWARD, FORWARD, 0.2),)
+    blocked = Place(place.body, place.ground, place.standing, place.touching, DT, wall)
+    with pytest.raises(UserError, match="the way leads over a step"):
+        going(blocked, straight(1.0), 0.1)
+
+
+@pytest.mark.slow
+def test_a_ball_rolls_to_its_point_without_slipping() -> None:
+    """Within 0.03, by an angle of way over radius, and no one takes that for a fall."""
+    done = rolled()
+    local = done.roll.ground.local(done.end.positions)
+    com = done.roll.body.centre_of_mass(local)
+    assert com[:2] == pytest.approx(WAY[0], abs=0.03) and done.fallen is None
+    way = float(np.linalg.norm(WAY))
+    assert np.radians(done.roll.reached(done.trajectory, 0, -1).rolled_degrees) == pytest.approx(
+        way / float(com[2]), rel=0.1
+    )
+    assert measure(done.trajectory).airborne_frames == 0.0
+
+
+@pytest.mark.slow
+def test_every_step_of_a_roll_is_audited() -> None:
+    done = rolled()
+    found = audit(done.trajectory, newton_unconverged=sum(not report.converged for report in done.reports))
+    assert found.momentum_residual < 1e-5 and found.angular_momentum_residual < 1e-4 and found.penetration < 0.01
+    assert found.cone_violation < 1e-4 and found.complementarity_gap < 1e-4 and found.inverted_elements == 0
+    assert found.energy_residual < 1e-6 and found.contact_velocity < 1e-6
