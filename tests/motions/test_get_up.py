@@ -84,14 +84,14 @@ def test_it_gives_up_after_its_throws() -> None:
 @cache
 def risen() -> tuple[FallWatch, list[StepReport], BodyState, BodyState]:
     """Laid on its side while it was to stand for a second, and then to stand for another."""
-    made, start = block(), lying(90.0)
+    made, start = block(), lying(80.0)
     parts = [
         Part("stand", {}, lambda place: StandFor(place, 1.0)),
         Part("stand", {}, lambda place: StandFor(place, 0.2)),
     ]
     watch = FallWatch(MotionSequence(made.place, parts), made.place, gets_up=True)
     state, memory, reports = start, made.stepper.initial_memory(), []
-    for _ in range(500):
+    for _ in range(1000):
         wishes = watch.objectives(state, reports[-1] if reports else None, DT)
         state, memory, fresh = made.stepper.advance(state, memory, wishes, DT)
         reports += fresh

@@ -227,7 +227,7 @@ def test_a_key_makes_it_jump_and_the_take_says_so(chromium: Any, session: Sessio
 
 @in_browser
 @pytest.mark.parametrize(
-    ("pressed", "axes", "doing"), [([0], [0, 0], "jump"), ([], [-1, 0.2], "turn")], ids=["button", "stick"]
+    ("pressed", "axes", "doing"), [([0], [0, 0], "jump"), ([], [-1, 0.2], "drive")], ids=["button", "stick"]
 )
 def test_a_gamepad_steers_it(chromium: Any, session: Session, pressed: list[int], axes: list[float], doing: str):
     with _watched(chromium, session) as page:
