@@ -157,7 +157,7 @@ def test_tiles_left_out_show_the_background(device: str) -> None:
     pixels = np.kron(mask, np.ones((16, 16), bool))[:40, :70]
     whole = render_gaussians(cloud, camera, background=(0.1, 0.5, 0.2), geometry=True)
     part = render_gaussians(cloud, camera, background=(0.1, 0.5, 0.2), geometry=True, mask=mask)
-    behind = np.float32([0.1, 0.5, 0.2])
+    behind = np.array([0.1, 0.5, 0.2], np.float32)
     assert np.array_equal(part.colour.numpy(), np.where(pixels[:, :, None], whole.colour.numpy(), behind))
     assert whole.median_depth is not None and part.median_depth is not None
     assert whole.normal is not None and part.normal is not None
