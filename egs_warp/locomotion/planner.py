@@ -168,7 +168,7 @@ class StageClock:
     """Milliseconds of each stage of a step."""
 
     milliseconds: dict[str, float] = field(default_factory=dict)
-    _last: float = field(default_factory=lambda: time.perf_counter())
+    _last: float = field(default_factory=time.perf_counter)
 
     def lap(self, name: str) -> None:
         """Since the lap before was ``name``."""
