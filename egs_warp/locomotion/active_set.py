@@ -13,7 +13,7 @@ import scipy.linalg as dense
 import warp as wp
 
 from egs_warp.kernels.locomotion import active_set as kernels
-from egs_warp.launching import empty
+from egs_warp.launching import empty_together
 from egs_warp.precision import real
 
 _PIVOTS = 600
@@ -112,11 +112,11 @@ def optimum_near(
     program.most = _HOPELESS * reduced.worth
     side = np.where(low & np.isfinite(lower), 1, np.where(high & np.isfinite(upper), -1, 0)).astype(np.int32)
     search.side = wp.array(side, dtype=int, device="cpu", copy=False)
-    search.active = empty(n, int, "cpu")
-    search.factor = empty((n, n), real, "cpu")
-    for name, count in (("at", m), ("pulls", n), ("rates", n), ("across", n), ("outside", n)):
-        setattr(search, name, empty(count, real, "cpu"))
-    ended = empty(1, int, "cpu")
+    each = ((n, real),) * 4
+    search.active, ended, search.at, search.factor, *vectors = empty_together(
+        "cpu", (n, int), (1, int), (m, real), ((n, n), real), *each
+    )
+    search.pulls, search.rates, search.across, search.outside = vectors
     wp.launch(kernels.optimum_kernel, 1, inputs=[program, _PIVOTS, search], outputs=[ended], device="cpu")
     how = int(ended.numpy()[0])
     multipliers = np.zeros(m)
