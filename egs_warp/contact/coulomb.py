@@ -9,7 +9,7 @@ import warp as wp
 
 from egs_warp.kernels.contact import coulomb as kernels
 from egs_warp.launching import empty_together
-from egs_warp.precision import real
+from egs_warp.precision import Vec4, real
 
 
 def coulomb_forces(
@@ -33,8 +33,8 @@ def coulomb_forces(
     if count == 0:
         return start, 0.0
     contacts, newton = contacts_of(delassus, free_velocity, shift, friction), kernels.Newton()
-    each, matrix = ((3 * count, real),) * 5, ((3 * count, 3 * count + 1), real)
-    *vectors, newton.unknowns, newton.matrix = empty_together("cpu", *each, (3 * count, int), matrix)
+    each, rows, matrix = ((3 * count, real),) * 5, (3 * count, int), ((3 * count, (3 * count + 4) // 4), Vec4)
+    *vectors, newton.unknowns, newton.pivots, newton.matrix = empty_together("cpu", *each, rows, rows, matrix)
     newton.velocities, newton.values, newton.step, newton.change, newton.best = vectors
     forces = np.array(start, dtype=np.float64, order="C")
     residual = np.empty(1)

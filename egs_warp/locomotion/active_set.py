@@ -14,7 +14,7 @@ import warp as wp
 
 from egs_warp.kernels.locomotion import active_set as kernels
 from egs_warp.launching import empty_together
-from egs_warp.precision import real
+from egs_warp.precision import Vec4, real
 
 _PIVOTS = 600
 _BROKEN = 1e-8
@@ -92,6 +92,14 @@ class Optimum:
     """Whether any point satisfies the bounds; else ``x`` means nothing."""
 
 
+def by_fours(values: np.ndarray) -> wp.array:
+    """``values`` (..., k) with zeros to the next four, as vectors of four."""
+    count = values.shape[-1]
+    padded = np.zeros((*values.shape[:-1], -(-count // 4), 4))
+    padded.reshape(*values.shape[:-1], -1)[..., :count] = values
+    return wp.array(padded, dtype=Vec4, device="cpu", copy=False)
+
+
 def optimum_near(
     reduced: ReducedRows, lower: np.ndarray, upper: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> Optimum | None:
@@ -100,23 +108,20 @@ def optimum_near(
     """
     m, n = reduced.rows.shape
     program, search = kernels.Program(), kernels.Search()
-    for name, value in (
-        ("rows", reduced.units),
-        ("products", reduced.products),
-        ("free", reduced.free / reduced.lengths),
-        ("lower", lower / reduced.lengths),
-        ("upper", upper / reduced.lengths),
-        ("slack", reduced.slack / reduced.lengths),
-    ):
-        setattr(program, name, wp.array(np.ascontiguousarray(value), dtype=real, device="cpu", copy=False))
+    program.rows, program.products = by_fours(reduced.units), by_fours(reduced.products)
+    program.free = by_fours(reduced.free / reduced.lengths)
+    program.lower, program.upper, program.slack = (
+        wp.array(value / reduced.lengths, dtype=real, device="cpu", copy=False)
+        for value in (lower, upper, reduced.slack)
+    )
     program.most = _HOPELESS * reduced.worth
     side = np.where(low & np.isfinite(lower), 1, np.where(high & np.isfinite(upper), -1, 0)).astype(np.int32)
     search.side = wp.array(side, dtype=int, device="cpu", copy=False)
-    each = ((n, real),) * 4
-    search.active, ended, search.at, search.factor, *vectors = empty_together(
-        "cpu", (n, int), (1, int), (m, real), ((n, n), real), *each
+    fours = (-(-m // 4), Vec4), (-(-n // 4), Vec4)
+    search.active, ended, search.factor, search.at, search.outside, *vectors = empty_together(
+        "cpu", (n, int), (1, int), ((n, n), real), *fours, *((n, real),) * 3
     )
-    search.pulls, search.rates, search.across, search.outside = vectors
+    search.pulls, search.rates, search.across = vectors
     wp.launch(kernels.optimum_kernel, 1, inputs=[program, _PIVOTS, search], outputs=[ended], device="cpu")
     how = int(ended.numpy()[0])
     multipliers = np.zeros(m)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from egs_warp.precision import real
+from egs_warp.precision import Vec4, real
 
 wp.set_module_options({"enable_backward": False})
 
@@ -43,9 +43,11 @@ class Newton:
     """(3n,) of the velocities by a whole step."""
     best: wp.array[real]
     unknowns: wp.array[int]
-    """(3n,) rows that the equations do not give at once, then columns with a pivot."""
-    matrix: wp.array2d[real]
-    """(3n, 3n + 1) their linear equations, right sides last."""
+    """(3n,) rows that the equations do not give at once."""
+    pivots: wp.array[int]
+    """(3n,) in which of their columns each row has its pivot."""
+    matrix: wp.array2d[Vec4]
+    """(3n, >= (3n + 1) / 4) their linear equations, right sides last, columns by fours: a processor takes them at once."""
 
 
 @wp.func
@@ -190,17 +192,30 @@ def write_equations(contacts: Contacts, forces: wp.array[real], newton: Newton):
         newton.change[row] = newton.change[row] + own
         for c in range(3 * count):
             right -= newton.change[c] * newton.step[c]
-        for b in range(unknowns):
-            newton.matrix[a, b] = newton.change[newton.unknowns[b]]
-        newton.matrix[a, unknowns] = right
+        write_row(newton.change, newton.unknowns, unknowns, right, newton.matrix, a)
     return unknowns
 
 
 @wp.func
-def subtract_row(matrix: wp.array2d[real], row: int, factor: real, other: int, first: int, last: int):
-    """Columns ``first`` to ``last`` of ``row``, less ``factor`` times ``other``."""
-    for b in range(first, last + 1):
-        matrix[row, b] = matrix[row, b] - factor * matrix[other, b]
+def entry(matrix: wp.array2d[Vec4], row: int, column: int):
+    """Of a matrix by fours."""
+    return matrix[row, column / 4][column % 4]
+
+
+@wp.func
+def write_row(
+    values: wp.array[real], columns: wp.array[int], count: int, right: real, matrix: wp.array2d[Vec4], row: int
+):
+    """The ``count`` ``columns`` of ``values`` and ``right`` as ``row``."""
+    for quad in range((count + 4) / 4):
+        four = Vec4()
+        for k in range(4):
+            b = 4 * quad + k
+            if b < count:
+                four[k] = values[columns[b]]
+            if b == count:
+                four[k] = right
+        matrix[row, quad] = four
 
 
 @wp.func
@@ -209,45 +224,37 @@ def solve_equations(unknowns: int, newton: Newton):
     bounded. The step has them in the end."""
     rank = int(0)
     largest = real(0.0)
+    quads = (unknowns + 4) / 4
     for j in range(unknowns):
         pivot = int(rank)
-        for a in range(rank, unknowns):
-            if wp.abs(newton.matrix[a, j]) > wp.abs(newton.matrix[pivot, j]):
-                pivot = a
         size = real(0.0)
-        if rank < unknowns:
-            size = wp.abs(newton.matrix[pivot, j])
+        for a in range(rank, unknowns):
+            candidate = wp.abs(entry(newton.matrix, a, j))
+            if candidate > size:
+                size = candidate
+                pivot = a
         if size > _SINGULAR * largest:
             largest = wp.max(largest, size)
             if pivot != rank:
-                for b in range(j, unknowns + 1):
-                    kept = newton.matrix[rank, b]
-                    newton.matrix[rank, b] = newton.matrix[pivot, b]
-                    newton.matrix[pivot, b] = kept
+                for quad in range(j / 4, quads):
+                    kept = newton.matrix[rank, quad]
+                    newton.matrix[rank, quad] = newton.matrix[pivot, quad]
+                    newton.matrix[pivot, quad] = kept
+            own = entry(newton.matrix, rank, j)
             for a in range(rank + 1, unknowns):
-                factor = newton.matrix[a, j] / newton.matrix[rank, j]
+                factor = entry(newton.matrix, a, j) / own
                 if factor != real(0.0):
-                    subtract_row(newton.matrix, a, factor, rank, j + 1, unknowns)
-                newton.matrix[a, j] = real(0.0)
+                    for quad in range(j / 4, quads):
+                        newton.matrix[a, quad] = newton.matrix[a, quad] - factor * newton.matrix[rank, quad]
+            newton.pivots[rank] = j
             rank += 1
-    row = int(rank)
-    for back in range(unknowns):
-        j = unknowns - 1 - back
-        # The last row whose pivot is this column: to the left of it, it has been cleared.
-        pivoted = int(0)
-        if row > 0:
-            pivoted = 1
-            if newton.matrix[row - 1, j] == real(0.0):
-                pivoted = 0
-            for b in range(j):
-                if newton.matrix[row - 1, b] != real(0.0):
-                    pivoted = 0
-        if pivoted == 1:
-            row -= 1
-            value = newton.matrix[row, unknowns]
-            for b in range(j + 1, unknowns):
-                value -= newton.matrix[row, b] * newton.step[newton.unknowns[b]]
-            newton.step[newton.unknowns[j]] = value / newton.matrix[row, j]
+    for back in range(rank):
+        row = rank - 1 - back
+        j = newton.pivots[row]
+        value = entry(newton.matrix, row, unknowns)
+        for b in range(j + 1, unknowns):
+            value -= entry(newton.matrix, row, b) * newton.step[newton.unknowns[b]]
+        newton.step[newton.unknowns[j]] = value / entry(newton.matrix, row, j)
 
 
 @wp.func

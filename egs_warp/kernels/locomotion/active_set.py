@@ -6,7 +6,7 @@ in the direction of its side s, z = R^T (s p), so all that is needed of R are it
 
 import warp as wp
 
-from egs_warp.precision import real
+from egs_warp.precision import Vec4, real
 
 wp.set_module_options({"enable_backward": False})
 
@@ -29,14 +29,14 @@ _DEPENDENT = wp.constant(real(1e-9))
 
 @wp.struct
 class Program:
-    """What is given."""
+    """What is given. Columns of matrices lie by fours, which a processor takes at once, zeros after the last."""
 
-    rows: wp.array2d[real]
+    rows: wp.array2d[Vec4]
     """(m, n) R."""
-    products: wp.array2d[real]
+    products: wp.array2d[Vec4]
     """(m, m) R R^T."""
-    free: wp.array[real]
-    """(m,) the rows at z = 0."""
+    free: wp.array[Vec4]
+    """(m,) by fours, the rows at z = 0."""
     lower: wp.array[real]
     upper: wp.array[real]
     slack: wp.array[real]
@@ -57,14 +57,14 @@ class Search:
     """(n,) their multipliers."""
     factor: wp.array2d[real]
     """(n, n) lower triangle L of their products, each in the direction of its side."""
-    at: wp.array[real]
-    """(m,) all rows."""
+    at: wp.array[Vec4]
+    """(m,) all rows, by fours."""
     rates: wp.array[real]
     """(n,) by how much each multiplier falls for one of the row that joins."""
     across: wp.array[real]
     """(n,) L^-1 of the products of the row that joins."""
-    outside: wp.array[real]
-    """(n,) what of the row that joins lies outside of those that hold."""
+    outside: wp.array[Vec4]
+    """(n,) by fours: what of the row that joins lies outside of those that hold."""
 
 
 @wp.func
@@ -73,6 +73,18 @@ def bound_of(program: Program, search: Search, row: int):
     if search.side[row] > 0:
         return program.lower[row]
     return program.upper[row]
+
+
+@wp.func
+def place_of(search: Search, row: int):
+    """Where ``row`` is."""
+    return search.at[row / 4][row % 4]
+
+
+@wp.func
+def product_of(program: Program, row: int, other: int):
+    """Of two rows."""
+    return program.products[row, other / 4][other % 4]
 
 
 @wp.func
@@ -99,16 +111,17 @@ def solve_upper(factor: wp.array2d[real], count: int, x: wp.array[real]):
 @wp.func
 def move_rows(program: Program, search: Search, row: int, by: real):
     """All rows where the multiplier of ``row`` is greater ``by``."""
-    for j in range(search.at.shape[0]):
-        search.at[j] = search.at[j] + by * program.products[row, j]
+    for quad in range(search.at.shape[0]):
+        search.at[quad] = search.at[quad] + by * program.products[row, quad]
 
 
 @wp.func
 def hold(program: Program, search: Search):
     """How many rows have a side, held at their bounds; -1 where that has no numbers."""
     count = int(0)
+    for quad in range(search.at.shape[0]):
+        search.at[quad] = program.free[quad]
     for row in range(search.side.shape[0]):
-        search.at[row] = program.free[row]
         if search.side[row] != 0:
             if count == search.active.shape[0]:
                 return -1
@@ -119,7 +132,7 @@ def hold(program: Program, search: Search):
         sign = real(search.side[row])
         for k in range(i + 1):
             other = search.active[k]
-            value = sign * real(search.side[other]) * program.products[row, other]
+            value = sign * real(search.side[other]) * product_of(program, row, other)
             if k == i:
                 value += _REDUNDANT
             for j in range(k):
@@ -130,7 +143,7 @@ def hold(program: Program, search: Search):
                 if not value > real(0.0):
                     return -1
                 search.factor[i, i] = wp.sqrt(value)
-        search.pulls[i] = sign * (bound_of(program, search, row) - program.free[row])
+        search.pulls[i] = sign * (bound_of(program, search, row) - program.free[row / 4][row % 4])
     solve_lower(search.factor, count, search.pulls)
     solve_upper(search.factor, count, search.pulls)
     for i in range(count):
@@ -148,7 +161,7 @@ def let_go_of_wrong(program: Program, search: Search, count: int):
     wrong = int(0)
     for i in range(count):
         row = search.active[i]
-        missed = wp.abs(search.at[row] - bound_of(program, search, row))
+        missed = wp.abs(place_of(search, row) - bound_of(program, search, row))
         if search.pulls[i] < -_PULLS * most or missed > _MISSED + program.slack[row]:
             search.side[row] = 0
             wrong += 1
@@ -158,7 +171,7 @@ def let_go_of_wrong(program: Program, search: Search, count: int):
 @wp.func
 def breach_of(program: Program, search: Search, row: int):
     """By how much more than it may ``row`` breaks its bounds, negative where it does not."""
-    at = search.at[row]
+    at = place_of(search, row)
     return wp.max(program.lower[row] - at, at - program.upper[row]) - program.slack[row]
 
 
@@ -168,7 +181,7 @@ def hold_broken(program: Program, search: Search):
     broken = int(0)
     for row in range(search.side.shape[0]):
         if search.side[row] == 0 and breach_of(program, search, row) > real(0.0):
-            search.side[row] = wp.where(search.at[row] < program.lower[row], 1, -1)
+            search.side[row] = wp.where(place_of(search, row) < program.lower[row], 1, -1)
             broken += 1
     return broken
 
@@ -219,42 +232,42 @@ def join(program: Program, search: Search, active: int, row: int):
     count = int(active)
     sign = int(-1)
     bound = program.upper[row]
-    if search.at[row] < program.lower[row]:
+    if place_of(search, row) < program.lower[row]:
         sign = 1
         bound = program.lower[row]
     towards = real(sign)
-    square = program.products[row, row]
+    square = product_of(program, row, row)
     pull = real(0.0)
     while True:
         for i in range(count):
             other = search.active[i]
-            value = towards * real(search.side[other]) * program.products[row, other]
+            value = towards * real(search.side[other]) * product_of(program, row, other)
             search.across[i] = value
         solve_lower(search.factor, count, search.across)
         for i in range(count):
             search.rates[i] = search.across[i]
         solve_upper(search.factor, count, search.rates)
-        for j in range(search.outside.shape[0]):
-            search.outside[j] = towards * program.rows[row, j]
+        for quad in range(search.outside.shape[0]):
+            search.outside[quad] = towards * program.rows[row, quad]
         part = real(wp.inf)
         first = int(-1)
         for i in range(count):
             other = search.active[i]
             rate = search.rates[i]
             share = real(search.side[other]) * rate
-            for j in range(search.outside.shape[0]):
-                search.outside[j] = search.outside[j] - share * program.rows[other, j]
+            for quad in range(search.outside.shape[0]):
+                search.outside[quad] = search.outside[quad] - share * program.rows[other, quad]
             if rate > real(0.0):
                 ends = wp.max(search.pulls[i], real(0.0)) / rate
                 if ends < part:
                     part = ends
                     first = i
         apart = real(0.0)
-        for j in range(search.outside.shape[0]):
-            apart += search.outside[j] * search.outside[j]
+        for quad in range(search.outside.shape[0]):
+            apart += wp.dot(search.outside[quad], search.outside[quad])
         whole = real(wp.inf)
         if apart > _DEPENDENT * square:
-            whole = towards * (bound - search.at[row]) / apart
+            whole = towards * (bound - place_of(search, row)) / apart
         step = wp.min(whole, part)
         if not step < real(wp.inf):
             return -1
@@ -287,7 +300,12 @@ def cost_of(program: Program, search: Search, count: int):
     cost = real(0.0)
     for i in range(count):
         row = search.active[i]
-        cost += real(0.5) * real(search.side[row]) * search.pulls[i] * (search.at[row] - program.free[row])
+        cost += (
+            real(0.5)
+            * real(search.side[row])
+            * search.pulls[i]
+            * (place_of(search, row) - program.free[row / 4][row % 4])
+        )
     return cost
 
 
