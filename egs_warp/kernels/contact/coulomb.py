@@ -47,7 +47,7 @@ class Newton:
     pivots: wp.array[int]
     """(3n,) in which of their columns each row has its pivot."""
     matrix: wp.array2d[Vec4]
-    """(3n, >= (3n + 1) / 4) their linear equations, right sides last, columns by fours: a processor takes them at once."""
+    """(3n, >= (3n + 1) / 4) their linear equations, right sides last, columns by fours: taken at once."""
 
 
 @wp.func
