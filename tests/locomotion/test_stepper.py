@@ -152,7 +152,7 @@ def test_a_body_bobs_as_asked() -> None:
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
 def test_a_gpu_s_factors_make_the_same_hop(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """30 steps in closed loop (10 on a CPU, where dense factors take their time), each with activations of its own, with
+    """30 steps in closed loop (10 on a CPU, where dense factors take their time), each with its own activations, with
     a GPU's kernels on a GPU: within 1e-8 H of sparse factors."""
     steps = 10 if device == "cpu" else 30
     dense_factors = pytest.importorskip("egs_warp.fem.dense_factors")
