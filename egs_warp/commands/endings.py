@@ -61,8 +61,11 @@ def one_line_errors(program: str) -> Iterator[None]:
         except MemoryError:
             end(1, "not enough memory; give a smaller capture, picture or number of Gaussians")
         except OSError as error:
-            if error.errno not in _GAVE_OUT + _REFUSED:
+            if error.errno not in (*_GAVE_OUT, *_REFUSED, errno.ENAMETOOLONG):
                 raise
+            if error.errno == errno.ENAMETOOLONG:
+                # Python's own look whether a file is there raises it.
+                end(2, f"{str(error.filename)[:60]}...: no such file or folder, the name is too long; check the path")
             place = f"{error.filename}: " if error.filename else ""
             end(1 if _gave_out(error) else 2, f"{place}{error.strerror}; free some space, or choose another place")
 

@@ -25,6 +25,8 @@ _HELP = (
     "give a mask.png, a folder of masks, x,y,z on it, a box x0,y0,z0,x1,y1,z1, a pixel u,v with --view, or clicks "
     "+u,v@photo on it and -u,v@photo beside it"
 )
+_MOST_DIGITS = 10
+"""Of the number of a camera."""
 _CLICK = re.compile(r"([+-]?)([0-9.]+),([0-9.]+)@(.+)", re.DOTALL)
 
 
@@ -47,11 +49,11 @@ def read_object(
     for text in given:
         if not text.strip():
             raise UserError(f"{flag}: nothing is given; {_HELP}")
-        click = None if Path(text).exists() else _CLICK.fullmatch(text)
+        click = None if _is_there(text) else _CLICK.fullmatch(text)
         if click is not None:
             one = _view_named(posed or (), click[4], text)
             clicks.append(_click(cloud, one, click[2], click[3], text, inside=click[1] != "-"))
-        elif not Path(text).exists() and text.count(",") == 1:
+        elif not _is_there(text) and text.count(",") == 1:
             clicks.append(_pixel(text, cloud, posed, view, flag))
         else:
             found.append(_place(text, posed, view, flag))
@@ -62,9 +64,17 @@ def read_object(
     return replace(found[0], clicks=tuple(clicks)) if found else ObjectSpec.of_clicks(clicks)
 
 
+def _is_there(text: str) -> bool:
+    try:
+        return Path(text).exists()
+    # A name that is too long.
+    except OSError:
+        return False
+
+
 def _place(text: str, posed: Sequence[PosedImage] | None, view: str | None, flag: str) -> ObjectSpec:
     """Masks, a point or a box."""
-    if Path(text).exists():
+    if _is_there(text):
         return ObjectSpec(masks=tuple(_read_masks(Path(text), posed, view)))
     try:
         numbers = np.array([float(part) for part in text.split(",")])
@@ -117,7 +127,8 @@ def _view_named(posed: Sequence[PosedImage], view: str | None, what: str) -> Pos
         if len(posed) == 1:
             return posed[0]
         raise UserError(f"--object {what}: {len(posed)} cameras; say which with --view NAME or NUMBER")
-    if view.isdigit() and int(view) < len(posed):
+    # Digits of other scripts, and thousands of them, are no number of a camera.
+    if view.isdecimal() and len(view) < _MOST_DIGITS and int(view) < len(posed):
         return posed[int(view)]
     for one in posed:
         if view in (one.name, Path(one.name).name, Path(one.name).stem):
