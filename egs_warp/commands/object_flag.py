@@ -14,7 +14,7 @@ from egs_warp.geometry.camera import shrunk
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.lens import Straightening
 from egs_warp.io.cameras import PosedImage
-from egs_warp.io.limits import check_pixels, picture_size, read_bytes
+from egs_warp.io.limits import FURTHEST, check_pixels, picture_size, read_bytes
 from egs_warp.segmentation.clicks import Click, click_at
 from egs_warp.segmentation.object_mask import Box, ObjectSpec
 from egs_warp.segmentation.votes import MaskedView
@@ -82,6 +82,8 @@ def _place(text: str, posed: Sequence[PosedImage] | None, view: str | None, flag
         raise UserError(f"{flag} {text}: no such file, nor numbers; {_HELP}") from None
     if not np.isfinite(numbers).all() or len(numbers) not in (3, 6):
         raise UserError(f"{flag} {text}: {len(numbers)} numbers; {_HELP}")
+    if np.abs(numbers).max() > FURTHEST:
+        raise UserError(f"{flag} {text}: further than {FURTHEST:g} units from the origin, where nothing lies; {_HELP}")
     if len(numbers) == 3:
         return ObjectSpec(point=numbers)
     low, high = np.minimum(numbers[:3], numbers[3:]), np.maximum(numbers[:3], numbers[3:])

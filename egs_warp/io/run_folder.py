@@ -201,6 +201,13 @@ def check_run_folder(out: Path | str, *, overwrite: bool = False, writes: Sequen
             raise _occupied(out, f"it has {name}")
 
 
+def check_no_file_of_a_run(path: Path | str) -> None:
+    """Raise ``UserError`` where ``path`` is a file that a run has written: its checksum would be another's."""
+    path = Path(path)
+    if path.exists() and (path.parent / MANIFEST).is_file() and path.name in _known(path.parent):
+        raise UserError(f"{path}: is a file of the run in {path.parent}; choose another name")
+
+
 def check_out(out: Path | str) -> None:
     """Raise ``UserError`` for a folder that cannot be made or written, and make nothing."""
     if not str(out).strip():

@@ -139,6 +139,7 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
     for text, given, view, message in (
         ("nothing.png", posed, None, "--object nothing.png: no such file, nor numbers"),
         ("1,2,3,4", posed, None, "--object 1,2,3,4: 4 numbers"),
+        ("1e300,2,3", posed, None, "--object 1e300,2,3: further than 1e.12 units from the origin"),
         ("1,2,3,1,5,6", posed, None, "the box is flat"),
         ("5,5", [], None, "a pixel needs cameras"),
         ("5,5", posed, None, "3 cameras; say which with --view"),
