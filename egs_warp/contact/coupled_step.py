@@ -9,7 +9,7 @@ import numpy as np
 from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.contact.detection import ContactDetector, ContactSet, push_out_speeds
 from egs_warp.contact.points import ContactPoints
-from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.factors import Factors
 from egs_warp.fem.step_problem import Tangent
 from egs_warp.muscles.tension import MuscleTension
 
@@ -83,7 +83,7 @@ class CoupledSolver:
 
     detector: ContactDetector
     points: ContactPoints
-    factors: SparseFactors
+    factors: Factors
     push_out_cap: float
     """m/s."""
     penetration_tolerance: float

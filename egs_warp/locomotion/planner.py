@@ -10,7 +10,7 @@ import numpy as np
 
 from egs_warp.contact.coupled_step import ContactResponse
 from egs_warp.fem.body import SoftBody
-from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.factors import Factors
 from egs_warp.locomotion.contact_pieces import ContactPieces
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.settings import LocomotionSettings
@@ -84,7 +84,7 @@ class StepPlanner:
     synergies: Synergies
     friction: float
     settings: LocomotionSettings
-    factors: SparseFactors
+    factors: Factors
     """Of the effort's horizon."""
 
     def plan(self, prospect: Prospect, last: np.ndarray, objectives: Sequence[AnyObjective], clock: StageClock) -> Plan:
@@ -168,7 +168,7 @@ class StageClock:
     """Milliseconds of each stage of a step."""
 
     milliseconds: dict[str, float] = field(default_factory=dict)
-    _last: float = field(default_factory=lambda: time.perf_counter())
+    _last: float = field(default_factory=time.perf_counter)
 
     def lap(self, name: str) -> None:
         """Since the lap before was ``name``."""

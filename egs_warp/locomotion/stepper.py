@@ -11,7 +11,7 @@ from egs_warp.contact.coupled_step import ContactResponse, CoupledResult, Couple
 from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet
 from egs_warp.contact.points import ContactPoints
 from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.factors import factors_on
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.planner import STEPS_A_UNIT, Plan, Prospect, StageClock, StepPlanner
@@ -88,7 +88,7 @@ class LocomotionStepper:
         self.points = ContactPoints(
             geometry, near=self.settings.near * body.height, lower=0.1 * self.settings.near * body.height
         )
-        self._factors = SparseFactors(body.assembly.upper_pattern)
+        self._factors = factors_on(body.assembly.device, body.assembly.upper_pattern)
         self.solver = CoupledSolver(
             self.detector,
             self.points,
@@ -106,7 +106,7 @@ class LocomotionStepper:
             find_synergies(muscles, tangent.solve(full), body.node_mass),
             geometry.friction,
             self.settings,
-            SparseFactors(body.assembly.upper_pattern),
+            factors_on(body.assembly.device, body.assembly.upper_pattern),
         )
 
     def initial_memory(self) -> StepMemory:
