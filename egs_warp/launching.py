@@ -15,7 +15,7 @@ import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -82,7 +82,9 @@ def _without_driver_warning() -> Iterator[None]:
         finally:
             os.dup2(kept, 2)
             said.seek(0)
-            os.write(2, b"".join(line for line in said if _NO_DRIVER not in line))
+            # A stream that is full or closed is not about the device.
+            with suppress(OSError):
+                os.write(2, b"".join(line for line in said if _NO_DRIVER not in line))
 
 
 def kernels_are_compiled() -> bool:

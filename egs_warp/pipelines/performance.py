@@ -30,6 +30,10 @@ _RISING = 120.0
 """sqrt(H / g) that getting up may take in one run."""
 LEAST_FRAMES = 2
 """Of a film; the first one is at rest."""
+MOST_FRAMES = 216_000
+"""Of a run that is told how many."""
+_STEEP = 0.9999
+"""Cosine to the vertical of a view from straight above or below."""
 _FROM_ABOVE = 0.5
 """Up for one along the ground, in a scene, which has a floor to be seen."""
 _IN_THE_WAY = 0.7
@@ -91,12 +95,14 @@ class Performance:
         if view_from is not None:
             direction = ground.axes @ (self.creature.frame.axes @ np.asarray(view_from, float))
         direction /= np.linalg.norm(direction)
+        # From above or below, the way the body faces is up in the picture.
+        upwards = ground.axes[0] if abs(direction[2]) > _STEEP else ground.axes[2]
         distance = float(np.linalg.norm(high - low))
         for _ in range(60):
             camera = Camera.look_at(
                 ground.world(middle + distance * direction),
                 ground.world(middle),
-                ground.axes[2],
+                upwards,
                 width=size,
                 height=size,
                 vertical_fov_degrees=30.0,
@@ -129,6 +135,8 @@ def check_frames(frames: int | None) -> None:
     if frames is not None and frames < LEAST_FRAMES:
         advice = f"give a whole number of at least {LEAST_FRAMES}; the first picture is at rest"
         raise ArgumentError("frames", advice, value=frames)
+    if frames is not None and frames > MOST_FRAMES:
+        raise ArgumentError("frames", f"give at most {MOST_FRAMES}, which is an hour", value=frames)
 
 
 def simulate(
