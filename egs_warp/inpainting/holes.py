@@ -18,7 +18,7 @@ from egs_warp.inpainting.rectified import PlaneWindow, rectify
 from egs_warp.io.planes import HoleOutline
 from egs_warp.segmentation.above_plane import CELLS
 from egs_warp.segmentation.connectivity import enclosed
-from egs_warp.segmentation.object_mask import Segmentation
+from egs_warp.segmentation.object_spec import Segmentation
 from egs_warp.segmentation.votes import MaskedView, check_size
 
 _TEXELS = 256

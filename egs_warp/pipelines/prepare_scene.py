@@ -22,7 +22,7 @@ from egs_warp.io.ply import write_ply
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, on_its_ground
 from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane, reach_across
-from egs_warp.segmentation.object_mask import ObjectSpec
+from egs_warp.segmentation.object_spec import ObjectSpec
 from egs_warp.training import has_torch
 
 if TYPE_CHECKING:

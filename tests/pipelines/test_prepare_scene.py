@@ -17,7 +17,7 @@ from egs_warp.io import read_capture, write_ply
 from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene, viewing_direction
 from egs_warp.segmentation.clearance import Clearing
-from egs_warp.segmentation.object_mask import ObjectSpec
+from egs_warp.segmentation.object_spec import ObjectSpec
 from tests.support.grounds import on_folds
 from tests.support.scenes import FLOOR, ball_on_floor
 

@@ -15,7 +15,8 @@ from egs_warp.io import read_cameras
 from egs_warp.io.cameras import write_cameras
 from egs_warp.pipelines.locate_plane import locate_plane
 from egs_warp.segmentation.clicks import click_at
-from egs_warp.segmentation.object_mask import ObjectSpec, segment
+from egs_warp.segmentation.object_mask import segment
+from egs_warp.segmentation.object_spec import ObjectSpec
 from tests.support.clicking import balls, click, front
 from tests.support.grounds import level
 from tests.support.scenes import FLOOR, ball_on_floor, lying, round_ones, shell

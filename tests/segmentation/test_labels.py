@@ -13,7 +13,9 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.bitmaps import depth_inside, distance_to
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.segmentation.labels import labels_of_votes, smoothed_labels
-from egs_warp.segmentation.object_mask import ObjectSpec, masks_from_selection, segment
+from egs_warp.segmentation.object_mask import segment
+from egs_warp.segmentation.object_spec import ObjectSpec
+from egs_warp.segmentation.selection_masks import masks_from_selection
 from egs_warp.segmentation.votes import MaskedView, Votes, votes_of_masks
 from tests.support.clicking import balls, click
 from tests.support.scenes import FLOOR
