@@ -34,6 +34,7 @@ from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.doubts import doubts
 from egs_warp.pipelines.film import draw_film
 from egs_warp.pipelines.front import mean_view
+from egs_warp.pipelines.ground_left import ground_left
 from egs_warp.pipelines.locate_plane import locate_plane, on_its_ground
 from egs_warp.pipelines.performance import simulate
 from egs_warp.pipelines.pictures import picture_cameras, plane_picture, segmentation_picture
@@ -117,13 +118,15 @@ def film(
             quiet=True,
         )
         simulation = performance.simulation
+        behind = creature.placed(scene.background)
+        left = ground_left(simulation.trajectory.positions[-1], behind, creature.solids[0], creature.body.height)
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),
             *(performance.sequence.done, ledger(performance.trajectory)),
             drawn=made.splats.count,
             drawing=made.milliseconds,
             source=name,
-            notes=(*scene.notes, *performance.cut_short()),
+            notes=(*scene.notes, *performance.cut_short(), *left),
             seed=0,
             asked={},
             ending=performance.ending,
@@ -139,7 +142,7 @@ def film(
             "seconds": {stage: 1e-3 * seconds[stage] for stage in STAGES if stage in seconds},
             "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
             "ended": report.state.value,
-            "said": said,
+            "said": [*said, *left],
             "notes": list(scene.notes),
         }
         run.file("row.json").write_text(json.dumps(row, indent=1) + "\n")

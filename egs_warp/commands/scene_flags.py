@@ -14,7 +14,7 @@ def add_object_flags(parser: argparse._ActionsContainer) -> None:
         "--object",
         action="append",
         help="mask.png, folder of masks, point x,y,z, box x0,y0,z0,x1,y1,z1, pixel u,v of --view, or clicks, as many "
-        "as needed: +u,v@photo goes along, -u,v@photo does not; salient is what stands out (egs-warp[masks])",
+        "as needed: +u,v@photo goes along, -u,v@photo does not; salient is what stands out (egs-warp[salient])",
     )
     parser.add_argument(
         "--mask-model",

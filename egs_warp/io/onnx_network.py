@@ -5,11 +5,9 @@ The file is read by ``read_onnx`` first: it carries no code, and what it needs o
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -47,7 +45,7 @@ def load_network(path: Path) -> OnnxNetwork:
     """Raises ``UserError`` for a file that is no ONNX, or whose operations the program at hand does not know."""
     file = read_onnx(path)
     try:
-        onnxruntime: Any = importlib.import_module("onnxruntime")
+        import onnxruntime  # type: ignore[import-not-found]
     except ImportError:
         return OnnxNetwork(path, file.inputs, _by_opencv(path, file.data))
     options = onnxruntime.SessionOptions()

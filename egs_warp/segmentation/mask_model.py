@@ -72,7 +72,7 @@ class OnnxClickModel:
         places[0, 0, :count], labels[0, 0, :count] = scale * points[:count], inside[:count]
         given = (np.ascontiguousarray(square.transpose(2, 0, 1)[None]), places, labels)
         answer = self.network.run(dict(zip(self.names, given, strict=True)), wanted=_WANTED)
-        masks = answer[0] if answer else np.zeros(0)
+        masks: np.ndarray = answer[0] if answer else np.zeros(0)
         if masks.ndim != 5 or masks.shape[:2] != (1, 1) or masks.size == 0 or not np.isfinite(masks).all():
             raise UserError(
                 f"{self.network.path}: the network returned shape {masks.shape} or values that are not finite, expected"
@@ -102,7 +102,7 @@ class SalientModel:
         for place in places:
             if place.is_file():
                 return cls(load_network(place))
-        raise UserError("object: nothing is installed that proposes one; install egs-warp[masks], or click on it")
+        raise UserError("object: nothing is installed that proposes one; install egs-warp[salient], or click on it")
 
     def mask(self, picture: np.ndarray) -> np.ndarray:
         """(H, W) bool of what stands out in ``picture`` (H, W, 3) float32, 0 to 1."""
