@@ -186,6 +186,8 @@ def _taken_apart(
     seconds["plane"] = first + second
     (thing, bare, notes), seconds["object"] = timed(take_apart, cloud, located, options, photographs)
     hole = hole_under(cloud, located.plane, located.segmentation)
+    if hole is None:
+        return PreparedScene(thing, bare, bare, located.plane, hole, located, (*located.notes, *notes))
     filled, seconds["hole"] = timed(inpaint, bare, hole)
     notes = (*located.notes, *notes, *filled.notes)
     return PreparedScene(thing, filled.cloud, bare, located.plane, hole, located, notes, filled)

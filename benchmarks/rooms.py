@@ -131,7 +131,8 @@ def rows_of(drawn: DrawnScene, options: argparse.Namespace, table: Table) -> tup
             continue
         if how == "masks" and not options.quick:
             hole = hole_under(cloud, located.plane, located.segmentation)
-            _, stages["inpaint"] = timed(inpaint, bare, hole, options=InpaintOptions(steps=0))
+            if hole is not None:
+                _, stages["inpaint"] = timed(inpaint, bare, hole, options=InpaintOptions(steps=0))
         seconds |= {name: 1e-3 * value for name, value in stages.items()}
         judged = [overlap(cloud, thing, view) for view in drawn.views[JUDGED]]
         ious = [one[0] for one in judged]

@@ -75,8 +75,8 @@ class PreparedScene:
     bare: GaussianCloud
     """The background before inpainting."""
     plane: Plane
-    hole: Hole
-    """In the floor, under the object."""
+    hole: Hole | None
+    """In the floor, under the object; None where it hangs above it."""
     located: LocatedPlane
     notes: tuple[str, ...]
     """What was found and done, for the user."""
@@ -96,7 +96,7 @@ class PreparedScene:
         place = out.file if isinstance(out, RunFolder) else out.joinpath
         write_ply(place("object.ply"), self.object)
         write_ply(place("background.ply"), self.background)
-        first = replace(self.located.known(), hole=self.hole.outline())
+        first = replace(self.located.known(), hole=self.hole.outline() if self.hole else None)
         write_planes(place("plane.json"), [first.over(known[0]) if known else first, *known[1:]])
 
 
@@ -128,7 +128,9 @@ def prepare_scene(
         cloud, located, options, photographs, progress=lambda done: progress("segment", done)
     )
     filled, hole = None, hole_under(cloud, located.plane, located.segmentation)
-    if options.inpaint:
+    if options.inpaint and hole is None:
+        notes = (*notes, "the object hangs above the ground, which is whole under it")
+    elif options.inpaint and hole is not None:
         progress("inpaint", 0.0)
         # torch may be missing, and with it the training that inpainting ends with.
         from egs_warp.inpainting.inpaint import InpaintOptions, inpaint

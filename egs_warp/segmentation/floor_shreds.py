@@ -43,7 +43,9 @@ def wisps(scene: AbovePlane, chosen: np.ndarray, size: float) -> np.ndarray:
     """
     low = scene.heights < _WISP_HEIGHT * size
     length = np.exp(scene.cloud.log_scales.numpy().max(axis=1))
-    wide = length > max(_WISP * size, 2.0 * float(np.median(length[chosen])))
+    # Than others at the foot: where a capture is coarse, a stand is all of wide ones, and leaves above it are small.
+    usual = float(np.median(length[chosen & low])) if (chosen & low).any() else 0.0
+    wide = length > max(_WISP * size, 2.0 * usual)
     if isinstance(scene.plane, HeightField):
         # Under the object the ground is a guess, and what lies there may be higher.
         wide |= scene.level

@@ -135,6 +135,8 @@ def _of_size(
     halo = (small | ~scene.solid) & above & close_to(scene.means, scene.means[chosen], _HALO * size)
     if not spec.masks:
         shreds = wisps(scene, object_mask, size)
+        for click in spec.clicks:
+            shreds[click.hits] = False
         object_mask &= ~shreds
         halo |= shreds
     floaters = (halo | (claimed & above)) & ~object_mask & ~buried & ~cut_off
