@@ -38,7 +38,7 @@ from egs_warp.pipelines.ground_left import ground_left
 from egs_warp.pipelines.locate_plane import locate_plane, on_its_ground
 from egs_warp.pipelines.performance import simulate
 from egs_warp.pipelines.pictures import picture_cameras, plane_picture, segmentation_picture
-from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, take_apart, viewing_direction
+from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, set_down, take_apart, viewing_direction
 from egs_warp.pipelines.report import report_of_run
 from egs_warp.pipelines.train_capture import train
 from egs_warp.segmentation.object_spec import ObjectSpec
@@ -185,6 +185,8 @@ def _taken_apart(
     located, second = timed(on_its_ground, cloud, located, spec, cameras)
     seconds["plane"] = first + second
     (thing, bare, notes), seconds["object"] = timed(take_apart, cloud, located, options, photographs)
+    thing, came_down = set_down(thing, located)
+    notes = (*notes, *came_down)
     hole = hole_under(cloud, located.plane, located.segmentation)
     if hole is None:
         return PreparedScene(thing, bare, bare, located.plane, hole, located, (*located.notes, *notes))

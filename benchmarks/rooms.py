@@ -80,6 +80,9 @@ def film_rows(options: argparse.Namespace) -> list[Row]:
     for row in rows:
         stages = " ".join(f"{stage} {value:.1f}" for stage, value in row.get("seconds", {}).items())
         print(f"{row['scene']}: {stages or row['said']} ({row['ended']})", flush=True)
+    if options.json:
+        # Should time be up before the rest is done.
+        options.json.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
     return rows
 
 

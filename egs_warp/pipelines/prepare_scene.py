@@ -38,6 +38,11 @@ _CLEARED = {
 }
 
 
+_SOLID = 0.1
+_AFLOAT = 0.03
+"""Of the object's size: what hangs higher above its plane does not stand there."""
+
+
 @dataclass(frozen=True)
 class SceneOptions:
     """What may be chosen."""
@@ -127,6 +132,8 @@ def prepare_scene(
     thing, bare, notes = take_apart(
         cloud, located, options, photographs, progress=lambda done: progress("segment", done)
     )
+    thing, came_down = set_down(thing, located)
+    notes = (*notes, *came_down)
     filled, hole = None, hole_under(cloud, located.plane, located.segmentation)
     if options.inpaint and hole is None:
         notes = (*notes, "the object hangs above the ground, which is whole under it")
@@ -187,6 +194,18 @@ def take_apart(
         *closed,
     )
     return thing, cloud.subset(found.background_mask), notes
+
+
+def set_down(thing: GaussianCloud, located: LocatedPlane) -> tuple[GaussianCloud, tuple[str, ...]]:
+    """``thing``, moved down onto its plane if it hangs above it, as a robot may that was captured afloat; and what to
+    say of that.
+    """
+    plane, size = located.plane, located.segmentation.size
+    lowest = float(np.quantile(plane.heights(thing.means.numpy()[thing.opacities() > _SOLID]), 0.002))
+    if located.ground is not None or lowest <= _AFLOAT * size:
+        return thing, ()
+    note = f"the object hung {lowest / size:.2f} of its size above the ground, and was set down on it"
+    return _moved(thing, lambda means: means - lowest * plane.normal), (note,)
 
 
 def _moved(cloud: GaussianCloud, to: Callable[[np.ndarray], np.ndarray]) -> GaussianCloud:
