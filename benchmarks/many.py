@@ -1,10 +1,10 @@
 """How many steps of a creature a second `simulate_many` makes, over the number of processes.
 
-python benchmarks/many.py [--quick] [--workers N ...] [--nodes N ...] [--frames N] [--jobs N] [--device cpu] [--json PATH]
-    [--plot PATH]
+python benchmarks/many.py [--quick] [--workers N ...] [--nodes N ...] [--frames N] [--jobs N] [--device cpu]
+    [--json PATH] [--plot PATH]
 
-Each of so many ``--workers`` does ``--jobs`` standing jumps of the pawn, each of another distance, the first ``--frames``
-of them. The rate is that of the middle 70 % of all frames: all workers have begun by then, and none has run out of
+Each of so many ``--workers`` does ``--jobs`` standing jumps of the pawn, each of another distance, of each the first
+``--frames``. The rate is that of the middle 70 % of all frames: all workers have begun by then, and none has run out of
 jobs; what they take to load is told apart. Each process has one thread, so a machine gives less to each where its cores
 share memory or clock.
 
@@ -107,8 +107,10 @@ def summary(rows: list[Row], device: str) -> dict[str, Any]:
         nodes: max((row["rate"] for row in rows if abs(row["nodes"] - nodes) <= NEAR * nodes), default=None)
         for nodes in AIMS
     }
-    told = ", ".join(f"{rate:.1f} at {nodes} nodes" for nodes, rate in best.items() if rate is not None)
-    why = f"a GPU's aim: a batch of bodies in one launch is not built; processes of this CPU make {told} steps a second"
+    told = " and ".join(
+        f"{rate:.1f} steps a second at {nodes} nodes" for nodes, rate in best.items() if rate is not None
+    )
+    why = f"a GPU's aim: a batch of bodies in one launch is not built; processes of this CPU make {told}"
     rates = [best[nodes] for nodes in AIMS]
     if device == "cpu" or None in rates:
         why = why if device == "cpu" else "not both cages were run"

@@ -18,8 +18,8 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.push import Push
 from egs_warp.motions.script import Script
 from egs_warp.motions.style import Style
-from egs_warp.pipelines.crew import Crew, Ended, Processes, Tell, Work, ended_tasks
 from egs_warp.pipelines.creature import Creature
+from egs_warp.pipelines.crew import Crew, Ended, Processes, Tell, Work, ended_tasks
 from egs_warp.pipelines.ending import State
 from egs_warp.pipelines.performance import Performance, simulate
 from egs_warp.pipelines.ray_crew import HERE, RayCrew

@@ -152,9 +152,10 @@ def simulate(
     ``longest``: seconds after which it is cut off, if that is earlier; ``step``: those of a solver step, if not the
     usual; ``style``: how it jumps; ``pushes``: what hits it meanwhile; ``get_up``: whether a body that has fallen is to
     get up and go on; ``activations`` (steps, M) metres: what muscles do in each solver step, whatever the motion would
-    have them do, which then only says what is measured; the run ends with the last of them. ``parts`` tells the folder that takes the steps as they are done, ``resume`` is that of a run that
-    was cut off and goes on. ``progress`` is told after each frame how many are done, and how many are expected in all
-    by now. Raises ``UserError`` for a motion that the body cannot do, and a folder that another run has left.
+    have them do, which then only says what is measured; the run ends with the last of them. ``parts`` tells the folder
+    that takes the steps as they are done, ``resume`` is that of a run that was cut off and goes on. ``progress`` is
+    told after each frame how many are done, and how many are expected in all by now. Raises ``UserError`` for a motion
+    that the body cannot do, and a folder that another run has left.
     """
     check_frames(frames)
     if activations is not None:
