@@ -22,14 +22,15 @@ from egs_warp.launching import THREADS
 
 MOST_RUNS = 3
 """A task whose process was lost as often has failed."""
-ONE_THREAD = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS", THREADS), "1"
+ONE_THREAD: dict[str, str] = dict.fromkeys(
+    ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "RAYON_NUM_THREADS", THREADS], "1"
 )
 """Environment of a worker: those beside it have the other cores."""
 Tell = Callable[..., object]
 """What a task tells of itself as it goes on."""
 Work = Callable[[Any, Tell], Any]
 """What is done with each task; like tasks and results it can be pickled. It goes to each worker once."""
+_WINDOWS, _NEW_GROUP = sys.platform == "win32", 0x200
 _BEGIN = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); import {0}; {0}.serve()"
 
 
@@ -167,7 +168,8 @@ class Processes:
             stdout=subprocess.PIPE,
             env={**os.environ, **ONE_THREAD},
             # In a group of its own the terminal's Ctrl-C does not reach it.
-            **({"creationflags": 0x200} if sys.platform == "win32" else {"process_group": 0}),
+            process_group=None if _WINDOWS else 0,
+            creationflags=_NEW_GROUP if _WINDOWS else 0,
         )
         running = self._running[worker] = _Running(process, queue.SimpleQueue())
         for message in (pickle.dumps(sys.path), pickle.dumps(self._script), self._work):
