@@ -105,8 +105,16 @@ def ended_tasks(crew: Crew, tasks: Sequence[Any], told: Callable[..., object]) -
                     yield Ended(number, *((event.value, None) if good else (None, event.value)), runs[number])
 
 
-def attempt(work: Work, task: Any, tell: Tell) -> tuple[str, Any]:
-    """``done`` and the result, or ``failed`` and a line."""
+def attempt(work: Work, task: Any, tell: Tell) -> bytes:
+    """Pickled: ``done`` and the result, or ``failed`` and a line."""
+    kind, value = _attempted(work, task, tell)
+    try:
+        return pickle.dumps((kind, value))
+    except Exception as error:
+        return pickle.dumps(("failed", f"what it returns cannot be sent: {error}"))
+
+
+def _attempted(work: Work, task: Any, tell: Tell) -> tuple[str, Any]:
     try:
         return "done", work(task, tell)
     except UserError as error:
@@ -220,10 +228,10 @@ def serve() -> None:
     threading.Thread(target=_take, args=(sys.stdin.buffer, tasks), daemon=True).start()
 
     def tell(*values: Any) -> None:
-        _say(out, "told", values)
+        _say(out, pickle.dumps(("told", values)))
 
     while True:
-        _say(out, *attempt(work, tasks.get(), tell))
+        _say(out, attempt(work, tasks.get(), tell))
 
 
 def _take(stream: IO[bytes], tasks: queue.SimpleQueue[Any]) -> None:
@@ -234,10 +242,6 @@ def _take(stream: IO[bytes], tasks: queue.SimpleQueue[Any]) -> None:
     os._exit(0)
 
 
-def _say(out: IO[bytes], kind: str, value: Any) -> None:
-    try:
-        message = pickle.dumps((kind, value))
-    except Exception as error:
-        message = pickle.dumps(("failed", f"what it returns cannot be sent: {error}"))
+def _say(out: IO[bytes], message: bytes) -> None:
     out.write(message)
     out.flush()

@@ -28,8 +28,8 @@ class RayWorker:
         self._work = pickle.loads(work)
         self._told: list[tuple[Any, ...]] = []
 
-    def run(self, task: Any) -> tuple[str, Any]:
-        """What the work makes of ``task``."""
+    def run(self, task: Any) -> bytes:
+        """What the work makes of ``task``, see ``attempt``."""
         self._told = []
         return attempt(self._work, task, lambda *values: self._told.append(values))
 
@@ -87,7 +87,7 @@ class RayCrew:
             # Of a task that is over nothing more is told.
             self._looks = {look: other for look, other in self._looks.items() if other != worker}
             try:
-                events.append(Event(worker, *ray.get(call)))
+                events.append(Event(worker, *pickle.loads(ray.get(call))))
             except ray.exceptions.RayError as error:
                 # One that only cannot be reached must not go on beside its successor.
                 with contextlib.suppress(Exception):
