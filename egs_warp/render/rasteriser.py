@@ -37,9 +37,9 @@ def render_gaussians(
     """Picture of ``cloud`` through ``camera``, on the device of the cloud.
 
     ``background`` is one colour, or an image (H, W, 3) of this camera's size. ``antialiased`` dims each splat by what
-    the 0.3 px low-pass adds to its area. ``geometry`` adds median depth and normals. ``mask``, one bool for each tile
-    of 16 x 16 pixels from the top left, leaves tiles out: they show the background alone. ``threads`` (a CPU only)
-    defaults to the available cores; the picture does not depend on it.
+    the 0.3 px low-pass adds to its area. ``geometry`` adds median depth, its splats and normals. ``mask``, one bool for
+    each tile of 16 x 16 pixels from the top left, leaves tiles out: they show the background alone. ``threads`` (a CPU
+    only) defaults to the available cores; the picture does not depend on it.
     Raises ``UserError`` for non-finite Gaussians, which it names, for an impossible camera and for a background or mask
     of another size.
     """
