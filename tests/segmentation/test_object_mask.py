@@ -278,6 +278,16 @@ def test_loose_matter_behind_a_hole_is_the_bodys() -> None:
     assert found.object_mask[len(skin) : len(skin) + 30].all()
 
 
+def test_the_floor_closes_a_bell_from_below() -> None:
+    """A dome that stands on its rim, open below: what is loose under it goes along."""
+    skin = shell(3000)
+    dome = skin[skin[:, 2] > 0.5] - [0.0, 0.0, 0.5]
+    inside = np.random.default_rng(0).normal(0.0, 0.03, (30, 3)) + [0.0, 0.0, 0.25]
+    whole = joined(round_ones(np.concatenate([dome, inside]), 0.02), lying(level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.05)))
+    found = segment(whole, FLOOR, ObjectSpec(point=np.array([0.0, 0.0, 0.5])))
+    assert found.object_mask[len(dome) : len(dome) + 30].all()
+
+
 def test_how_far_a_floor_scatters_is_judged_beside_the_object() -> None:
     """Three standard deviations of the floor that is near; not of a higher one far away, nor of what lies under the
     object.
