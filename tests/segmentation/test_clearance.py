@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -132,7 +133,9 @@ def test_what_straddles_is_split_in_three_across_the_plane(device: str) -> None:
         np.zeros((3, 1, 3)),
         device=device,
     )
-    split = _subdivided(cloud, PLANE, Reach.ELLIPSOID)
+    # Both reach across by three tenths.
+    assert _subdivided(cloud, PLANE, Reach.ELLIPSOID, 0.31) is cloud
+    split = _subdivided(cloud, PLANE, Reach.ELLIPSOID, 0.29)
     np.testing.assert_allclose(PLANE.heights(split.means.numpy()), [0.5, 0.05, 0.15, 0.25, 0.05, 0.15], atol=1e-5)
     np.testing.assert_allclose(covariances(split)[0], covariances(cloud)[2], atol=1e-8)
     arms = split.means.numpy()[1:4].astype(np.float64) - cloud.means.numpy()[0]
@@ -243,6 +246,14 @@ def test_finetuning_clears_the_plane_and_keeps_the_looks() -> None:
     cameras = foot_ring(ball, floor, size=72)[::3]
     options = ClearingOptions(iterations=120, subdivisions=0, weight=3.0)
     tuned = clear_plane(ball, floor, Clearing.FINETUNE, cameras=cameras, options=options)
+    hasty = replace(options, iterations=3)
+    cut, left = (
+        clear_plane(ball, floor, Clearing.FINETUNE, cameras=cameras, options=replace(hasty, cut_rest=cut_rest))
+        for cut_rest in (True, False)
+    )
+    straddles = np.abs(before) < eta
+    assert np.array_equal(cut.means.numpy()[~straddles], left.means.numpy()[~straddles])
+    assert (floor.heights(cut.means.numpy())[straddles] > floor.heights(left.means.numpy())[straddles]).mean() > 0.9
     after, eta = reach_across(tuned, floor)
     assert float(np.maximum(eta - np.abs(after), 0.0).sum()) < 0.35 * crossing
     assert (after > 0.0).all()
