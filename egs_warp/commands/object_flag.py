@@ -14,7 +14,7 @@ from egs_warp.geometry.camera import shrunk
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.lens import Straightening
 from egs_warp.io.cameras import PosedImage
-from egs_warp.io.limits import check_pixels, picture_size, read_bytes
+from egs_warp.io.limits import FURTHEST, check_pixels, picture_size, read_bytes
 from egs_warp.segmentation.carried_masks import masks_of_clicks, salient_masks
 from egs_warp.segmentation.clicks import Click, click_at
 from egs_warp.segmentation.mask_model import OnnxClickModel, SalientModel
@@ -27,6 +27,8 @@ _HELP = (
     "give a mask.png, a folder of masks, x,y,z on it, a box x0,y0,z0,x1,y1,z1, a pixel u,v with --view, or clicks "
     "+u,v@photo on it and -u,v@photo beside it"
 )
+_MOST_DIGITS = 10
+"""Of the number of a camera."""
 _SALIENT = "salient"
 _CLICK = re.compile(r"([+-]?)([0-9.]+),([0-9.]+)@(.+)", re.DOTALL)
 
@@ -52,13 +54,13 @@ def read_object(
     for text in given:
         if not text.strip():
             raise UserError(f"{flag}: nothing is given; {_HELP}")
-        click = None if Path(text).exists() else _CLICK.fullmatch(text)
+        click = None if _is_there(text) else _CLICK.fullmatch(text)
         if click is not None:
             one = _view_named(posed or (), click[4], text)
             clicks.append(_click(cloud, one, click[2], click[3], text, inside=click[1] != "-"))
-        elif not Path(text).exists() and text.count(",") == 1:
+        elif not _is_there(text) and text.count(",") == 1:
             clicks.append(_pixel(text, cloud, posed, view, flag))
-        elif text == _SALIENT and not Path(text).exists():
+        elif text == _SALIENT and not _is_there(text):
             found.append(_salient(cloud, posed, flag))
         else:
             found.append(_place(text, posed, view, flag))
@@ -75,6 +77,14 @@ def read_object(
     return replace(found[0], clicks=tuple(clicks)) if found else ObjectSpec.of_clicks(clicks)
 
 
+def _is_there(text: str) -> bool:
+    try:
+        return Path(text).exists()
+    # A name that is too long.
+    except OSError:
+        return False
+
+
 def _salient(cloud: GaussianCloud, posed: Sequence[PosedImage] | None, flag: str) -> ObjectSpec:
     """Masks of what stands out of the photos' pictures."""
     if not posed:
@@ -85,7 +95,7 @@ def _salient(cloud: GaussianCloud, posed: Sequence[PosedImage] | None, flag: str
 
 def _place(text: str, posed: Sequence[PosedImage] | None, view: str | None, flag: str) -> ObjectSpec:
     """Masks, a point or a box."""
-    if Path(text).exists():
+    if _is_there(text):
         return ObjectSpec(masks=tuple(_read_masks(Path(text), posed, view)))
     try:
         numbers = np.array([float(part) for part in text.split(",")])
@@ -93,6 +103,8 @@ def _place(text: str, posed: Sequence[PosedImage] | None, view: str | None, flag
         raise UserError(f"{flag} {text}: no such file, nor numbers; {_HELP}") from None
     if not np.isfinite(numbers).all() or len(numbers) not in (3, 6):
         raise UserError(f"{flag} {text}: {len(numbers)} numbers; {_HELP}")
+    if np.abs(numbers).max() > FURTHEST:
+        raise UserError(f"{flag} {text}: further than {FURTHEST:g} units from the origin, where nothing lies; {_HELP}")
     if len(numbers) == 3:
         return ObjectSpec(point=numbers)
     low, high = np.minimum(numbers[:3], numbers[3:]), np.maximum(numbers[:3], numbers[3:])
@@ -138,7 +150,8 @@ def _view_named(posed: Sequence[PosedImage], view: str | None, what: str) -> Pos
         if len(posed) == 1:
             return posed[0]
         raise UserError(f"--object {what}: {len(posed)} cameras; say which with --view NAME or NUMBER")
-    if view.isdigit() and int(view) < len(posed):
+    # Digits of other scripts, and thousands of them, are no number of a camera.
+    if view.isdecimal() and len(view) < _MOST_DIGITS and int(view) < len(posed):
         return posed[int(view)]
     for one in posed:
         if view in (one.name, Path(one.name).name, Path(one.name).stem):

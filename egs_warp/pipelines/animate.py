@@ -31,7 +31,7 @@ from egs_warp.pipelines.oddities import oddities
 from egs_warp.pipelines.performance import check_frames, simulate
 from egs_warp.pipelines.plots import draw_plots
 from egs_warp.pipelines.progress import preparation_bar, simulation_bar
-from egs_warp.pipelines.report import Report, report_of_run
+from egs_warp.pipelines.report import GaussianCounts, Report, report_of_run
 from egs_warp.pipelines.shot import LARGEST_SIDE, SMALLEST_SIDE, Shot
 
 LARGEST_FRICTION = 10.0
@@ -230,7 +230,7 @@ def animate(
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),
             *(performance.sequence.done, books),
-            drawn=film.splats.count,
+            gaussians=GaussianCounts.of(creature, film.splats.count),
             drawing=film.milliseconds,
             source=source,
             notes=notes,

@@ -14,7 +14,7 @@ from egs_warp.kernels.render.ellipse import TILE_PIXELS
 from egs_warp.kernels.render.geometry import composite_geometry_kernel, splat_normals_kernel
 from egs_warp.launching import device_of, empty, empty_together, launch_rows
 from egs_warp.render.projection import ProjectedGaussians
-from egs_warp.render.tiles import TileLists
+from egs_warp.render.tiles import TileLists, build_tile_lists, lists_fit
 
 
 @dataclass(frozen=True)
@@ -49,14 +49,40 @@ class RenderedImage:
         return np.rint(np.clip(self.colour.numpy(), 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
+def list_and_composite(
+    projected: ProjectedGaussians,
+    view: Any,
+    *,
+    background: Background,
+    threads: int,
+    onto: RenderedImage | None = None,
+) -> tuple[TileLists, RenderedImage]:
+    """The tile lists and the picture, as ``composite`` makes it.
+
+    The number of pairs is looked at when all is queued: a GPU that waited for it would stand still meanwhile.
+    """
+    lists = build_tile_lists(projected, view, threads=threads, guess=True)
+    image = composite(projected, lists, view, background=background, threads=threads, onto=onto)
+    if not lists_fit(lists, projected):
+        lists = build_tile_lists(projected, view, threads=threads)
+        image = composite(projected, lists, view, background=background, threads=threads, onto=image)
+    return lists, image
+
+
 def composite(
-    projected: ProjectedGaussians, lists: TileLists, view: Any, *, background: Background, threads: int
+    projected: ProjectedGaussians,
+    lists: TileLists,
+    view: Any,
+    *,
+    background: Background,
+    threads: int,
+    onto: RenderedImage | None = None,
 ) -> RenderedImage:
-    """Blend every tile's Gaussians from front to back over ``background``."""
+    """Blend every tile's Gaussians from front to back over ``background``, into the arrays of ``onto`` where given."""
     device = device_of(projected.ellipse)
     width, height = int(view.width), int(view.height)
     shape = (height, width)
-    colour, alpha, depth = empty_together(device, (shape, wp.vec3), (shape, wp.float32), (shape, wp.float32))
+    image = onto or RenderedImage(*empty_together(device, (shape, wp.vec3), (shape, wp.float32), (shape, wp.float32)))
     inputs = [
         width,
         height,
@@ -72,12 +98,12 @@ def composite(
         composite_tile_kernel,
         lists.tile_count * (TILE_PIXELS if device.is_cuda else 1),
         inputs=inputs,
-        outputs=[colour, alpha, depth],
+        outputs=[image.colour, image.alpha, image.depth],
         device=device,
         threads=threads,
         work=lists.work,
     )
-    return RenderedImage(colour, alpha, depth)
+    return image
 
 
 def add_geometry(
