@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -111,6 +112,14 @@ def test_progress_ends_where_all_is_done(told: list[tuple[int, int]], outcomes: 
     assert told[-1] == (frames, frames) and done == sorted(done) and all(one <= of for one, of in told)
 
 
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed: egs-warp[ray]")
+def test_over_ray_it_has_the_same_bits(creature: Creature, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    job = Job(motion("jump 0.2 0.1"), friction=0.5, frames=FEW)
+    (outcome,) = simulate_many(creature, [job], workers="ray")
+    assert outcome.error is None and same(outcome.trajectory, job.perform(creature).trajectory)
+
+
 def test_trajectories_may_lie_in_a_folder(creature: Creature, tmp_path: Path) -> None:
     """As they end they are told, by their numbers."""
     ended: dict[int, Outcome] = {}
@@ -149,7 +158,6 @@ def test_activations_of_a_run_bring_it_about_again(creature: Creature) -> None:
     again = simulate(creature, motion("jump"), activations=first.trajectory.activations)
     assert np.array_equal(again.trajectory.activations, first.trajectory.activations)
     off = np.abs(again.trajectory.positions - first.trajectory.positions).max()
-    print("off", np.abs(again.trajectory.positions - first.trajectory.positions).max(axis=(1, 2)))
     assert off < 1e-3 * creature.body.height
     still = simulate(creature, motion("jump"), activations=np.zeros_like(first.trajectory.activations))
     moved = np.abs(still.trajectory.positions[-1] - first.trajectory.positions[-1]).max()
