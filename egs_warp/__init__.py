@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from egs_warp.render.rasteriser import render_gaussians
     from egs_warp.segmentation.clearance import Clearing, ClearingOptions, Reach
     from egs_warp.segmentation.clicks import Click, click_at
-    from egs_warp.segmentation.object_mask import Box, ObjectSpec
+    from egs_warp.segmentation.object_spec import Box, ObjectSpec
     from egs_warp.segmentation.votes import MaskedView
     from egs_warp.training.finetune import (
         Densification,
@@ -102,7 +102,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "render.rasteriser": ("render_gaussians",),
     "segmentation.clearance": ("Clearing", "ClearingOptions", "Reach"),
     "segmentation.clicks": ("Click", "click_at"),
-    "segmentation.object_mask": ("Box", "ObjectSpec"),
+    "segmentation.object_spec": ("Box", "ObjectSpec"),
     "segmentation.votes": ("MaskedView",),
     "training.finetune": ("Densification", "FinetuneOptions", "Rates", "TrainingView", "finetune", "views_of_capture"),
     "training.likeness": ("psnr",),

@@ -48,7 +48,7 @@ class ContactResponse:
         """Of ``contacts``; ``columns`` if they are known."""
         if columns is None:
             columns = tangent.problem.dt * tangent.solve(contacts.frame.T)
-        delassus = contacts.frame @ columns
+        delassus = contacts.speeds(columns)
         return cls(tangent, contacts, columns, delassus)
 
     def forces(self, free: np.ndarray, shift: np.ndarray, friction: float, start: np.ndarray) -> np.ndarray:
@@ -57,7 +57,7 @@ class ContactResponse:
             return start
         regular = self.delassus.copy()
         regular[np.diag_indices_from(regular)] += _SINGULAR * regular.diagonal().mean()
-        return coulomb_forces(regular, self.contacts.frame @ free, shift, friction, start)[0]
+        return coulomb_forces(regular, self.contacts.speeds(free), shift, friction, start)[0]
 
 
 @dataclass(frozen=True)

@@ -63,10 +63,10 @@ class DenseFactors:
             inverse = self._inverse = torch.linalg.solve_triangular(self._factor, self._identity, upper=False)
         return inverse.T @ (inverse @ right)
 
-    def product(self, entries: np.ndarray, right: torch.Tensor) -> torch.Tensor:
+    def quadratic(self, entries: np.ndarray, moves: torch.Tensor) -> torch.Tensor:
         """See ``Factors``."""
         self._fill(self._other, entries)
-        return self._other @ right
+        return moves.T @ (self._other @ moves)
 
     def take(self, values: np.ndarray) -> torch.Tensor:
         """See ``Factors``."""

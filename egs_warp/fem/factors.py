@@ -36,8 +36,9 @@ class Factors(Protocol):
         """(n,) or each column of (n, m), NumPy's or their own; alike comes back."""
         ...
 
-    def product(self, entries: np.ndarray, right: Any) -> Any:
-        """The matrix with upper ``entries`` (nnz,) times ``right`` (n, m), one of their own; alike comes back."""
+    def quadratic(self, entries: np.ndarray, moves: Any) -> Any:
+        """(m, m) X^T H X of the matrix H with upper ``entries`` (nnz,) and ``moves`` X (n, m), one of their own; alike
+        comes back."""
         ...
 
     def take(self, values: np.ndarray) -> Any:

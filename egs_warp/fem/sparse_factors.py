@@ -82,9 +82,13 @@ class SparseFactors:
         across, through, small = self._added
         return plain - through @ (small @ (across.T @ plain))
 
-    def product(self, entries: np.ndarray, right: np.ndarray) -> np.ndarray:
+    def quadratic(self, entries: np.ndarray, moves: np.ndarray) -> np.ndarray:
         """See ``Factors``."""
-        return sparse.csr_matrix((entries[self._full_from_upper], *self._full), shape=(len(right), len(right))) @ right
+        matrix = sparse.csr_matrix((entries[self._full_from_upper], *self._full), shape=(len(moves), len(moves)))
+        moves = np.ascontiguousarray(moves)
+        half = moves.shape[1] // 2
+        parts = beside(lambda: moves.T @ (matrix @ moves[:, :half]), lambda: moves.T @ (matrix @ moves[:, half:]))
+        return np.hstack(parts)
 
     def take(self, values: np.ndarray) -> np.ndarray:
         """See ``Factors``."""

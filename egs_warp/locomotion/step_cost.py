@@ -111,7 +111,7 @@ def effort_cost(
     further = factors.solve(factors.take(np.repeat(body.node_mass, 3)[:, None]) * speeds)
     moves = problem.dt * speeds + (time - problem.dt) * further
     moves[:, -1] -= problem.dt * factors.take(foreseen)
-    quadratic = factors.give(moves.T @ factors.product(entries, moves))
+    quadratic = factors.give(factors.quadratic(entries, moves))
     force = factors.give(factors.take(assembly.gradient(end, damping).ravel()) @ moves)
     unit = weight / (body.weight * body.height)
     return QuadraticCost(

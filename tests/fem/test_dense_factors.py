@@ -35,8 +35,8 @@ def pattern(count: int) -> sparse.csc_matrix:
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("diagonal", [30.0, 1.0])
 def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
-    """Solutions and products to rounding, with a sum and without; an indefinite matrix has no dense factors, but a sum
-    with it may have.
+    """Solutions and quadratic forms to rounding, with a sum and without; an indefinite matrix has no dense factors, but
+    a sum with it may have.
     """
     upper = pattern(60)
     dense, thin = DenseFactors(upper, device=device), SparseFactors(upper)
@@ -47,8 +47,12 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
         entries = entries_of(upper, seed, diagonal)
         definite = thin.update(entries)
         assert dense.update(entries) == dense.ready == definite == (diagonal == 30.0)
-        got = dense.give(dense.product(entries, dense.take(right)))
-        assert np.abs(got - thin.product(entries, right)).max() < 1e-12
+        matrix = thin.quadratic(entries, np.eye(60))
+        assert np.array_equal(matrix, matrix.T) and np.array_equal(
+            sparse.csc_matrix((entries, upper.indices, upper.indptr), upper.shape).toarray(), np.triu(matrix)
+        )
+        got = dense.give(dense.quadratic(entries, dense.take(right)))
+        assert np.abs(got - right.T @ matrix @ right).max() < 1e-10
         if definite:
             assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-12
             assert np.abs(dense.solve(right[:, 0]) - thin.solve(right[:, 0])).max() < 1e-12
@@ -58,8 +62,7 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
         # As much along every axis as makes the sum definite.
         assert dense.add(np.eye(60), np.full(60, 40.0)) and thin.add(np.eye(60), np.full(60, 40.0)) and dense.ready
         assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-10
-        matrix = thin.product(entries, np.eye(60)) + 40.0 * np.eye(60)
-        assert np.abs(matrix @ dense.solve(right) - right).max() < 1e-10
+        assert np.abs((matrix + 40.0 * np.eye(60)) @ dense.solve(right) - right).max() < 1e-10
 
 
 @pytest.mark.parametrize("device", DEVICES)
