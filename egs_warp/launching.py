@@ -11,10 +11,11 @@ import os
 import sys
 import tempfile
 import threading
+import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -31,6 +32,8 @@ U = TypeVar("U")
 Device: TypeAlias = wp.Device | str | None
 """A device or its name; None is Warp's current one."""
 
+THREADS = "EGS_WARP_THREADS"
+"""In the environment: how many cores the package may use at most, where that is less than there are."""
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 _MIN_ROWS_PER_CHUNK = 2048
 """Below this many light rows a launch's own cost (about 20 us) is no longer small against its work."""
@@ -44,7 +47,9 @@ _LAST_CHUNKS_PER_THREAD = 24
 
 def available_threads() -> int:
     """Number of processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    most = os.environ.get(THREADS, "")
+    return max(1, min(cores, int(most))) if most.isdecimal() else cores
 
 
 def use_device(device: str) -> None:
@@ -81,7 +86,9 @@ def _without_driver_warning() -> Iterator[None]:
         finally:
             os.dup2(kept, 2)
             said.seek(0)
-            os.write(2, b"".join(line for line in said if _NO_DRIVER not in line))
+            # A stream that is full or closed is not about the device.
+            with suppress(OSError):
+                os.write(2, b"".join(line for line in said if _NO_DRIVER not in line))
 
 
 def kernels_are_compiled() -> bool:
@@ -151,10 +158,10 @@ _recorded = _Recorded()
 
 
 def launch_again(kernel: Any, dim: int, *, inputs: Sequence[Any], outputs: Sequence[Any], device: wp.Device) -> None:
-    """``wp.launch`` at half its cost, for kernels that run many times a second.
+    """``wp.launch`` at a third of its cost, for kernels that run many times a second.
 
     The first launch of a thread is kept; the next ones only put in those arguments that are others than last time,
-    whose types are not checked again.
+    whose types are not checked again. A struct or vector that is the same object as last time may have other contents.
     """
     launches = _recorded.launches
     kept, kept_dim, held = launches.get((kernel, device.alias), (None, -1, []))
@@ -165,27 +172,32 @@ def launch_again(kernel: Any, dim: int, *, inputs: Sequence[Any], outputs: Seque
             return
         # What the launch keeps alive besides its packed arguments.
         kept.fwd_args = None  # pyright: ignore[reportAttributeAccessIssue]  # guessed from a list
+        held = [_UNKNOWN] * (len(inputs) + len(outputs))
+        launches[kernel, device.alias] = kept, dim, held
     else:
         if dim != kept_dim:
             kept.set_dim(dim)
-        put = kept.set_param_at_index_from_ctype
+            launches[kernel, device.alias] = kept, dim, held
         for i, value in enumerate((*inputs, *outputs)):
+            last = held[i]
             if isinstance(value, wp.array):
-                # Where it lies, not the array: that would keep its memory.
-                place = (value.ptr, value.shape, value.strides)
-                if held[i] != place:
-                    put(i, value.__ctype__())
-                    held[i] = place
+                # Held weakly: the array itself would keep its memory.
+                if type(last) is not weakref.ref or last() is not value:
+                    kept.set_param_at_index_from_ctype(i, value.__ctype__())
+                    held[i] = weakref.ref(value)
             elif isinstance(value, int | float):
-                if held[i] != value:
-                    put(i, value)
+                if type(last) is not type(value) or last != value:
+                    kept.set_param_at_index_from_ctype(i, value)
                     held[i] = value
-            else:
+            elif last is not value:
                 kept.set_param_at_index(i, value)
-                held[i] = None
-    launches[kernel, device.alias] = kept, dim, held or [None] * (len(inputs) + len(outputs))
+                held[i] = value
     if dim > 0:
         kept.launch()
+
+
+_UNKNOWN = object()
+"""Stands for an argument that was never put in."""
 
 
 def _chunk_edges(row_count: int, threads: int, work: np.ndarray | None) -> list[int]:
@@ -208,6 +220,8 @@ def _chunk_edges(row_count: int, threads: int, work: np.ndarray | None) -> list[
 
 def beside(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
     """Both results; ``second`` runs in another thread where one is free."""
+    if available_threads() == 1:
+        return first(), second()
     helper = _pool().submit(second)
     try:
         done = first()
@@ -256,6 +270,8 @@ def empty_together(device: Device, *wanted: tuple[Shape, Any]) -> list[wp.array]
         starts.append(total)
         count = shape if isinstance(shape, int) else math.prod(shape)
         total += -(-count * wp.types.type_size_in_bytes(dtype) // _ALIGNMENT) * _ALIGNMENT
+    if device.is_cuda:
+        _keep_memory(device.alias)
     # In rows, for no side of an array may have 2^31 entries.
     memory = empty((max(total // _ALIGNMENT, 1), _ALIGNMENT), wp.uint8, device)
     pieces = []
@@ -270,6 +286,20 @@ def empty_together(device: Device, *wanted: tuple[Shape, Any]) -> list[wp.array]
         while len(kept) > _POOLED_KINDS:
             kept.popitem(last=False)
     return list(pieces)
+
+
+@cache
+def _keep_memory(alias: str) -> None:
+    """Let Warp keep some of the memory that is free: by CUDA's default a GPU gives all of it back whenever anyone waits
+    for it, and to have it mapped again takes as long as a picture of a small scene."""
+    device = wp.get_device(alias)
+    share = device.total_memory // _KEPT_SHARE
+    if device.is_mempool_enabled and wp.get_mempool_release_threshold(device) < share:
+        wp.set_mempool_release_threshold(device, share)
+
+
+_KEPT_SHARE = 32
+"""The part of a GPU's memory that is kept is one in so many."""
 
 
 def _holders(pieces: list[wp.array]) -> int:

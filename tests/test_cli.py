@@ -35,6 +35,10 @@ from egs_warp.segmentation.clearance import Clearing
         (["--height", "11"], "--height 11.0: give a number of body heights from 0 to 10"),
         (["--height", "0"], "--height 0: a jump needs a height above 0 body heights"),
         (["--frames", "0"], "--frames 0: give a whole number of at least 2; the first picture is at rest"),
+        (["--frames", "9" * 20], f"--frames {'9' * 20}: give at most 216000, which is an hour"),
+        (["--front", "1e308,1e308,0"], "--front 1e308,1e308,0: give three numbers x,y,z or an axis as -y"),
+        (["--plane", "0,0,1,1e300"], "--plane 0,0,1,1e300: lies 1e+300 units from the origin; give at most 1e+12"),
+        (["--plane", "1" * 300], f"{'1' * 60}...: no such file or folder, the name is too long; check the path"),
         (["--size", "99999"], "--size 99999x99999: give pixels from 16 to 4096, as 512 or 640x360"),
         (["--camera", "none.json"], "none.json: no such file"),
         (["--fps", "-1"], "--fps -1.0: give a number of frames a second from 1 to 1000"),
@@ -62,6 +66,7 @@ from egs_warp.segmentation.clearance import Clearing
         ([], "nothing.ply"),
     ],
 )
+@pytest.mark.filterwarnings("error")
 def test_bad_input_is_one_line(
     flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -98,6 +103,25 @@ def test_values_may_begin_with_a_minus_and_wrong_flags_take_one_line(
     assert status == 2
     assert message in error
     assert error.startswith("egs-warp") and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "animate {long} --out {out}",
+        "animate {capture} --out {out} --object {long} --up z",
+        "animate {capture} --out {out} --object 0,0,0.5 --cameras {long} --up z",
+        "animate {capture} --out {out} --background {long} --up z",
+        "convert {long} {out}.ply",
+        "view {long}",
+    ],
+)
+def test_names_that_are_too_long_are_one_line(line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_ply(tmp_path / "a.ply", pawn(gaussian_count=50, device="cpu").cloud)
+    given = {"long": "a" * 300, "capture": tmp_path / "a.ply", "out": tmp_path / "out"}
+    assert main([word.format(**given) for word in line.split()]) == 2
+    error = capsys.readouterr().err
+    assert "no such file" in error and error.count("\n") == 1
 
 
 def test_flat_object_leaves_an_earlier_result_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

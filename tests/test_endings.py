@@ -130,6 +130,43 @@ def test_a_closed_pipe_only_silences() -> None:
     assert run.wait(60) == 0
 
 
+def told_by(command: str, *, encoding: str = "utf-8") -> tuple[int, str, str]:
+    """Status and output of a command of the shell, in which ``egs-warp`` stands for the program."""
+    line = command.replace("egs-warp", f"{sys.executable} -m egs_warp.cli")
+    environment = os.environ | {"PYTHONIOENCODING": encoding}
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, env=environment, timeout=120)
+    return done.returncode, done.stdout, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "status"),
+    [
+        pytest.param("egs-warp doctor >&-", 0, marks=pytest.mark.slow),
+        ("egs-warp doctor <&- >&- 2>&-", 0),
+        pytest.param("egs-warp animate none.ply --out never 2>&-", 2, marks=pytest.mark.slow),
+        ("egs-warp animate none.ply --out never 2>/dev/full", 2),
+        ("egs-warp doctor >/dev/full", 1),
+    ],
+)
+def test_output_that_goes_nowhere_changes_no_status(command: str, status: int) -> None:
+    """But where what was asked for is itself the output."""
+    ended, _, said = told_by(command)
+    assert ended == status and "Traceback" not in said and said.count("\n") <= 1
+
+
+def test_files_are_not_opened_in_the_place_of_closed_streams() -> None:
+    """What a library prints would go into them."""
+    code = "from egs_warp.commands.endings import one_line_errors\nwith one_line_errors('prog'):\n"
+    code += " import os, tempfile\n with tempfile.TemporaryFile() as file: os._exit(file.fileno())"
+    assert told_by(f'{sys.executable} -c "$(cat <<"END"\n{code}\nEND\n)" <&- >&- 2>&-')[0] > 2
+
+
+def test_letters_that_a_terminal_does_not_know(tmp_path: Path) -> None:
+    """Of a folder's name, told when all is written."""
+    status, said, error = told_by(f"egs-warp samples '{tmp_path}/é'", encoding="ascii")
+    assert status == 0 and "\\xe9" in said and error == ""
+
+
 def test_the_command_is_quick_to_refuse() -> None:
     """No heavy package is imported for a wrong flag or the version."""
     code = "import sys\nfrom egs_warp.cli import main\ntry:\n main(sys.argv[1:])\nexcept SystemExit as end:\n"

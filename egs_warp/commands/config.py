@@ -6,6 +6,7 @@ import argparse
 import hashlib
 import os
 import re
+import reprlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -54,20 +55,21 @@ def with_config(arguments: Sequence[str], parser: argparse.ArgumentParser) -> li
             continue
         if name not in actions:
             near = ", ".join(sorted(actions))
-            raise UserError(f"{path}: unknown key {key!r}; give some of {near}")
+            raise UserError(f"{path}: unknown key {_shown(key)}; give some of {near}")
         if value is None or value is False:
             continue
         action = actions[name]
         if isinstance(action, argparse._AppendAction):
             option, texts = action.option_strings[0], value if isinstance(value, list) else [value]
             if not all(isinstance(one, str | int | float) for one in texts):
-                raise UserError(f"{path}: {key} is {value!r}; give a text or a list of texts")
+                raise UserError(f"{path}: {key} is {_shown(value)}; give a text or a list of texts")
             # Given beside it, none of the file's: they would mean both.
             if not any(argument == option or argument.startswith(f"{option}=") for argument in rest):
                 flags += [f"{option}={_from_file(name, str(one), path.parent)}" for one in texts]
             continue
         if (value is True) != (action.nargs == 0) or not isinstance(value, bool | int | float | str):
-            raise UserError(f"{path}: {key} is {value!r}; give {'true' if action.nargs == 0 else 'a text or a number'}")
+            wanted = "true" if action.nargs == 0 else "a text or a number"
+            raise UserError(f"{path}: {key} is {_shown(value)}; give {wanted}")
         text = _from_file(name, str(value), path.parent)
         if not action.option_strings:
             positional.append(text)
@@ -118,8 +120,17 @@ def _read(path: Path) -> dict[Any, Any]:
 
     from egs_warp.io.text import read_text
 
+    class Plain(yaml.SafeLoader):
+        """Without aliases: a few lines of them stand for more than fits into any memory."""
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                where = self.peek_event().start_mark
+                raise yaml.MarkedYAMLError(problem="an alias, *name; write out what it stands for", problem_mark=where)
+            return super().compose_node(parent, index)
+
     try:
-        tree = yaml.safe_load(read_text(path))
+        tree = yaml.load(read_text(path), Plain)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         if isinstance(error, UserError):
             raise
@@ -127,6 +138,13 @@ def _read(path: Path) -> dict[Any, Any]:
     if not isinstance(tree, dict):
         raise UserError(f"{path}: no keys and values; write one flag a line, as motion: jump")
     return tree
+
+
+def _shown(value: Any) -> str:
+    """For a message, not in full where it is long."""
+    short = reprlib.Repr()
+    short.maxstring = short.maxother = 80
+    return short.repr(value)
 
 
 def _from_file(name: str, value: str, folder: Path) -> str:

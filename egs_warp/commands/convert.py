@@ -43,6 +43,7 @@ def _convert(chosen: argparse.Namespace) -> int:
     from egs_warp.geometry.gaussians import with_degree
     from egs_warp.io import read_capture, writable_folder
     from egs_warp.io.losses import losses
+    from egs_warp.io.run_folder import check_no_file_of_a_run
     from egs_warp.io.sequence import numbered_captures
     from egs_warp.io.writing import WRITERS, writer_of
     from egs_warp.launching import use_device
@@ -54,6 +55,7 @@ def _convert(chosen: argparse.Namespace) -> int:
             raise UserError(f"{chosen.out}: its folder does not exist; create {chosen.out.parent} first")
         if chosen.out.exists() and chosen.capture.exists() and chosen.out.samefile(chosen.capture):
             raise UserError(f"{chosen.out}: is what is read; give another name")
+        check_no_file_of_a_run(chosen.out)
         pairs = [(chosen.capture, chosen.out)]
     else:
         ending, write = WRITERS[chosen.to]

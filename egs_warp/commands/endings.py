@@ -61,8 +61,11 @@ def one_line_errors(program: str) -> Iterator[None]:
         except MemoryError:
             end(1, "not enough memory; give a smaller capture, picture or number of Gaussians")
         except OSError as error:
-            if error.errno not in _GAVE_OUT + _REFUSED:
+            if error.errno not in (*_GAVE_OUT, *_REFUSED, errno.ENAMETOOLONG):
                 raise
+            if error.errno == errno.ENAMETOOLONG:
+                # Python's own look whether a file is there raises it.
+                end(2, f"{str(error.filename)[:60]}...: no such file or folder, the name is too long; check the path")
             place = f"{error.filename}: " if error.filename else ""
             end(1 if _gave_out(error) else 2, f"{place}{error.strerror}; free some space, or choose another place")
 
@@ -115,21 +118,40 @@ def _signals() -> Iterator[None]:
 
 @contextmanager
 def _deaf_streams() -> Iterator[None]:
-    """Output within goes on in silence where nobody reads it any more."""
+    """Output within goes on in silence where nobody reads it any more, or ever did; what cannot be told on stderr stops
+    nothing.
+    """
+    _open_standard_files()
     before = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = _Stream(before[0]), _Stream(before[1])
-    try:
-        yield
-        sys.stdout.flush()
-    finally:
-        sys.stdout, sys.stderr = before
+    # Python has none where the shell has closed it.
+    with open(os.devnull, "w") as nowhere:
+        sys.stdout = _Stream(before[0] or nowhere, BrokenPipeError)
+        sys.stderr = _Stream(before[1] or nowhere, OSError)
+        try:
+            yield
+            sys.stdout.flush()
+        finally:
+            sys.stdout, sys.stderr = before
+
+
+def _open_standard_files() -> None:
+    """Those that the shell has closed lead nowhere: the next file that is opened would get their number, and with it
+    whatever libraries print.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            # The lowest that is free: this one.
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
 
 
 class _Stream:
-    """A text stream whose reader may go away."""
+    """A text stream whose reader may go away, or know fewer letters."""
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
+    def __init__(self, stream: TextIO, lost: type[OSError]) -> None:
+        """``lost``: errors at which it falls silent."""
+        self._stream, self._lost = stream, lost
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
@@ -138,7 +160,10 @@ class _Stream:
         """As that of the stream."""
         try:
             return self._stream.write(text)
-        except BrokenPipeError:
+        except UnicodeEncodeError as error:
+            # The name of a folder, say, at the end of hours of work.
+            return self._stream.write(text.encode(error.encoding, "backslashreplace").decode(error.encoding))
+        except self._lost:
             self._silence()
             return len(text)
 
@@ -146,7 +171,7 @@ class _Stream:
         """As that of the stream."""
         try:
             self._stream.flush()
-        except BrokenPipeError:
+        except self._lost:
             self._silence()
 
     def _silence(self) -> None:

@@ -86,7 +86,8 @@ def parse_direction(flag: str, text: str) -> np.ndarray:
         direction = np.array([float(part) for part in text.split(",")])
     except ValueError:
         direction = np.zeros(0)
-    length = float(np.linalg.norm(direction))
+    with np.errstate(over="ignore", invalid="ignore"):
+        length = float(np.linalg.norm(direction))
     if len(direction) != 3 or not np.isfinite(length) or length == 0.0:
         raise UserError(f"--{flag} {text}: give three numbers x,y,z or an axis as -y")
     return direction / length
@@ -95,12 +96,16 @@ def parse_direction(flag: str, text: str) -> np.ndarray:
 def parse_plane(text: str) -> Plane:
     """Plane from ``nx,ny,nz,d``. Raises ``UserError`` otherwise."""
     from egs_warp.geometry.plane import Plane
+    from egs_warp.io.limits import FURTHEST
 
     try:
         nx, ny, nz, d = (float(part) for part in text.split(","))
     except ValueError as error:
         raise UserError(f"--plane {text}: give four numbers nx,ny,nz,d") from error
-    return Plane.from_coefficients(nx, ny, nz, d)
+    plane = Plane.from_coefficients(nx, ny, nz, d)
+    if abs(plane.offset) > FURTHEST:
+        raise UserError(f"--plane {text}: lies {abs(plane.offset):g} units from the origin; give at most {FURTHEST:g}")
+    return plane
 
 
 def guessed_up(capture: Capture) -> tuple[np.ndarray, str]:

@@ -77,6 +77,8 @@ def _session(chosen: argparse.Namespace) -> Session:
     from egs_warp.commands.scene_input import ground_of, plane_of
     from egs_warp.io import read_capture
     from egs_warp.io.run_folder import check_out
+    from egs_warp.io.text import parse_json, read_text
+    from egs_warp.meshing.cage import check_nodes
     from egs_warp.pipelines.animate import AnimateOptions
     from egs_warp.pipelines.creature import make_creature
     from egs_warp.pipelines.progress import preparation_bar
@@ -85,6 +87,9 @@ def _session(chosen: argparse.Namespace) -> Session:
     from egs_warp.web.session import Session, SessionOptions
 
     check_out(chosen.out)
+    check_nodes(chosen.nodes)
+    if chosen.muscles is not None:
+        parse_json(read_text(chosen.muscles), chosen.muscles)
     options = AnimateOptions(friction=chosen.friction, metres_per_unit=chosen.metres_per_unit)
     up = parse_up(chosen.up) if chosen.up is not None else None
     plane = plane_of(chosen.plane) if chosen.plane is not None else None

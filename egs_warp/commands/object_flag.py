@@ -14,9 +14,11 @@ from egs_warp.geometry.camera import shrunk
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.lens import Straightening
 from egs_warp.io.cameras import PosedImage
-from egs_warp.io.limits import check_pixels, picture_size, read_bytes
+from egs_warp.io.limits import FURTHEST, check_pixels, picture_size, read_bytes
+from egs_warp.segmentation.carried_masks import masks_of_clicks, salient_masks
 from egs_warp.segmentation.clicks import Click, click_at
-from egs_warp.segmentation.object_mask import Box, ObjectSpec
+from egs_warp.segmentation.mask_model import OnnxClickModel, SalientModel
+from egs_warp.segmentation.object_spec import Box, ObjectSpec
 from egs_warp.segmentation.votes import MaskedView
 
 MAX_MASK_SIDE = 800
@@ -25,6 +27,9 @@ _HELP = (
     "give a mask.png, a folder of masks, x,y,z on it, a box x0,y0,z0,x1,y1,z1, a pixel u,v with --view, or clicks "
     "+u,v@photo on it and -u,v@photo beside it"
 )
+_MOST_DIGITS = 10
+"""Of the number of a camera."""
+_SALIENT = "salient"
 _CLICK = re.compile(r"([+-]?)([0-9.]+),([0-9.]+)@(.+)", re.DOTALL)
 
 
@@ -35,11 +40,13 @@ def read_object(
     *,
     view: str | None = None,
     flag: str = "--object",
+    mask_model: Path | None = None,
 ) -> ObjectSpec:
     """What ``--object TEXT`` means, given once or several times, or that of another ``flag``: a mask's file, a folder
-    of masks, a point, a box, or a pixel of the view ``view``; and clicks, which alone will do.
+    of masks, a point, a box, or a pixel of the view ``view``; clicks, which alone will do; or ``salient``.
 
-    Masks belong to the camera whose photo has the same name. Raises ``UserError`` with one line for anything else.
+    With ``mask_model``, a network's file, clicks become masks. Masks belong to the camera whose photo has the same
+    name. Raises ``UserError`` with one line for anything else.
     """
     given = [texts] if isinstance(texts, str) else list(texts)
     found: list[ObjectSpec] = []
@@ -47,24 +54,48 @@ def read_object(
     for text in given:
         if not text.strip():
             raise UserError(f"{flag}: nothing is given; {_HELP}")
-        click = None if Path(text).exists() else _CLICK.fullmatch(text)
+        click = None if _is_there(text) else _CLICK.fullmatch(text)
         if click is not None:
             one = _view_named(posed or (), click[4], text)
             clicks.append(_click(cloud, one, click[2], click[3], text, inside=click[1] != "-"))
-        elif not Path(text).exists() and text.count(",") == 1:
+        elif not _is_there(text) and text.count(",") == 1:
             clicks.append(_pixel(text, cloud, posed, view, flag))
+        elif text == _SALIENT and not _is_there(text):
+            found.append(_salient(cloud, posed, flag))
         else:
             found.append(_place(text, posed, view, flag))
     if len(found) > 1:
         raise UserError(
             f"{flag}: {len(found)} places, {given[0]} and others; give one, and clicks +u,v@photo beside it"
         )
+    if mask_model is not None:
+        if found or not clicks:
+            raise UserError(f"--mask-model {mask_model}: it makes masks from clicks; give {flag} +u,v@photo alone")
+        model = OnnxClickModel.read(mask_model)
+        masks = masks_of_clicks(cloud, clicks, [one.camera for one in posed or ()], model)
+        return ObjectSpec(masks=tuple(masks), clicks=tuple(clicks))
     return replace(found[0], clicks=tuple(clicks)) if found else ObjectSpec.of_clicks(clicks)
+
+
+def _is_there(text: str) -> bool:
+    try:
+        return Path(text).exists()
+    # A name that is too long.
+    except OSError:
+        return False
+
+
+def _salient(cloud: GaussianCloud, posed: Sequence[PosedImage] | None, flag: str) -> ObjectSpec:
+    """Masks of what stands out of the photos' pictures."""
+    if not posed:
+        raise UserError(f"{flag} {_SALIENT}: needs pictures to look at; give --cameras, or a point x,y,z")
+    masks = salient_masks(cloud, [one.camera for one in posed], SalientModel.installed())
+    return ObjectSpec(masks=tuple(masks))
 
 
 def _place(text: str, posed: Sequence[PosedImage] | None, view: str | None, flag: str) -> ObjectSpec:
     """Masks, a point or a box."""
-    if Path(text).exists():
+    if _is_there(text):
         return ObjectSpec(masks=tuple(_read_masks(Path(text), posed, view)))
     try:
         numbers = np.array([float(part) for part in text.split(",")])
@@ -72,6 +103,8 @@ def _place(text: str, posed: Sequence[PosedImage] | None, view: str | None, flag
         raise UserError(f"{flag} {text}: no such file, nor numbers; {_HELP}") from None
     if not np.isfinite(numbers).all() or len(numbers) not in (3, 6):
         raise UserError(f"{flag} {text}: {len(numbers)} numbers; {_HELP}")
+    if np.abs(numbers).max() > FURTHEST:
+        raise UserError(f"{flag} {text}: further than {FURTHEST:g} units from the origin, where nothing lies; {_HELP}")
     if len(numbers) == 3:
         return ObjectSpec(point=numbers)
     low, high = np.minimum(numbers[:3], numbers[3:]), np.maximum(numbers[:3], numbers[3:])
@@ -117,7 +150,8 @@ def _view_named(posed: Sequence[PosedImage], view: str | None, what: str) -> Pos
         if len(posed) == 1:
             return posed[0]
         raise UserError(f"--object {what}: {len(posed)} cameras; say which with --view NAME or NUMBER")
-    if view.isdigit() and int(view) < len(posed):
+    # Digits of other scripts, and thousands of them, are no number of a camera.
+    if view.isdecimal() and len(view) < _MOST_DIGITS and int(view) < len(posed):
         return posed[int(view)]
     for one in posed:
         if view in (one.name, Path(one.name).name, Path(one.name).stem):

@@ -26,13 +26,15 @@ def add_parser(commands: Commands) -> None:
 
 
 def _resume(chosen: argparse.Namespace) -> int:
-    from egs_warp.io.run_folder import has_finished
+    from egs_warp.io.run_folder import has_finished, tidy
     from egs_warp.io.text import parse_json, read_text
     from egs_warp.pipelines.ending import State
+    from egs_warp.pipelines.finished_run import PARTS
 
     folder: Path = chosen.folder
     if has_finished(folder):
         report = parse_json(read_text(folder / "report.json"), folder / "report.json")
+        tidy(folder, PARTS)
         print(f"{folder}: this run has finished")
         return (
             FALLEN

@@ -9,7 +9,7 @@ import numpy as np
 from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.contact.detection import ContactDetector, ContactSet, push_out_speeds
 from egs_warp.contact.points import ContactPoints
-from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.factors import Factors
 from egs_warp.fem.step_problem import Tangent
 from egs_warp.muscles.tension import MuscleTension
 
@@ -48,7 +48,7 @@ class ContactResponse:
         """Of ``contacts``; ``columns`` if they are known."""
         if columns is None:
             columns = tangent.problem.dt * tangent.solve(contacts.frame.T)
-        delassus = contacts.frame @ columns
+        delassus = contacts.speeds(columns)
         return cls(tangent, contacts, columns, delassus)
 
     def forces(self, free: np.ndarray, shift: np.ndarray, friction: float, start: np.ndarray) -> np.ndarray:
@@ -57,7 +57,7 @@ class ContactResponse:
             return start
         regular = self.delassus.copy()
         regular[np.diag_indices_from(regular)] += _SINGULAR * regular.diagonal().mean()
-        return coulomb_forces(regular, self.contacts.frame @ free, shift, friction, start)[0]
+        return coulomb_forces(regular, self.contacts.speeds(free), shift, friction, start)[0]
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class CoupledSolver:
 
     detector: ContactDetector
     points: ContactPoints
-    factors: SparseFactors
+    factors: Factors
     push_out_cap: float
     """m/s."""
     penetration_tolerance: float

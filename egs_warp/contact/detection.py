@@ -20,6 +20,7 @@ from egs_warp.geometry.rows import distinct_rows
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.kernels.contact import gaps as kernels
 from egs_warp.kernels.contact.height_field import ground_gaps_kernel
+from egs_warp.launching import launch_again, put
 from egs_warp.precision import Mat33, Vec3, Vec4, real
 
 LEAST_OUTSIDE = 0.1
@@ -94,11 +95,17 @@ class ContactSet:
         """(n,) the node that each point goes with most."""
         return self.nodes[np.arange(self.count), np.argmax(self.weights, axis=1)]
 
+    def speeds(self, velocities: np.ndarray) -> np.ndarray:
+        """``frame`` times nodal velocities (3N,) or (3N, k), by the four nodes that each contact knows."""
+        each = velocities[3 * self.nodes[:, :, None] + np.arange(3)].reshape(self.count, 4, velocities[:3].size)
+        at_points = (self.weights[:, None, :] @ each).reshape(self.count, 3, velocities[0].size)
+        return (self.axes @ at_points).reshape(3 * self.count, *velocities.shape[1:])
+
     def end_gaps(self, dt: float, velocities: np.ndarray) -> np.ndarray:
         """(n,) gap after a step of ``dt`` with nodal end velocities (N, 3), to the tangent plane of the start where the
         ground is not flat.
         """
-        return self.gaps + dt * (self.frame @ velocities.ravel())[0::3]
+        return self.gaps + dt * self.speeds(velocities.ravel())[0::3]
 
 
 def contact_geometry(
@@ -233,7 +240,7 @@ class ContactDetector:
 
     def __init__(self, geometry: ContactGeometry, *, device: str | None = None) -> None:
         self.geometry = geometry
-        self._device = device
+        self._device = wp.get_device(device)
         self._tet_from_point = wp.array(geometry.tet_from_point, dtype=int, device=device)
         self._weights = wp.array(geometry.weights, dtype=Vec4, device=device)
         self._tets = wp.array(geometry.mesh.tets, dtype=wp.vec4i, device=device)
@@ -258,10 +265,10 @@ class ContactDetector:
         Of a solid's faces the one counts that the point is furthest in front of, or least far behind; to ground that is
         not flat the distance is ``HeightField.gaps``.
         """
-        self._positions.assign(np.ascontiguousarray(positions))
-        wp.launch(
+        put(self._positions, positions)
+        launch_again(
             kernels.point_gaps_kernel,
-            dim=len(self.geometry.tet_from_point),
+            len(self.geometry.tet_from_point),
             inputs=[
                 self._tets,
                 self._tet_from_point,

@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy.linalg as dense
 from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.elasticity import Damping
-from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.factors import Factors
 from egs_warp.muscles.tension import MuscleTension
 
 _NEGLIGIBLE = 1e-3
@@ -110,29 +109,20 @@ class StepProblem:
         change = (1.0 + self.dt * self.drag) * velocities - self.state.velocities - self.dt * self.body.gravity - turned
         return self.mass * change + self.dt * internal
 
-    def tangent(self, factors: SparseFactors, velocities: np.ndarray, tension: MuscleTension | None) -> Tangent:
+    def tangent(self, factors: Factors, velocities: np.ndarray, tension: MuscleTension | None) -> Tangent:
         """The derivative of the residual at ``velocities`` (N, 3), or a definite one near it, factored by
         ``factors``. Raises ``UnsolvableStepError`` where it has no factors.
         """
         definite = factors.update(self._entries(velocities, projected=False))
-        across, rates = np.zeros((len(self.turns), 0)), np.zeros(0)
         if tension is not None:
             across, rates = tension.hessian(self.end_positions(velocities)).factors(least=_NEGLIGIBLE)
-        if factors.ready and len(rates) > 0:
-            through = factors.solve(across)
-            small = across.T @ through
-            small[np.diag_indices_from(small)] += 1.0 / (self.dt**2 * rates)
-            # Haynsworth: negative eigenvalues of the sum = those of S + positive ones of the small matrix - pulling
-            # directions.
-            positive, inverse = _inverse(small)
-            if factors.negative_pivots + positive == int((rates > 0.0).sum()):
-                return Tangent(self, factors, across, through, inverse)
+            if factors.add(across, self.dt**2 * rates):
+                return Tangent(self, factors)
         if not definite:
             factors.update(self._entries(velocities, projected=True))
         if not factors.ready:
             raise UnsolvableStepError("the tangent is singular or not finite")
-        nothing = np.zeros((len(self.turns), 0))
-        return Tangent(self, factors, nothing, nothing, np.zeros((0, 0)))
+        return Tangent(self, factors)
 
     def _entries(self, velocities: np.ndarray, *, projected: bool) -> np.ndarray:
         """Upper entries of S = (1 + dt alpha) M + dt C + dt^2 K at the end of ``velocities``."""
@@ -143,53 +133,26 @@ class StepProblem:
         return entries
 
 
-def _inverse(symmetric: np.ndarray) -> tuple[int, np.ndarray]:
-    """How many eigenvalues of the lower triangle's matrix (n, n) are positive, and its inverse, from one
-    Bunch-Kaufman factorisation; not finite where the matrix is singular.
-    """
-    factor, invert = dense.get_lapack_funcs(("sytrf", "sytri"), (symmetric,))
-    factors, pivots, info = factor(symmetric, lower=1)
-    if info > 0:
-        return -1, np.full_like(symmetric, np.nan)
-    # A block of two, marked by negative pivots, has an eigenvalue of each sign.
-    positive = int((factors.diagonal()[pivots > 0] > 0.0).sum()) + int((pivots < 0).sum()) // 2
-    inverse, _ = invert(factors, pivots, lower=1)
-    lower = np.tril(inverse, -1)
-    return positive, lower + lower.T + np.diag(inverse.diagonal())
-
-
 @dataclass(frozen=True)
 class Tangent:
-    """Inverse J^-1 of the derivative of a step's residual: S of the elements, the muscles' stiffness by Woodbury, the
-    momentum kept.
+    """Inverse J^-1 of the derivative of a step's residual: S of the elements, the muscles' stiffness, the momentum
+    kept.
 
     J = S + dt^2 (K_a - M turns I^-1 turns^T (K + K_a)). Its inverse is that of S + dt^2 K_a with so much of a turn
     added that each column of the result has the angular momentum of the impulse.
     """
 
     problem: StepProblem
-    factors: SparseFactors
-    across: np.ndarray
-    """(3N, 2m) directions across the muscles that count."""
-    through: np.ndarray
-    """(3N, 2m) S^-1 of them."""
-    small: np.ndarray
-    """(2m, 2m) inverse of the capacitance matrix."""
+    factors: Factors
 
     @cached_property
     def _turning(self) -> tuple[np.ndarray, np.ndarray]:
-        turned = self._plain(self.problem.momenta.T)
+        turned = self.factors.solve(self.problem.momenta.T)
         return turned, np.linalg.inv((1.0 + self.problem.dt * self.problem.drag) * self.problem.momenta @ turned)
-
-    def _plain(self, impulses: np.ndarray) -> np.ndarray:
-        plain = self.factors.solve(impulses)
-        if self.across.shape[1] == 0:
-            return plain
-        return plain - self.through @ (self.small @ (self.across.T @ plain))
 
     def solve(self, impulses: np.ndarray) -> np.ndarray:
         """(3N,) or (3N, m) m/s that ``impulses`` of that shape, N s, bring about."""
-        problem, plain = self.problem, self._plain(impulses)
+        problem, plain = self.problem, self.factors.solve(impulses)
         turned, inverse = self._turning
         mass_ratio = 1.0 + problem.dt * problem.drag
         missing = problem.turns.T @ impulses - mass_ratio * (problem.momenta @ plain)

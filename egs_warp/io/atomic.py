@@ -74,15 +74,19 @@ def writable_folder(path: Path | str) -> Path:
     return folder
 
 
-def sweep(folder: Path) -> None:
-    """Remove what ``atomic_write`` of killed processes has left in ``folder``; those of living ones are locked."""
+def sweep(folder: Path) -> bool:
+    """Remove what ``atomic_write`` of killed processes has left in ``folder``; those of living ones are locked. Returns
+    whether there is any that is too young to be told from those.
+    """
+    young = False
     if fcntl is None:
-        return
+        return young
     for entry in os.scandir(folder):
         try:
             if not _TEMPORARY.fullmatch(entry.name) or not entry.is_file(follow_symlinks=False):
                 continue
             if abs(time.time() - entry.stat(follow_symlinks=False).st_mtime) < _YOUNGEST:
+                young = True
                 continue
             descriptor = os.open(entry.path, os.O_RDWR)
             try:
@@ -93,6 +97,16 @@ def sweep(folder: Path) -> None:
         # Another process was faster, or may do what we may not.
         except OSError:
             continue
+    return young
+
+
+def sweep_all(folder: Path) -> None:
+    """``sweep``, waiting for what is too young, seconds at most: a program that a killed process had started, such as
+    ffmpeg, may have written to the last.
+    """
+    give_up = time.monotonic() + 2.0 * _YOUNGEST
+    while sweep(folder) and time.monotonic() < give_up:
+        time.sleep(0.05 * _YOUNGEST)
 
 
 @contextmanager

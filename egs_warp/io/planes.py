@@ -14,7 +14,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.height_field import HeightField, check_grid
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.atomic import atomic_write
-from egs_warp.io.limits import LARGEST_TEXT, read_bytes
+from egs_warp.io.limits import FURTHEST, LARGEST_TEXT, read_bytes
 from egs_warp.io.text import whole_number
 
 _MOST_TEXELS = 1 << 13
@@ -110,6 +110,8 @@ class KnownPlane:
             raise UserError(f"{path}: plane {number} needs normal [x, y, z] and offset; make it again") from error
         nx, ny, nz = normal.tolist()
         plane = Plane.from_coefficients(nx, ny, nz, offset)
+        if abs(plane.offset) > FURTHEST:
+            raise UserError(f"{path}: plane {number} lies {abs(plane.offset):g} units from the origin; make it again")
         try:
             centre = np.array(entry["centre"], dtype=float).reshape(3) if "centre" in entry else None
             numbers = {name: float(entry[name]) for name in _NUMBERS if name in entry}

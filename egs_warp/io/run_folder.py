@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from egs_warp.errors import ArgumentError, UserError
-from egs_warp.io.atomic import atomic_write, lock, sweep, writable_folder
+from egs_warp.io.atomic import atomic_write, lock, sweep, sweep_all, writable_folder
 from egs_warp.io.limits import LARGEST_TEXT, read_bytes
 from egs_warp.io.text import parse_json, read_text
 from egs_warp.version import __version__
@@ -87,7 +87,7 @@ class RunFolder:
             if name not in facts and name not in self._kept:
                 shutil.rmtree(self.path / name, ignore_errors=True)
         # What the run that was cut off has left was too young when this one began, perhaps.
-        sweep(self.path)
+        sweep_all(self.path)
 
     def _write_manifest(self, files: dict[str, Any], *, finished: bool) -> None:
         about = {"schema": _SCHEMA, "version": __version__, "command": self._command, "finished": finished}
@@ -141,6 +141,21 @@ def run_folder(
         yield RunFolder(folder, command=command, overwrite=overwrite, names=_known(folder)[:-1] if resume else ())
 
 
+def tidy(out: Path | str, scratch: str) -> None:
+    """Remove what a run that was killed as it ended has left in the folder ``out`` beside its files: its folder
+    ``scratch``, its lock, half-written files. Of one that still runs it removes nothing.
+    """
+    folder = Path(out)
+    try:
+        with lock(folder / _LOCK) as free:
+            if free:
+                shutil.rmtree(folder / scratch, ignore_errors=True)
+                sweep(folder)
+    # Where one may not write nothing is removed.
+    except OSError:
+        pass
+
+
 def _check(out: Path | str, *, overwrite: bool, resume: bool) -> None:
     if not resume:
         check_run_folder(out, overwrite=overwrite)
@@ -154,7 +169,7 @@ def has_finished(out: Path | str) -> bool:
     """
     check_out(out)
     path = Path(out) / MANIFEST
-    if not path.is_file():
+    if not path.is_file() or _is_hollow(Path(out)):
         raise UserError(f"{out}: no run has begun to write here; begin it")
     manifest = parse_json(read_text(path), path)
     if not isinstance(manifest, dict) or not _names_in(manifest):
@@ -179,11 +194,18 @@ def check_run_folder(out: Path | str, *, overwrite: bool = False, writes: Sequen
     check_out(out)
     if overwrite:
         return
-    if (Path(out) / MANIFEST).is_file():
+    if (Path(out) / MANIFEST).is_file() and not _is_hollow(Path(out)):
         raise _occupied(out, "it has an earlier run")
     for name in writes:
         if (Path(out) / name).exists():
             raise _occupied(out, f"it has {name}")
+
+
+def check_no_file_of_a_run(path: Path | str) -> None:
+    """Raise ``UserError`` where ``path`` is a file that a run has written: its checksum would be another's."""
+    path = Path(path)
+    if path.exists() and (path.parent / MANIFEST).is_file() and path.name in _known(path.parent):
+        raise UserError(f"{path}: is a file of the run in {path.parent}; choose another name")
 
 
 def check_out(out: Path | str) -> None:
@@ -217,14 +239,25 @@ def _occupied(out: Path | str, what: str) -> UserError:
 
 def _known(folder: Path) -> list[str]:
     """Files of the earlier run in ``folder`` by its manifest, which comes last."""
-    path = folder / MANIFEST
-    if not path.is_file():
+    if not (folder / MANIFEST).is_file() or _is_hollow(folder):
         return []
+    return [*_names_in(_manifest(folder)), MANIFEST]
+
+
+def _is_hollow(folder: Path) -> bool:
+    """Whether the manifest in ``folder`` is of a run that was killed between it and its first file: of no run."""
+    manifest = _manifest(folder)
+    names = _names_in(manifest)
+    begun = isinstance(manifest, dict) and manifest.get("finished") is False
+    return begun and bool(names) and not any((folder / name).exists() for name in names)
+
+
+def _manifest(folder: Path) -> Any:
+    """None of one that is damaged."""
     try:
-        names = _names_in(json.loads(read_bytes(path, at_most=LARGEST_TEXT)))
+        return json.loads(read_bytes(folder / MANIFEST, at_most=LARGEST_TEXT))
     except (ValueError, RecursionError):
-        names = []
-    return [*names, MANIFEST]
+        return None
 
 
 def _names_in(manifest: Any) -> list[str]:

@@ -142,7 +142,7 @@ def search_pieces(
     sliding, modes = modes, ContactModes(np.where(modes.kind == SLIDE, STICK, modes.kind), modes.slip)
     while count < qp_limit:
         count += 1
-        solution = solve_piece(program, start, modes, solver)
+        solution = solve_piece(program, start, modes, solver, beside=count > 1)
         if solution is None:
             infeasible += 1
             if best is not None or infeasible > 1 or (sliding.kind != SLIDE).all():
@@ -184,10 +184,10 @@ def solve_relaxed(program: ContactPieces, solver: QpSolver | str) -> tuple[np.nd
 
 
 def solve_piece(
-    program: ContactPieces, start: np.ndarray, modes: ContactModes, solver: QpSolver | str
+    program: ContactPieces, start: np.ndarray, modes: ContactModes, solver: QpSolver | str, *, beside: bool = False
 ) -> PieceSolution | None:
     """Optimum of the activations in the piece of ``modes``; what ``start`` breaks of its bounds, up to ``_BROKEN``, may
-    stay broken as much. None without a solution.
+    stay broken as much. None without a solution. ``beside`` where another piece of the step is solved already.
     """
     m = program.activations
     offset, slope = _forces_of(program, modes)
@@ -203,6 +203,7 @@ def solve_piece(
         np.concatenate([program.lower, lower]),
         np.concatenate([program.upper, np.full(len(lower), np.inf)]),
         start[:m],
+        beside=beside,
     )
     if not found.usable:
         return None

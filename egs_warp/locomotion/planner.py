@@ -10,7 +10,7 @@ import numpy as np
 
 from egs_warp.contact.coupled_step import ContactResponse
 from egs_warp.fem.body import SoftBody
-from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.factors import Factors
 from egs_warp.locomotion.contact_pieces import ContactPieces
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.settings import LocomotionSettings
@@ -84,7 +84,7 @@ class StepPlanner:
     synergies: Synergies
     friction: float
     settings: LocomotionSettings
-    factors: SparseFactors
+    factors: Factors
     """Of the effort's horizon."""
 
     def plan(self, prospect: Prospect, last: np.ndarray, objectives: Sequence[AnyObjective], clock: StageClock) -> Plan:
@@ -125,7 +125,7 @@ class StepPlanner:
         impulses[:, :-1] = problem.dt * (members.T @ each.T).T
         impulses[:, -1] = free
         solved = response.tangent.solve(impulses)
-        torques = problem.dt * weight * (contacts.frame @ problem.turns).T
+        torques = problem.dt * weight * contacts.speeds(problem.turns).T
         linear = LinearStep(
             foreseen.ravel() - solved[:, -1],
             np.hstack([solved[:, :-1], weight * response.columns]),
@@ -137,15 +137,15 @@ class StepPlanner:
             + effort_cost(problem, linear, foreseen.ravel(), self.factors)
             + self._activation_cost(problem.dt, previous, linear.columns.shape[1])
         )
-        rows = np.hstack([contacts.frame @ solved[:, :-1], weight * response.delassus]) / speed
-        offset = contacts.frame @ linear.base / speed
+        rows = np.hstack([contacts.speeds(solved[:, :-1]), weight * response.delassus]) / speed
+        offset = contacts.speeds(linear.base) / speed
         offset[::3] += prospect.shift / speed
         reach = _FASTEST * problem.dt / body.time_unit
         pieces = ContactPieces(
             *(cost.P, cost.q, cost.constant, rows, offset, self.friction),
             *(np.maximum(previous - reach, -1.0), np.minimum(previous + reach, 1.0)),
         )
-        slip = (contacts.frame @ foreseen.ravel()).reshape(-1, 3) / speed
+        slip = contacts.speeds(foreseen.ravel()).reshape(-1, 3) / speed
         start = self.synergies.mean(prospect.activations / self.muscles.bounds)
         return StepProgram(pieces, Foreseen(start, prospect.forces / weight, slip), linear)
 
@@ -168,7 +168,7 @@ class StageClock:
     """Milliseconds of each stage of a step."""
 
     milliseconds: dict[str, float] = field(default_factory=dict)
-    _last: float = field(default_factory=lambda: time.perf_counter())
+    _last: float = field(default_factory=time.perf_counter)
 
     def lap(self, name: str) -> None:
         """Since the lap before was ``name``."""

@@ -68,8 +68,11 @@ class QpSolution:
 class QuadraticProgram(Protocol):
     """min 1/2 x^T P x + q^T x subject to l <= A x <= u, set up once; a re-solve changes only l and u."""
 
-    def solve(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None) -> QpSolution:
-        """Solve with these bounds (m,), warm-started from ``start`` (n,), or from the last solution."""
+    def solve(
+        self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, beside: bool = False
+    ) -> QpSolution:
+        """Solve with these bounds (m,), warm-started from ``start`` (n,), or from the last solution; ``beside`` where
+        that is the optimum of a program beside this one."""
         ...
 
 
@@ -83,7 +86,8 @@ def quadratic_program(
 class OsqpProgram:
     """A ``QuadraticProgram`` for OSQP: a few iterations on the rows that matter tell which of them hold the optimum,
     from where ``active_set`` finds it to rounding. Where rounding leads that astray, OSQP goes on with all rows, to its
-    own ``accuracy``.
+    own ``accuracy``. A program beside one that is solved needs no iterations: the rows that its minimum without bounds
+    breaks are a guess that costs as little.
     """
 
     def __init__(self, P: np.ndarray, q: np.ndarray, A: np.ndarray, *, accuracy: float = 3e-5) -> None:
@@ -94,7 +98,9 @@ class OsqpProgram:
         self._whole: osqp.OSQP | None = None
         self._start: np.ndarray | None = None
 
-    def solve(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None) -> QpSolution:
+    def solve(
+        self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, beside: bool = False
+    ) -> QpSolution:
         """See ``QuadraticProgram``."""
         start = self._start if start is None else start
         if (upper - lower < _HELD).any():
@@ -108,6 +114,9 @@ class OsqpProgram:
         if not chosen.any():
             # As in flight: there is nothing to iterate on.
             return self._exact(rows.minimum, np.zeros(len(lower)))
+        if beside:
+            found = self._finished(lower, upper, rows.free < lower, rows.free > upper)
+            return found or self._by_iterations(lower, upper, start)
         if start is not None:
             at = self._A @ start
             chosen |= (at < lower + _NEAR) | (at > upper - _NEAR)
@@ -122,15 +131,14 @@ class OsqpProgram:
             return self._by_iterations(lower, upper, start)
         multipliers = np.zeros(len(lower))
         multipliers[index] = result.y
-        return self._finished(result.x, multipliers, lower, upper) or self._by_iterations(lower, upper, result.x)
-
-    def _finished(
-        self, x: np.ndarray, multipliers: np.ndarray, lower: np.ndarray, upper: np.ndarray
-    ) -> QpSolution | None:
-        """The optimum, from the rows that OSQP holds to be active; None where rounding leads astray."""
-        at = self._A @ x
+        at = self._A @ result.x
         low = at - lower < -multipliers
-        found = optimum_near(self._rows, lower, upper, low, (upper - at < multipliers) & ~low)
+        found = self._finished(lower, upper, low, (upper - at < multipliers) & ~low)
+        return found or self._by_iterations(lower, upper, result.x)
+
+    def _finished(self, lower: np.ndarray, upper: np.ndarray, low: np.ndarray, high: np.ndarray) -> QpSolution | None:
+        """The optimum, from a guess of the rows that hold it at which bound; None where rounding leads astray."""
+        found = optimum_near(self._rows, lower, upper, low, high)
         if found is None:
             return None
         if not found.feasible:
@@ -215,7 +223,9 @@ class DaqpProgram:
         self._model.settings = {"eq_reduction": 1}
         self._ready = False
 
-    def solve(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None) -> QpSolution:
+    def solve(
+        self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None = None, *, beside: bool = False
+    ) -> QpSolution:
         """See ``QuadraticProgram``; it starts from its own last active set."""
         low, high = np.maximum(lower, -1e30), np.minimum(upper, 1e30)
         held = np.where(high - low < 1e-13, 5, 0).astype(np.int32)

@@ -9,10 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sparse
 
 from egs_warp.contact.detection import ContactSet
-from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.factors import Factors
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.objectives import AnyObjective
 
@@ -87,7 +86,7 @@ def effort_cost(
     problem: StepProblem,
     linear: LinearStep,
     foreseen: np.ndarray,
-    factors: SparseFactors,
+    factors: Factors,
     *,
     weight: float = EFFORT,
     horizon: float = HORIZON,
@@ -105,16 +104,15 @@ def effort_cost(
     end = problem.end_positions(foreseen.reshape(-1, 3))
     assembly, damping = body.assembly, body.assembly.damping(problem.state.positions, time)
     entries = assembly.hessian_entries(end, damping, projected=True)
-    upper = assembly.matrix(entries)
     implicit = time**2 * entries
     implicit[assembly.diagonal_entries] += np.repeat(body.node_mass, 3)
     factors.update(implicit)
-    speeds = np.column_stack([linear.columns, linear.base])
-    further = factors.solve(np.repeat(body.node_mass, 3)[:, None] * speeds)
+    speeds = factors.take(np.column_stack([linear.columns, linear.base]))
+    further = factors.solve(factors.take(np.repeat(body.node_mass, 3)[:, None]) * speeds)
     moves = problem.dt * speeds + (time - problem.dt) * further
-    moves[:, -1] -= problem.dt * foreseen
-    quadratic = moves.T @ (upper @ moves + sparse.triu(upper, 1).T @ moves)
-    force = assembly.gradient(end, damping).ravel() @ moves
+    moves[:, -1] -= problem.dt * factors.take(foreseen)
+    quadratic = factors.give(factors.quadratic(entries, moves))
+    force = factors.give(factors.take(assembly.gradient(end, damping).ravel()) @ moves)
     unit = weight / (body.weight * body.height)
     return QuadraticCost(
         unit * quadratic[:-1, :-1],

@@ -11,7 +11,7 @@ from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from egs_warp.errors import UserError
+from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.rows import distinct_rows
@@ -24,6 +24,7 @@ from egs_warp.meshing.tetwild import tetwild
 
 _MIN_DIHEDRAL_DEGREES = 8.0
 _ENCLOSED_AIM = 0.9993
+LEAST_NODES, MOST_NODES = 50, 20_000
 _MAX_GROWTH_STEPS = 6
 _GROWTH_SAMPLE = 20000
 _FINER_PER_STEP = 0.15
@@ -98,6 +99,12 @@ def build_cage(
     )
 
 
+def check_nodes(nodes: int) -> None:
+    """Raise ``ArgumentError`` for a number that no cage has: before any long work."""
+    if not LEAST_NODES <= nodes <= MOST_NODES:
+        raise ArgumentError("nodes", f"give a number from {LEAST_NODES} to {MOST_NODES}", value=nodes)
+
+
 def cage_of_body(
     cloud: GaussianCloud,
     *,
@@ -116,8 +123,8 @@ def cage_of_body(
 
     Raises ``UserError`` for an object without volume (flat, tiny, nothing opaque above the plane).
     """
-    if not 50 <= target_nodes <= 20000:
-        raise UserError(f"cage: {target_nodes} nodes asked; give a number from 50 to 20000")
+    if not LEAST_NODES <= target_nodes <= MOST_NODES:
+        raise UserError(f"cage: {target_nodes} nodes asked; give a number from {LEAST_NODES} to {MOST_NODES}")
     solid = solid or solid_from_gaussians(cloud)
     _refuse_flat(solid)
     weights = np.where(solid.belongs, cloud.opacities(), 0.0)

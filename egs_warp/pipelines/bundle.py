@@ -11,6 +11,7 @@ from egs_warp.deformation.deformer import MAX_STRETCH
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import with_degree
 from egs_warp.io.atomic import atomic_write
+from egs_warp.io.run_folder import check_no_file_of_a_run
 from egs_warp.kernels.deformation.carried_cage import RIGID
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.pipelines.export import chosen_frames
@@ -24,6 +25,7 @@ def export_bundle(run: FinishedRun, path: Path, *, every: int = 1, degree: int |
     """Write one .npz (docs/guide/export.md). Raises ``UserError`` for another name."""
     if path.suffix.lower() != ENDING:
         raise UserError(f"{path}: give a name that ends in {ENDING}")
+    check_no_file_of_a_run(path)
     frames = chosen_frames(run, frame=None, every=every)
     t, splats, plan = run.trajectory, with_degree(run.creature.splats, degree), run.deformer().plan
     codes, shares = plan.mean_tets.numpy(), plan.shares.numpy()

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.frames import box_corners
+from egs_warp.io.run_folder import check_no_file_of_a_run
 from egs_warp.io.sequence import frame_paths
 from egs_warp.io.video import VideoWriter, write_png
 from egs_warp.pipelines.film import Frame, drawn_frames
@@ -46,9 +47,11 @@ def render_run(
 
     ``hold``: this frame at 60 Hz alone, and the camera goes around it once. The same arguments give the same pictures.
     Raises ``UserError`` for a frame that the run does not have, a name or shot that does not fit the other, and a
-    folder that holds other frames.
+    folder that holds other frames, or for a file of a run.
     """
     folder = out.suffix == ""
+    if not folder:
+        check_no_file_of_a_run(out)
     if shot.transparent and (show is not Show.COLOUR or (not folder and out.suffix.lower() == ".mp4")):
         advice = "give a .mov, a .webm or a folder" if show is Show.COLOUR else "leave out what to show besides colour"
         raise ArgumentError("background", f"H.264, depth and alpha have no transparency; {advice}", value="transparent")

@@ -14,6 +14,7 @@ from tqdm import tqdm
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud, with_degree
 from egs_warp.io.atomic import atomic_write, system_error
+from egs_warp.io.run_folder import check_no_file_of_a_run
 from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.pipelines.export import chosen_frames
 from egs_warp.pipelines.finished_run import FinishedRun
@@ -35,6 +36,7 @@ def export_usd(run: FinishedRun, path: Path, *, every: int = 1, degree: int | No
     Sdf, Usd, UsdGeom, UsdVol, Vt = _modules()
     if path.suffix not in (".usdc", ".usda"):
         raise UserError(f"{path}: give a name that ends in .usdc or .usda")
+    check_no_file_of_a_run(path)
     frames = chosen_frames(run, frame=None, every=every)
     t = run.trajectory
     with atomic_write(path) as temporary, _system_errors():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
@@ -15,10 +16,12 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.launching import available_threads
 from egs_warp.render.backward import backward
-from egs_warp.render.compositing import RenderedImage, composite
+from egs_warp.render.compositing import RenderedImage, list_and_composite
 from egs_warp.render.projection import ProjectedGaussians, project, view_from_camera
 from egs_warp.render.rasteriser import background_of, refusing_what_does_not_fit
-from egs_warp.render.tiles import TileLists, build_tile_lists
+from egs_warp.render.tiles import TileLists
+
+_ATTRIBUTES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
 
 
 @dataclass(frozen=True)
@@ -62,27 +65,34 @@ def render_torch(
     (n, 2), any values, receives the gradient by the screen positions in pixels, which densification by splitting
     watches. On CUDA the work is queued on torch's current stream. Raises ``UserError`` as ``render_gaussians`` does.
     """
-    tensors = {
-        "means": (means, (len(means), 3)),
-        "rotations": (rotations, (len(means), 4)),
-        "log_scales": (log_scales, (len(means), 3)),
-        "opacity_logits": (opacity_logits, (len(means),)),
-        "sh": (sh, (len(means), sh.shape[1], 3)),
-    }
-    for name, (tensor, shape) in tensors.items():
-        if tuple(tensor.shape) != shape or tensor.dtype != torch.float32 or tensor.device != means.device:
-            raise UserError(
-                f"render: {name} is {tuple(tensor.shape)} {tensor.dtype} on {tensor.device},"
-                f" expected {shape} float32 on {means.device}"
-            )
+    attributes = (means, rotations, log_scales, opacity_logits, sh)
+    _refuse_misfits(*attributes)
     if (rotation is None) != (translation is None):
         raise UserError("render: give the pose's rotation and translation together, or neither")
-    task = _Task(camera, background, antialiased, threads or available_threads())
-    colour, alpha, depth = _Render.apply(
-        *(means, rotations, log_scales, opacity_logits, sh, rotation, translation, screen, task)
-    )
-    assert task.slot_end is not None
-    return TorchImage(colour, alpha, depth, task.slot_end)
+    # A GPU does not ask for threads, and to count them is a call of the system.
+    threads = 1 if means.is_cuda else threads or available_threads()
+    task = _Task(camera, background, antialiased, threads)
+    given = (*attributes, rotation, translation, screen)
+    # What records nothing needs none of autograd's ways.
+    if torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in given):
+        colour, alpha, depth = _Render.apply(*given, task)
+        assert task.slot_end is not None
+        return TorchImage(colour, alpha, depth, task.slot_end)
+    (colour, alpha, depth), done = _draw(attributes, rotation, translation, task)
+    return TorchImage(colour, alpha, depth, done.projected.slot_end)
+
+
+def _refuse_misfits(*attributes: torch.Tensor) -> None:
+    """Raise ``UserError`` for a tensor of another shape, type or device than ``render_torch`` takes."""
+    means, _, _, _, sh = attributes
+    count, device = means.shape[0], means.device
+    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, sh.shape[1], 3))
+    for number, (tensor, shape) in enumerate(zip(attributes, shapes, strict=True)):
+        if tensor.shape != shape or tensor.dtype != torch.float32 or tensor.device != device:
+            raise UserError(
+                f"render: {_ATTRIBUTES[number]} is {tuple(tensor.shape)} {tensor.dtype} on {tensor.device},"
+                f" expected {shape} float32 on {device}"
+            )
 
 
 @dataclass
@@ -100,8 +110,8 @@ class _Task:
 class _Forward:
     """What the backward pass needs of the forward pass."""
 
-    tensors: tuple[torch.Tensor, ...]
-    """Owners of the cloud's memory."""
+    owners: tuple[torch.Tensor, ...]
+    """Of the cloud's memory and of the picture's."""
     cloud: GaussianCloud
     view: Any
     projected: ProjectedGaussians
@@ -145,46 +155,81 @@ def _cloud_at(places: tuple[int, ...], count: int, coefficients: int, device: st
     )
 
 
+@lru_cache(maxsize=64)
+def _array_at(place: int, dtype: Any, shape: tuple[int, ...], device: str) -> wp.array:
+    """The array that begins at this address; it owns no memory, as ``_cloud_at``."""
+    return wp.array(ptr=place, dtype=dtype, shape=shape, device=device)
+
+
+_PIXEL_TYPES = (wp.vec3, wp.float32, wp.float32)
+"""Of a picture's colour, alpha and depth."""
+
+
+def _draw(
+    attributes: Sequence[torch.Tensor], rotation: torch.Tensor | None, translation: torch.Tensor | None, task: _Task
+) -> tuple[tuple[torch.Tensor, torch.Tensor, torch.Tensor], _Forward]:
+    """Colour, alpha and depth, and what a backward pass needs of the way there."""
+    camera = task.camera
+    if rotation is not None and translation is not None:
+        camera = replace(
+            camera,
+            rotation=rotation.detach().double().cpu().numpy(),
+            translation=translation.detach().double().cpu().numpy(),
+        )
+    wp.init()
+    tensors = tuple(tensor.detach().contiguous() for tensor in attributes)
+    device = tensors[0].device
+    with torch_stream(device):
+        cloud = _cloud_of(tensors)
+        view = view_from_camera(camera)
+        threads = task.threads
+        with refusing_what_does_not_fit(cloud, camera):
+            projected = project(cloud, view, antialiased=task.antialiased, threads=threads)
+            shape = (camera.height, camera.width)
+            # torch's memory, for to make a tensor of Warp's takes as long as three launches.
+            picture = (
+                torch.empty((*shape, 3), dtype=torch.float32, device=device),
+                torch.empty(shape, dtype=torch.float32, device=device),
+                torch.empty(shape, dtype=torch.float32, device=device),
+            )
+            alias = cloud.device.alias
+            onto = RenderedImage(
+                *(_array_at(t.data_ptr(), d, shape, alias) for t, d in zip(picture, _PIXEL_TYPES, strict=True))
+            )
+            behind = background_of(task.background, camera, cloud.device)
+            lists, image = list_and_composite(projected, view, background=behind, threads=threads, onto=onto)
+    # The picture's own tensors will hold this.
+    owners = (*tensors, *(tensor.detach() for tensor in picture))
+    return picture, _Forward(owners, cloud, view, projected, lists, image)
+
+
 class _Render(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, *arguments: Any) -> tuple[torch.Tensor, ...]:
         *attributes, rotation, translation, _screen, task = arguments
-        camera = task.camera
-        if rotation is not None:
-            camera = replace(
-                camera,
-                rotation=rotation.detach().double().cpu().numpy(),
-                translation=translation.detach().double().cpu().numpy(),
-            )
-        wp.init()
-        tensors = tuple(tensor.detach().contiguous() for tensor in attributes)
-        with torch_stream(tensors[0].device):
-            cloud = _cloud_of(tensors)
-            view = view_from_camera(camera)
-            threads = task.threads
-            with refusing_what_does_not_fit(cloud, camera):
-                projected = project(cloud, view, antialiased=task.antialiased, threads=threads)
-                lists = build_tile_lists(projected, view, threads=threads)
-                behind = background_of(task.background, camera, cloud.device)
-                image = composite(projected, lists, view, background=behind, threads=threads)
-            ctx.forward_pass = _Forward(tensors, cloud, view, projected, lists, image)
-            ctx.task = task
-            ctx.want_pose = rotation is not None and (ctx.needs_input_grad[5] or ctx.needs_input_grad[6])
-            ctx.set_materialize_grads(False)
-            task.slot_end = projected.slot_end
-            return wp.to_torch(image.colour), wp.to_torch(image.alpha), wp.to_torch(image.depth)
+        picture, ctx.forward_pass = _draw(attributes, rotation, translation, task)
+        ctx.task = task
+        ctx.want_pose = rotation is not None and (ctx.needs_input_grad[5] or ctx.needs_input_grad[6])
+        ctx.set_materialize_grads(False)
+        task.slot_end = ctx.forward_pass.projected.slot_end
+        return picture
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *pixel_gradients: torch.Tensor | None) -> tuple[torch.Tensor | None, ...]:
         done: _Forward = ctx.forward_pass
-        device = wp.device_to_torch(done.cloud.device)
-        with torch_stream(torch.device(device)):
+        device = done.owners[0].device
+        with torch_stream(device):
+            alias = done.cloud.device.alias
+            # Held until the kernels that read them are queued.
+            given = tuple(None if gradient is None else gradient.detach().contiguous() for gradient in pixel_gradients)
+            shape = done.image.alpha.shape
             by_colour, by_alpha, by_depth = (
-                None if gradient is None else wp.from_torch(gradient.detach().contiguous(), dtype=dtype)
-                for gradient, dtype in zip(pixel_gradients[:3], (wp.vec3, wp.float32, wp.float32), strict=True)
+                None if gradient is None else _array_at(gradient.data_ptr(), dtype, shape, alias)
+                for gradient, dtype in zip(given, _PIXEL_TYPES, strict=True)
             )
             with refusing_what_does_not_fit(done.cloud, ctx.task.camera):
+                by_attributes = tuple(torch.empty_like(tensor) for tensor in done.owners[:5])
                 gradients = backward(
                     *(done.cloud, done.view, done.projected, done.lists, done.image),
                     colour_gradient=by_colour,
@@ -194,12 +239,12 @@ class _Render(torch.autograd.Function):
                     want_pose=ctx.want_pose,
                     want_screen=ctx.needs_input_grad[7],
                     threads=ctx.task.threads,
+                    onto=_cloud_of(by_attributes),
                 )
-            names = ("means", "rotations", "log_scales", "opacity_logits", "sh", "pose_rotation", "pose_translation")
-            arrays = [getattr(gradients, name) for name in (*names, "screen")]
-            tensors = [None if array is None else wp.to_torch(array) for array in arrays]
             # The pose's gradient is the sum of every Gaussian's part.
-            for index in (5, 6):
-                part = tensors[index]
-                tensors[index] = None if part is None else part.sum(dim=0)
-            return (*tensors, None)
+            by_pose = (
+                None if part is None else wp.to_torch(part).sum(dim=0)
+                for part in (gradients.pose_rotation, gradients.pose_translation)
+            )
+            by_screen = None if gradients.screen is None else wp.to_torch(gradients.screen)
+            return (*by_attributes, *by_pose, by_screen, None)

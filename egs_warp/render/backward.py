@@ -54,8 +54,12 @@ def backward(
     want_pose: bool,
     want_screen: bool = False,
     threads: int,
+    onto: GaussianCloud | None = None,
 ) -> CloudGradients:
-    """From gradients (H, W) by ``image``'s colour (vec3), alpha and depth (float32); None stands for zero."""
+    """From gradients (H, W) by ``image``'s colour (vec3), alpha and depth (float32); None stands for zero.
+
+    The gradients by the attributes go into the arrays of ``onto`` where given.
+    """
     device, count = cloud.device, cloud.count
     (moments,) = empty_together(device, ((with_room(projected.slot_count), 3), wp.vec4))
     walked = [
@@ -92,12 +96,16 @@ def backward(
             threads=threads,
             work=lists.work,
         )
-    gradients = CloudGradients(
+    by_attributes = onto or GaussianCloud(
         *empty_together(
             device,
             *((count, wp.vec3), (count, wp.vec4), (count, wp.vec3), (count, wp.float32)),
             (cloud.sh.shape, wp.vec3),
-        ),
+        )
+    )
+    gradients = CloudGradients(
+        *(by_attributes.means, by_attributes.rotations, by_attributes.log_scales),
+        *(by_attributes.opacity_logits, by_attributes.sh),
         screen=empty(count, wp.vec2, device) if want_screen else None,
         pose_rotation=empty(count, wp.mat33, device) if want_pose else None,
         pose_translation=empty(count, wp.vec3, device) if want_pose else None,

@@ -14,7 +14,7 @@ from egs_warp.kernels.render.ellipse import TILE_PIXELS
 from egs_warp.kernels.render.geometry import composite_geometry_kernel, splat_normals_kernel
 from egs_warp.launching import device_of, empty, empty_together, launch_rows
 from egs_warp.render.projection import ProjectedGaussians
-from egs_warp.render.tiles import TileLists
+from egs_warp.render.tiles import TileLists, build_tile_lists, lists_fit
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,8 @@ class RenderedImage:
     """(H, W) float32: alpha-weighted mean z-depth divided by alpha, scene units; 0 where alpha is 0."""
     median_depth: wp.array | None = None
     """(H, W) float32: z-depth of the splat that stops half of the light, 0 where none does; only if asked for."""
+    median_gaussian: wp.array | None = None
+    """(H, W) int32: which splat that is, -1 where none does; only if asked for."""
     normal: wp.array | None = None
     """(H, W) vec3 in camera axes: blended thinnest axis of each splat, on the camera's side; only if asked for."""
 
@@ -47,14 +49,40 @@ class RenderedImage:
         return np.rint(np.clip(self.colour.numpy(), 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
+def list_and_composite(
+    projected: ProjectedGaussians,
+    view: Any,
+    *,
+    background: Background,
+    threads: int,
+    onto: RenderedImage | None = None,
+) -> tuple[TileLists, RenderedImage]:
+    """The tile lists and the picture, as ``composite`` makes it.
+
+    The number of pairs is looked at when all is queued: a GPU that waited for it would stand still meanwhile.
+    """
+    lists = build_tile_lists(projected, view, threads=threads, guess=True)
+    image = composite(projected, lists, view, background=background, threads=threads, onto=onto)
+    if not lists_fit(lists, projected):
+        lists = build_tile_lists(projected, view, threads=threads)
+        image = composite(projected, lists, view, background=background, threads=threads, onto=image)
+    return lists, image
+
+
 def composite(
-    projected: ProjectedGaussians, lists: TileLists, view: Any, *, background: Background, threads: int
+    projected: ProjectedGaussians,
+    lists: TileLists,
+    view: Any,
+    *,
+    background: Background,
+    threads: int,
+    onto: RenderedImage | None = None,
 ) -> RenderedImage:
-    """Blend every tile's Gaussians from front to back over ``background``."""
+    """Blend every tile's Gaussians from front to back over ``background``, into the arrays of ``onto`` where given."""
     device = device_of(projected.ellipse)
     width, height = int(view.width), int(view.height)
     shape = (height, width)
-    colour, alpha, depth = empty_together(device, (shape, wp.vec3), (shape, wp.float32), (shape, wp.float32))
+    image = onto or RenderedImage(*empty_together(device, (shape, wp.vec3), (shape, wp.float32), (shape, wp.float32)))
     inputs = [
         width,
         height,
@@ -70,12 +98,12 @@ def composite(
         composite_tile_kernel,
         lists.tile_count * (TILE_PIXELS if device.is_cuda else 1),
         inputs=inputs,
-        outputs=[colour, alpha, depth],
+        outputs=[image.colour, image.alpha, image.depth],
         device=device,
         threads=threads,
         work=lists.work,
     )
-    return RenderedImage(colour, alpha, depth)
+    return image
 
 
 def add_geometry(
@@ -87,7 +115,7 @@ def add_geometry(
     *,
     threads: int,
 ) -> RenderedImage:
-    """``image`` with median depth and normals."""
+    """``image`` with median depth, the splats it is of, and normals."""
     device = cloud.device
     width, height = int(view.width), int(view.height)
     splat_normals = empty(cloud.count, wp.vec3, device)
@@ -100,6 +128,7 @@ def add_geometry(
         threads=threads,
     )
     median_depth = empty(width * height, wp.float32, device)
+    median_gaussian = empty(width * height, wp.int32, device)
     normal = empty(width * height, wp.vec3, device)
     launch_rows(
         composite_geometry_kernel,
@@ -108,9 +137,14 @@ def add_geometry(
             *(width, height, lists.tile_start, lists.gaussian_from_intersection),
             *(projected.ellipse, projected.falloff, projected.colour_depth, splat_normals),
         ],
-        outputs=[median_depth, normal],
+        outputs=[median_depth, median_gaussian, normal],
         device=device,
         threads=threads,
     )
     shape = (height, width)
-    return replace(image, median_depth=median_depth.reshape(shape), normal=normal.reshape(shape))
+    return replace(
+        image,
+        median_depth=median_depth.reshape(shape),
+        median_gaussian=median_gaussian.reshape(shape),
+        normal=normal.reshape(shape),
+    )

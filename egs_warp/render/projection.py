@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import threading
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -46,30 +47,36 @@ class ProjectedGaussians:
 
 
 def view_from_camera(camera: Camera) -> Any:
-    """The camera in single precision, with the bounds of the projection's Jacobian. Raises ``UserError`` for an
-    impossible camera.
+    """The camera in single precision, with the bounds of the projection's Jacobian, not to be changed: equal cameras
+    share it. Raises ``UserError`` for an impossible camera.
     """
-    rotation = np.asarray(camera.rotation, dtype=np.float64).ravel().tolist()
-    translation = np.asarray(camera.translation, dtype=np.float64).tolist()
-    numbers = (camera.fx, camera.fy, camera.cx, camera.cy, camera.near, *rotation, *translation)
-    if not all(map(math.isfinite, numbers)) or camera.fx <= 0 or camera.fy <= 0:
+    rotation = np.asarray(camera.rotation, dtype=np.float64)
+    translation = np.asarray(camera.translation, dtype=np.float64)
+    lens = (camera.fx, camera.fy, camera.cx, camera.cy, camera.near, camera.far)
+    return _view(camera.width, camera.height, lens, rotation.tobytes(), translation.tobytes())
+
+
+@lru_cache(maxsize=1024)
+def _view(width: int, height: int, lens: tuple[float, ...], rotation: bytes, translation: bytes) -> Any:
+    """Kept, for to fill it in takes longer than to launch a kernel."""
+    fx, fy, cx, cy, near, far = lens
+    turn, shift = np.frombuffer(rotation), np.frombuffer(translation)
+    if not all(map(math.isfinite, (fx, fy, cx, cy, near, *turn, *shift))) or fx <= 0 or fy <= 0:
         raise UserError("camera: its pose and intrinsics must be finite and its focal lengths positive")
-    if camera.width < 1 or camera.height < 1:
-        raise UserError(f"camera: image size {camera.width} x {camera.height} must be at least 1 x 1")
-    if not 0 < camera.near < camera.far:
-        raise UserError(f"camera: near {camera.near} and far {camera.far} must satisfy 0 < near < far")
+    if width < 1 or height < 1:
+        raise UserError(f"camera: image size {width} x {height} must be at least 1 x 1")
+    if not 0 < near < far:
+        raise UserError(f"camera: near {near} and far {far} must satisfy 0 < near < far")
     view = View()
-    view.rotation = wp.mat33(*rotation)
-    view.translation = wp.vec3(*translation)
-    view.centre = wp.vec3(*camera.centre.tolist())
-    view.fx, view.fy, view.cx, view.cy = camera.fx, camera.fy, camera.cx, camera.cy
-    view.near, view.far = camera.near, min(camera.far, 3.4e38)
-    view.width, view.height = camera.width, camera.height
-    margin_x, margin_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy
-    view.slope_low = wp.vec2(-camera.cx / camera.fx - margin_x, -camera.cy / camera.fy - margin_y)
-    view.slope_high = wp.vec2(
-        (camera.width - camera.cx) / camera.fx + margin_x, (camera.height - camera.cy) / camera.fy + margin_y
-    )
+    view.rotation = wp.mat33(*turn.tolist())
+    view.translation = wp.vec3(*shift.tolist())
+    view.centre = wp.vec3(*(-turn.reshape(3, 3).T @ shift).tolist())
+    view.fx, view.fy, view.cx, view.cy = fx, fy, cx, cy
+    view.near, view.far = near, min(far, 3.4e38)
+    view.width, view.height = width, height
+    margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
+    view.slope_low = wp.vec2(-cx / fx - margin_x, -cy / fy - margin_y)
+    view.slope_high = wp.vec2((width - cx) / fx + margin_x, (height - cy) / fy + margin_y)
     return view
 
 
@@ -88,9 +95,10 @@ def project(cloud: GaussianCloud, view: Any, *, antialiased: bool, threads: int)
         threads=threads,
     )
     wp.utils.array_scan(tile_count, tile_count, inclusive=True)
+    last = _fetch_last(tile_count)
 
     def count_slots() -> int:
-        slot_count = _last(tile_count)
+        slot_count = last()
         if not 0 <= slot_count < 2**30:
             raise _too_many(cloud, view, tile_count.numpy())
         return slot_count
@@ -98,21 +106,42 @@ def project(cloud: GaussianCloud, view: Any, *, antialiased: bool, threads: int)
     return ProjectedGaussians(ellipse, falloff, colour_depth, tile_count, count_slots)
 
 
-_read_back = threading.local()
-"""One number in page-locked memory for each thread: what comes from a GPU arrives there twice as fast."""
+class _ReadBack:
+    """One number in page-locked memory, which what comes from a GPU reaches twice as fast, and when it is there."""
+
+    def __init__(self, device: wp.Device) -> None:
+        self.array = empty(1, wp.int64, "cpu", pinned=True)
+        self.values = self.array.numpy()
+        self.there = wp.Event(device)
 
 
-def _last(values: wp.array) -> int:
-    """The last of ``values`` (n,) int64; on a GPU this waits until it is there."""
+class _ReadBacks(threading.local):
+    """Those of this thread that nobody waits for, by device."""
+
+    def __init__(self) -> None:
+        self.free: defaultdict[str, list[_ReadBack]] = defaultdict(list)
+
+
+_read_backs = _ReadBacks()
+
+
+def _fetch_last(values: wp.array) -> Callable[[], int]:
+    """Have the last of ``values`` (n,) int64 brought here; what is returned, to be called once, waits for it."""
     device = device_of(values)
     if device.is_cpu:
-        return int(values.numpy()[-1])
-    if not hasattr(_read_back, "array"):
-        _read_back.array = empty(1, wp.int64, "cpu", pinned=True)
-        _read_back.values = _read_back.array.numpy()
-    wp.copy(_read_back.array, values, src_offset=len(values) - 1, count=1)
-    wp.synchronize_stream(device.stream)
-    return int(_read_back.values[0])
+        return lambda: int(values.numpy()[-1])
+    free = _read_backs.free[device.alias]
+    read_back = free.pop() if free else _ReadBack(device)
+    wp.copy(read_back.array, values, src_offset=len(values) - 1, count=1)
+    device.stream.record_event(read_back.there)
+
+    def last() -> int:
+        wp.synchronize_event(read_back.there)
+        number = int(read_back.values[0])
+        free.append(read_back)
+        return number
+
+    return last
 
 
 def _too_many(cloud: GaussianCloud, view: Any, slot_end: np.ndarray) -> UserError:

@@ -9,6 +9,7 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -18,9 +19,8 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.launching import Device, available_threads
-from egs_warp.render.compositing import Background, RenderedImage, add_geometry, composite
+from egs_warp.render.compositing import Background, RenderedImage, add_geometry, list_and_composite
 from egs_warp.render.projection import project, view_from_camera
-from egs_warp.render.tiles import build_tile_lists
 
 
 def render_gaussians(
@@ -35,8 +35,8 @@ def render_gaussians(
     """Picture of ``cloud`` through ``camera``, on the device of the cloud.
 
     ``background`` is one colour, or an image (H, W, 3) of this camera's size. ``antialiased`` dims each splat by what
-    the 0.3 px low-pass adds to its area. ``geometry`` adds median depth and normals. ``threads`` (a CPU only) defaults
-    to the available cores; the picture does not depend on it.
+    the 0.3 px low-pass adds to its area. ``geometry`` adds median depth, its splats and normals. ``threads`` (a CPU
+    only) defaults to the available cores; the picture does not depend on it.
     Raises ``UserError`` for non-finite Gaussians, which it names, for an impossible camera and for a background of
     another size.
     """
@@ -45,8 +45,7 @@ def render_gaussians(
     with refusing_what_does_not_fit(cloud, camera):
         behind = background_of(background, camera, cloud.device)
         projected = project(cloud, view, antialiased=antialiased, threads=threads)
-        lists = build_tile_lists(projected, view, threads=threads)
-        image = composite(projected, lists, view, background=behind, threads=threads)
+        lists, image = list_and_composite(projected, view, background=behind, threads=threads)
         if geometry:
             image = add_geometry(image, cloud, projected, lists, view, threads=threads)
     return image
@@ -99,11 +98,16 @@ def _is_finite_number(value: Any) -> bool:
     return isinstance(value, float | int) and math.isfinite(value)
 
 
+@lru_cache(maxsize=64)
+def _flat_background(colour: tuple[float, float, float]) -> Background:
+    return Background(wp.vec3(*colour))
+
+
 def background_of(background: Any, camera: Camera, device: Device) -> Background:
     """From a colour or an image (H, W, 3). Raises ``UserError`` for anything else."""
     shape = (camera.height, camera.width)
     if isinstance(background, tuple) and len(background) == 3 and all(map(_is_finite_number, background)):
-        return Background(wp.vec3(*background))
+        return _flat_background(background)
     if isinstance(background, wp.array) and background.dtype == wp.vec3 and background.shape == shape:
         image: Any = background.to(device).contiguous()
         return Background(wp.vec3(), image.flatten())

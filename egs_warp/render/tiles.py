@@ -42,14 +42,25 @@ class TileLists:
         return self.tile_start.shape[0] - 1
 
 
-def build_tile_lists(projected: ProjectedGaussians, view: Any, *, threads: int) -> TileLists:
-    """Sort the visible Gaussians by depth and list them for every tile that they reach (exact ellipse-tile test)."""
+def build_tile_lists(projected: ProjectedGaussians, view: Any, *, threads: int, guess: bool = False) -> TileLists:
+    """Sort the visible Gaussians by depth and list them for every tile that they reach (exact ellipse-tile test).
+
+    To ``guess`` is not to wait, on a GPU, for the number of pairs where pictures lately had few; ``lists_fit`` then
+    says whether there was room for them.
+    """
     columns = -(-view.width // TILE_SIDE)
     rows = -(-view.height // TILE_SIDE)
     device = device_of(projected.ellipse)
     if device.is_cuda:
-        return _lists_by_sorting(projected, view, columns * rows)
+        return _lists_by_sorting(projected, view, columns * rows, guess=guess)
     return _lists_by_counting(projected, view, columns * rows, threads)
+
+
+def lists_fit(lists: TileLists, projected: ProjectedGaussians) -> bool:
+    """Whether the pairs had room in ``lists``, made by a guess; where not, the lists are empty."""
+    pairs = projected.slot_count
+    _remember(device_of(lists.tile_start), pairs)
+    return pairs <= len(lists.gaussian_from_intersection)
 
 
 def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, threads: int) -> TileLists:
@@ -93,27 +104,31 @@ def _lists_by_counting(projected: ProjectedGaussians, view: Any, tiles: int, thr
     return TileLists(wp.array(tile_start, dtype=wp.int32, device=device), gaussians, slots, work)
 
 
-def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int) -> TileLists:
+def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int, *, guess: bool = False) -> TileLists:
     """Radix sort of all (tile, Gaussian) pairs by tile and the leading bits of depth;
     32 bits sort twice as fast as 64.
     """
     device = device_of(projected.ellipse)
     count = projected.slot_end.shape[0]
     # Memory for about as many pairs as lately: it is taken while the GPU projects, before their number is known.
-    room = _lists_for(_expected.get(device.alias, 0), tiles, device)
-    pairs = projected.slot_count
-    _expected[device.alias] = pairs if pairs <= _LARGE_SORT else 0
+    expected = _expected.get(device.alias, 0)
+    room = _lists_for(expected, tiles, device)
+    if guess and room is not None and expected <= _MOST_GUESSED:
+        pairs = len(room.gaussians)
+    else:
+        pairs = projected.slot_count
+        _remember(device, pairs)
     if pairs == 0:
         return TileLists(
             zeros(tiles + 1, wp.int32, device), empty(1, wp.int32, device), empty(1, wp.int32, device), None
         )
-    if room is None or len(room.gaussians) < pairs or len(room.tile_start) != tiles + 1:
+    if room is None or len(room.gaussians) < pairs:
         room = _lists_for(pairs, tiles, device)
         assert room is not None
     keys, scratch = room.keys, room.scratch
     nearest, farthest = (int(np.float32(z).view(np.int32)) for z in (view.near, view.far))
     depth_bits = max((farthest - nearest).bit_length(), 1)
-    tile_bits = max(tiles - 1, 1).bit_length()
+    tile_bits = tiles.bit_length()
     kept_bits = min(depth_bits, _KEY_BITS - tile_bits)
     launch_again(
         emit_tiles_kernel,
@@ -137,6 +152,16 @@ def _lists_by_sorting(projected: ProjectedGaussians, view: Any, tiles: int) -> T
         device=device,
     )
     return TileLists(room.tile_start, room.gaussians, room.slots, None)
+
+
+_MOST_GUESSED = 2_000_000
+"""Expected pairs up to which it takes less time to sort some room that stays empty than to wait for their number."""
+
+
+def _remember(device: wp.Device, pairs: int) -> None:
+    """What to expect next: views change, so the most of late, which is slowly forgotten."""
+    lately = _expected.get(device.alias, 0) * 15 // 16
+    _expected[device.alias] = max(pairs, lately) if pairs <= _LARGE_SORT else 0
 
 
 _expected: dict[str, int] = {}

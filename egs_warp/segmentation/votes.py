@@ -16,10 +16,9 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.launching import available_threads
 from egs_warp.render.backward import backward
-from egs_warp.render.compositing import composite
+from egs_warp.render.compositing import list_and_composite
 from egs_warp.render.projection import project, view_from_camera
 from egs_warp.render.rasteriser import background_of, refusing_what_does_not_fit
-from egs_warp.render.tiles import build_tile_lists
 
 
 @dataclass(frozen=True)
@@ -110,9 +109,8 @@ def _votes_of_view(grey: GaussianCloud, masked: MaskedView) -> np.ndarray:
     colour = np.stack([inside, 1.0 - inside, np.zeros_like(inside)], axis=2)
     with refusing_what_does_not_fit(grey, masked.camera):
         projected = project(grey, view, antialiased=False, threads=threads)
-        lists = build_tile_lists(projected, view, threads=threads)
         behind = background_of((0.0, 0.0, 0.0), masked.camera, grey.device)
-        image = composite(projected, lists, view, background=behind, threads=threads)
+        lists, image = list_and_composite(projected, view, background=behind, threads=threads)
         gradients = backward(
             *(grey, view, projected, lists, image),
             colour_gradient=wp.array(colour, dtype=wp.vec3, device=grey.device),

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from egs_warp.errors import UserError
 from egs_warp.io.atomic import atomic_write
+from egs_warp.io.run_folder import check_no_file_of_a_run
 from egs_warp.web.recording import Recording
 
 PAGE = Path(__file__).with_name("page.html")
@@ -29,8 +30,11 @@ def page_text() -> str:
 def export_page(path: Path, recordings: Sequence[Recording]) -> int:
     """Write ``recordings`` and the page that shows them as one HTML file; returns its size in bytes.
 
-    The same runs give the same file.
+    The same runs give the same file. Raises ``UserError`` for another ending than .html, and a file of a run.
     """
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise UserError(f"{path}: give a name that ends in .html")
+    check_no_file_of_a_run(path)
     scripts = [
         f'<script type="application/octet-stream" data-run="{number}">'
         f"{base64.b64encode(gzip.compress(recording.bytes(), mtime=0)).decode()}</script>"

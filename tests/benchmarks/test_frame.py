@@ -43,7 +43,16 @@ def test_steps_are_told_by_their_contacts(frame: ModuleType) -> None:
 def test_aims(frame: ModuleType) -> None:
     """541 nodes take 35.7 ms in the mean: ten times as fast as 360 ms, not as 350."""
     for old, fast in ((360.0, True), (350.0, False)):
-        aims = frame.summary(records(), old)["aims"]
+        aims = frame.summary(records(), old, "cpu")["aims"]
         assert (aims["cpu_541"], aims["cpu_10x"], aims["cpu_250_realtime"]) == (True, fast, True)
-    assert not frame.summary(records(2.0), 400.0)["aims"]["cpu_541"]
-    assert frame.summary(records(), None)["why_null"]["cpu_10x"]
+        assert aims["gpu_541"] is aims["gpu_1000"] is aims["gpu_frame_60hz"] is None
+    assert not frame.summary(records(2.0), 400.0, "cpu")["aims"]["cpu_541"]
+    assert frame.summary(records(), None, "cpu")["why_null"]["cpu_10x"]
+
+
+def test_aims_of_a_gpu(frame: ModuleType) -> None:
+    """1,000 nodes take 88 ms at the scale of 1 and 12.4 at 0.13, 541 nodes 35.7 and 5.6."""
+    slow, fast = (frame.summary(records(scale), None, "cuda:0")["aims"] for scale in (1.0, 0.13))
+    assert slow["cpu_541"] is fast["cpu_541"] is None
+    assert (slow["gpu_541"], slow["gpu_1000"], slow["gpu_frame_60hz"]) == (False, False, False)
+    assert (fast["gpu_541"], fast["gpu_1000"], fast["gpu_frame_60hz"]) == (True, True, None)

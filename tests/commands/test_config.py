@@ -128,6 +128,11 @@ def test_clicks_are_a_list_and_those_given_beside_the_file_go_alone(tmp_path: Pa
         ("a: [", "not YAML"),
         ("motion: !!python/object/apply:os.system [id]", "not YAML"),
         ("a: " + "[" * 5000, "not YAML"),
+        ("frames: &a 4\nfps: *a", 'stands for in "<unicode string>", line 2, column 6'),
+        (
+            "motion: [" + "jump, " * 5000 + "jump]",
+            "motion is ['jump', 'jump', 'jump', 'jump', 'jump', 'jump', ...]; give",
+        ),
     ],
 )
 def test_bad_files_are_one_line(text: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -140,6 +145,20 @@ def test_bad_files_are_one_line(text: str, said: str, tmp_path: Path, capsys: py
     error = capsys.readouterr().err
     assert status == 2 and said in error and error.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("way", ["lists", "merged"])
+def test_a_few_lines_that_stand_for_billions(way: str, tmp_path: Path) -> None:
+    """Lists of lists nine times over, told in a message, or keys merged as often: neither fits into any memory."""
+    inner = {"lists": "[z, z]", "merged": "{up: z}"}[way]
+    lines = [f"a0: &a0 {inner}"]
+    for level in range(1, 12):
+        many = ", ".join([f"*a{level - 1}"] * 9)
+        lines.append(f"a{level}: &a{level} " + {"lists": f"[{many}]", "merged": f"{{<<: [{many}]}}"}[way])
+    lines.append("object: [*a11]")
+    (tmp_path / "run.yaml").write_text("\n".join(lines))
+    with pytest.raises(UserError, match=r"run.yaml: not YAML \(an alias, \*name; write out what it stands for"):
+        _given(["--config", str(tmp_path / "run.yaml")])
 
 
 def test_a_missing_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

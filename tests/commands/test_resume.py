@@ -24,6 +24,8 @@ PATIENCE = 300.0
 """Seconds that a run may take on a busy machine."""
 MOMENTS = int(os.environ.get("EGS_WARP_MOMENTS", "4"))
 """At which each command is killed once; the short form of docs/reliability.md unless told."""
+SEED = os.environ.get("EGS_WARP_SEED", "")
+"""Other moments, so that several processes can share them."""
 SMALL = ("--up", "z", "--size", "32")
 COMMANDS = {
     "jump": ("pawn.ply", "--frames", "28"),
@@ -103,6 +105,11 @@ def test_a_run_that_is_killed_again_and_again(tmp_path: Path, capsys: pytest.Cap
     assert coarse_main(again) == 0
     assert bits(out) == bits(whole)
     capsys.readouterr()
+    # As one leaves it that is killed as it ends.
+    parts.mkdir()
+    (out / ".egs-run.lock").touch()
+    assert coarse_main(again) == 0 and bits(out) == bits(whole)
+    capsys.readouterr()
     assert coarse_main(again) == 0 and capsys.readouterr().out == f"{out}: this run has finished\n"
 
 
@@ -120,8 +127,10 @@ def test_random_moments(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     write_ply(folder / "room.ply", scene("pawn", device="cpu").whole()[0])
     began = time.monotonic()
     status = finishes(animate(name, folder, whole))
+    # Nothing but what the run has made, whatever is killed below.
+    assert not [path for path in whole.iterdir() if path.is_dir() or path.name.startswith(".")]
     length = time.monotonic() - began
-    moments = random.Random(name)
+    moments = random.Random(name + SEED)
     for number, ending in enumerate([signal.SIGKILL] * MOMENTS + [signal.SIGINT] * (MOMENTS // 4)):
         out = tmp_path / str(number)
         ended_by(animate(name, folder, out), ending, folder, length * moments.random())
@@ -138,7 +147,11 @@ def test_what_cannot_go_on_is_told(tmp_path: Path, capsys: pytest.CaptureFixture
     out, manifest = tmp_path / "out", tmp_path / "out" / MANIFEST
     assert told(out) == f"egs-warp: {out}: no run has begun to write here; begin it\n"
     out.mkdir()
-    content = {"schema": 1, "version": "0.0.1", "finished": False, "files": {"run.yaml": None}}
+    content: dict = {"schema": 1, "version": "0.0.1", "finished": False, "files": {"run.yaml": None}}
+    manifest.write_text(json.dumps(content))
+    assert told(out) == f"egs-warp: {out}: no run has begun to write here; begin it\n"
+    (out / "trajectory.parts").mkdir()
+    content["files"] |= {"trajectory.parts": None}
     manifest.write_text(json.dumps(content))
     assert "the run was begun by egs-warp 0.0.1, this is 0.1.0, whose steps are others; begin the run" in told(out)
     for broken in ("[]", "{}", json.dumps({"files": {"../a": None}})):

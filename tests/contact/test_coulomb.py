@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from egs_warp.contact.coulomb import coulomb_forces
-from egs_warp.kernels.contact.coulomb import gauss_seidel_kernel
+from egs_warp.contact.coulomb import contacts_of, coulomb_forces
+from egs_warp.kernels.contact.coulomb import sweeps_kernel
 
 COUNT = 5
 
@@ -49,8 +49,8 @@ def test_sweeps_equal_their_twin(friction: float, sweeps: int) -> None:
     for seed in range(60):
         delassus, free, shift, start = problem(seed)
         forces = wp.array(start.ravel(), dtype=wp.float64, device="cpu")
-        given = [wp.array(value, device="cpu") for value in (delassus, free, shift)]
-        wp.launch(gauss_seidel_kernel, dim=1, inputs=[*given, friction, sweeps, forces], device="cpu")
+        given = contacts_of(delassus, free, shift, friction)
+        wp.launch(sweeps_kernel, dim=1, inputs=[given, sweeps, forces], device="cpu")
         got = forces.numpy().reshape(-1, 3)
         expected = swept_twin(delassus, free, shift, friction, start, sweeps)
         np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12 * max(1.0, np.abs(expected).max()))

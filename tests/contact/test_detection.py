@@ -192,6 +192,10 @@ def test_contact_frame_maps_nodes_to_points(device: str) -> None:
         velocity = geometry.weights[point] @ v[mesh.tets[geometry.tet_from_point[point]]]
         assert np.allclose(contacts.axes[i] @ contacts.axes[i].T, np.eye(3), atol=1e-14)
         assert np.allclose(local[i], contacts.axes[i] @ velocity, atol=1e-13)
+    many = np.random.default_rng(4).standard_normal((v.size, 5))
+    assert np.allclose(contacts.speeds(many), contacts.frame @ many, atol=1e-13)
+    assert np.allclose(contacts.speeds(v.ravel()), local.ravel(), atol=1e-13)
+    assert detector.contact_set(chosen[:0], mesh.nodes).speeds(many).shape == (0, 5)
     moved, _ = detector.gaps(mesh.nodes + 0.01 * v)
     assert np.allclose(contacts.end_gaps(0.01, v), moved[chosen], atol=1e-13)
 

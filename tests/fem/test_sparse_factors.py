@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sparse
 
-from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.sparse_factors import SparseFactors, inverse_and_positives
 
 
 def random_matrix(count: int, shift: float) -> sparse.csc_matrix:
@@ -48,3 +48,17 @@ def test_what_cannot_be_factored_is_told() -> None:
     singular = sparse.csc_matrix(np.ones((2, 2)))
     factors = SparseFactors(upper_of(singular))
     assert not factors.update(np.ones(3)) and not factors.ready
+
+
+@pytest.mark.parametrize("size", [2, 7, 60])
+def test_an_inverse_comes_with_the_count_of_positive_eigenvalues(size: int) -> None:
+    """Of any symmetric matrix, a diagonal of zeros and blocks of two among them; the upper triangle is not read."""
+    random = np.random.default_rng(size)
+    for diagonal in (0.0, 1.0, 10.0, -10.0):
+        lower = np.tril(random.normal(size=(size, size)), -1)
+        matrix = lower + lower.T + diagonal * np.diag(random.normal(size=size))
+        positive, inverse = inverse_and_positives(np.tril(matrix) + np.triu(np.full_like(matrix, 7.0), 1))
+        assert positive == (np.linalg.eigvalsh(matrix) > 0.0).sum()
+        np.testing.assert_allclose(inverse @ matrix, np.eye(size), atol=1e-8)
+    positive, inverse = inverse_and_positives(np.zeros((size, size)))
+    assert positive < 0 and not np.isfinite(inverse).any()

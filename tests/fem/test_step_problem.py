@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.body import BodyState, SoftBody, make_body
 from egs_warp.fem.sparse_factors import SparseFactors
-from egs_warp.fem.step_problem import StepProblem, _inverse
+from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.plane import Plane
 from egs_warp.muscles.muscle_set import automatic_muscles
 from egs_warp.muscles.tension import MuscleTension
@@ -96,20 +96,6 @@ def test_the_tangent_inverts_the_derivative(body: SoftBody, tension: MuscleTensi
         change = (problem.residual(v + h * along, pull) - problem.residual(v - h * along, pull)) / (2 * h)
         # What Woodbury leaves out are muscles of less than a thousandth of the largest stiffness.
         assert np.abs(change.ravel() - impulse).max() < (2e-3 if muscles else 1e-6) * np.abs(impulse).max()
-
-
-@pytest.mark.parametrize("size", [2, 7, 60])
-def test_an_inverse_comes_with_the_count_of_positive_eigenvalues(size: int) -> None:
-    """Of any symmetric matrix, a diagonal of zeros and blocks of two among them; the upper triangle is not read."""
-    random = np.random.default_rng(size)
-    for diagonal in (0.0, 1.0, 10.0, -10.0):
-        lower = np.tril(random.normal(size=(size, size)), -1)
-        matrix = lower + lower.T + diagonal * np.diag(random.normal(size=size))
-        positive, inverse = _inverse(np.tril(matrix) + np.triu(np.full_like(matrix, 7.0), 1))
-        assert positive == (np.linalg.eigvalsh(matrix) > 0.0).sum()
-        np.testing.assert_allclose(inverse @ matrix, np.eye(size), atol=1e-8)
-    positive, inverse = _inverse(np.zeros((size, size)))
-    assert positive < 0 and not np.isfinite(inverse).any()
 
 
 def test_every_column_has_the_momenta_of_its_impulse(body: SoftBody, tension: MuscleTension) -> None:

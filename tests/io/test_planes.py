@@ -48,6 +48,7 @@ def test_what_is_found_anew_takes_the_place_of_what_was_known() -> None:
             "its ground is damaged; make it again with egs-warp segment",
         ),
         ({"noise": "low"}, "the facts of plane 0 are damaged; make it again"),
+        ({"offset": 1e300}, "plane 0 lies 1e+300 units from the origin; make it again"),
         ({"centre": [1.0]}, "the facts of plane 0 are damaged; make it again"),
     ],
 )

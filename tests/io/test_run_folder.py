@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from egs_warp.errors import UserError
-from egs_warp.io.run_folder import MANIFEST, check_run_folder, run_folder
+from egs_warp.io.run_folder import MANIFEST, check_run_folder, run_folder, tidy
 from tests.support.two_runs import told_elsewhere
 
 
@@ -145,19 +145,45 @@ def test_places_are_checked_before_the_work_and_not_made(tmp_path: Path) -> None
     assert os.listdir(tmp_path) == ["file"]
 
 
-def test_what_a_killed_run_left_is_gone_when_the_next_has_finished(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Too young to be swept when that one began."""
-    left = tmp_path / f".egs-{'0' * 16}.png"
+def test_what_a_killed_run_left_is_gone_when_the_next_has_finished(tmp_path: Path) -> None:
+    """However young: an ffmpeg that has outlived the run that started it writes its last after the next has begun."""
+    left = tmp_path / f".egs-{'0' * 16}.mp4"
     with run_folder(tmp_path) as run:
-        left.write_text("half")
         run.file("a.txt").write_text("one")
     with run_folder(tmp_path, resume=True) as run:
-        assert run.resumed and left.exists()
-        monkeypatch.setattr("egs_warp.io.atomic._YOUNGEST", 0.0)
+        left.write_text("half")
         run.file("a.txt").write_text("two")
         run.finish()
+    assert sorted(os.listdir(tmp_path)) == ["a.txt", MANIFEST]
+
+
+def test_a_run_that_was_killed_before_its_first_file_is_none(tmp_path: Path) -> None:
+    """Its manifest tells of files, none of which is there."""
+    with run_folder(tmp_path) as run:
+        run.file("a.txt")
+    assert manifest(tmp_path)["files"] == {"a.txt": None}
+    with pytest.raises(UserError, match="no run has begun to write here; begin it"), run_folder(tmp_path, resume=True):
+        raise AssertionError("must not come here")
+    check_run_folder(tmp_path)
+    with run_folder(tmp_path) as run:
+        run.file("a.txt").write_text("one")
+        run.finish()
+    assert sorted(os.listdir(tmp_path)) == ["a.txt", MANIFEST] and manifest(tmp_path)["finished"] is True
+    with pytest.raises(UserError, match="it has an earlier run"):
+        check_run_folder(tmp_path)
+
+
+def test_what_a_run_left_that_was_killed_as_it_ended(tmp_path: Path) -> None:
+    """Between its last manifest and its end: nothing is taken from one that still runs."""
+    with run_folder(tmp_path) as run:
+        run.file("a.txt").write_text("one")
+        run.finish()
+        (tmp_path / "parts").mkdir()
+        (tmp_path / "parts" / "b.npz").write_text("step")
+        tidy(tmp_path, "parts")
+        assert (tmp_path / "parts" / "b.npz").exists()
+    (tmp_path / ".egs-run.lock").write_text("")
+    tidy(tmp_path, "parts")
     assert sorted(os.listdir(tmp_path)) == ["a.txt", MANIFEST]
 
 

@@ -49,7 +49,7 @@ def test_the_conditions_of_the_optimum_hold(guess: str) -> None:
 
 
 def test_bounds_that_no_point_satisfies_are_told_apart() -> None:
-    """Two rows that exclude each other, alone and among others; and the same a hair apart."""
+    """Two rows that exclude each other, by a tenth, among others."""
     for seed in range(20):
         P, q, A, lower, upper = random_program(seed)
         row = len(q) + 1
@@ -58,10 +58,21 @@ def test_bounds_that_no_point_satisfies_are_told_apart() -> None:
         reduced = ReducedRows.of(P, q, A)
         found = optimum_near(reduced, lower, upper, reduced.free < lower, reduced.free > upper)
         assert found is not None and not found.feasible
-        lower[-1] = upper[row] - 1e-3
+
+
+def test_a_sliver_between_two_bounds_has_an_optimum() -> None:
+    """A row and its double that leave a millionth between them, with a point within: it is found, and lies there."""
+    for seed in range(20):
+        P, q, A, lower, upper = random_program(seed)
+        row = len(q) + int(np.flatnonzero(np.isfinite(lower[len(q) :]))[0])
+        inside = 0.5 * (lower[row] + upper[row])  # where the point that satisfies all of them is
+        A, upper = np.vstack([A, A[row]]), np.r_[upper, np.inf]
+        upper[row], lower = inside + 1e-6, np.r_[lower, inside]
+        reduced = ReducedRows.of(P, q, A)
         found = optimum_near(reduced, lower, upper, reduced.free < lower, reduced.free > upper)
-        if found is not None and found.feasible:
-            assert (A @ found.x)[-1] == pytest.approx(upper[row], abs=1.1e-3)
+        assert found is not None and found.feasible
+        slack = 1e-7 * max(1.0, np.linalg.norm(A[row]))
+        assert -slack < (A @ found.x)[-1] - inside < 1e-6 + slack
 
 
 def test_a_minimum_within_its_bounds_is_the_optimum() -> None:

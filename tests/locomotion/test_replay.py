@@ -121,6 +121,22 @@ def test_a_run_goes_on_to_the_same_bits(
     assert same_steps(again.reports, whole.reports) and solved == []
 
 
+@pytest.mark.slow
+def test_a_run_goes_on_from_any_of_its_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cut off after each step: nothing lasts from one step to the next but what is written down."""
+    monkeypatch.setattr("egs_warp.locomotion.recorder._STEPS_A_PART", 1)
+    whole = run(block(), parts=lambda: tmp_path / "whole")
+    parts = sorted(path.name for path in (tmp_path / "whole").iterdir())
+    assert len(parts) == 1 + len(whole.reports)
+    for kept in range(1, len(parts) - 1):
+        folder = tmp_path / str(kept)
+        folder.mkdir()
+        for name in parts[: kept + 1]:
+            shutil.copy(tmp_path / "whole" / name, folder)
+        resumed = run(block(), parts=lambda folder=folder: folder, resume=folder)
+        assert same_steps(resumed.reports, whole.reports), kept
+
+
 def test_parts_of_divided_steps_are_put_together_again(tmp_path: Path) -> None:
     """Steps that did not converge at once: what was asked is asked once for all of their parts."""
     slid = slide()

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from egs_warp.errors import UserError
+from egs_warp.locomotion import solvers
 from egs_warp.locomotion.solvers import QpSolver, QpStatus, quadratic_program
 
 SOLVERS = pytest.mark.parametrize(("solver", "accuracy"), [(QpSolver.OSQP, 1e-4), (QpSolver.DAQP, 1e-6)])
@@ -58,6 +59,23 @@ def test_bounds_only_updates_give_the_optimum_of_a_fresh_set_up(solver: QpSolver
             assert warm.objective == pytest.approx(fresh.objective, abs=accuracy)
             assert np.abs(P @ warm.x + q + rows.T @ warm.multipliers).max() < 10 * accuracy
             assert (rows @ warm.x - upper).max() < accuracy and (lower - rows @ warm.x).max() < accuracy
+
+
+def test_a_program_beside_one_that_is_solved_needs_no_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same optimum as OSQP leads to, without OSQP, and no point where there is none."""
+    for seed in range(12):
+        P, q, A = random_program(seed)
+        lower, upper = np.full(30, -0.1), np.full(30, 0.2)
+        asked = quadratic_program(P, q, A).solve(lower, upper)
+        with monkeypatch.context() as patch:
+            patch.setattr(solvers, "_answer", None)
+            beside = quadratic_program(P, q, A).solve(lower, upper, beside=True)
+            rows, below = np.vstack([A, A[:1]]), np.append(lower, 0.3)
+            none = quadratic_program(P, q, rows).solve(below, np.append(upper, 1.0), beside=True)
+        assert np.abs(asked.x - beside.x).max() < 1e-9 and asked.status is beside.status is QpStatus.SOLVED
+        assert (np.abs(asked.multipliers) > 1e-6).sum() > 5
+        assert np.abs(asked.multipliers - beside.multipliers).max() < 1e-7
+        assert none.status is QpStatus.INFEASIBLE
 
 
 @SOLVERS

@@ -111,6 +111,15 @@ def test_a_run_that_is_cut_off_leaves_its_steps(
     assert len(read_trajectory(tmp_path / "earlier-1" / PARTS).dt) == 14
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_film_from_straight_above_or_below(performance: Performance, side: float) -> None:
+    """The way the body faces is up in the picture."""
+    up = thing().plane.normal
+    camera = performance.camera(64, side * up)
+    np.testing.assert_allclose(camera.rotation[2], [0.0, 0.0, -side], atol=1e-9)
+    assert performance.place.ground.axes[0] @ -camera.rotation[1] > 0.999
+
+
 def test_no_ffmpeg_is_told_before_anything_is_done(
     run: Callable[..., Report], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

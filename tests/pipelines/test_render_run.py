@@ -10,9 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
+from egs_warp.assets import pawn
 from egs_warp.cli import main
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
+from egs_warp.io import write_ply
+from egs_warp.io.run_folder import run_folder as owned
 from egs_warp.io.video import VideoWriter
 from egs_warp.pipelines.film import drawn_frames
 from egs_warp.pipelines.finished_run import FinishedRun
@@ -40,6 +43,33 @@ def _pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
 def test_without_flags_it_is_the_film_bit_for_bit(run_folder: Path, tmp_path: Path) -> None:
     assert main(["render", str(run_folder), "--out", str(tmp_path / "again.mp4")]) == 0
     assert (tmp_path / "again.mp4").read_bytes() == (run_folder / "jump.mp4").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "render {run} --out {run}/jump.mp4 --size 64",
+        "export {run} --to bundle --out {run}/trajectory.npz",
+        "convert {capture} {other}/object.ply",
+    ],
+)
+def test_files_of_a_run_are_not_written_over(
+    line: str, run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its film and its steps stay, and their checksums with them."""
+    write_ply(tmp_path / "a.ply", pawn(gaussian_count=50).cloud)
+    with owned(tmp_path / "other", command="segment") as other:
+        write_ply(other.file("object.ply"), pawn(gaussian_count=60).cloud)
+        other.finish()
+    names = {"run": run_folder, "capture": tmp_path / "a.ply", "other": tmp_path / "other"}
+    words = line.format(**names).split()
+    target = Path(words[words.index("--out") + 1] if "--out" in words else words[-1])
+    before = target.read_bytes()
+    assert main(words) == 2
+    assert capsys.readouterr().err == (
+        f"egs-warp: {target}: is a file of the run in {target.parent}; choose another name\n"
+    )
+    assert target.read_bytes() == before
 
 
 @pytest.mark.parametrize("camera", ["fixed", "follow", "orbit"])

@@ -168,6 +168,39 @@ def test_work_is_queued_on_torchs_stream() -> None:
     assert torch.equal(got, expected)
 
 
+def test_a_picture_without_gradients_has_the_same_bits(device: str) -> None:
+    values, camera = many_splats()
+    tensors = [torch.tensor(values[name], dtype=torch.float32, device=device) for name in NAMES]
+    plain = render_torch(*tensors, camera=camera)
+    recorded = render_torch(*(tensor.clone().requires_grad_() for tensor in tensors), camera=camera)
+    with torch.no_grad():
+        again = render_torch(*(tensor.clone().requires_grad_() for tensor in tensors), camera=camera)
+    for name in ("colour", "alpha", "depth"):
+        assert getattr(recorded, name).requires_grad and not getattr(again, name).requires_grad
+        assert torch.equal(getattr(plain, name), getattr(recorded, name))
+        assert torch.equal(getattr(plain, name), getattr(again, name))
+
+
+def test_pictures_wait_for_their_gradients_while_others_are_made(device: str) -> None:
+    """Memory that nobody holds is given again: what a picture's gradients need must be held as long as the picture."""
+    values, camera = many_splats()
+    nearer = replace(camera, translation=camera.translation - [0.0, 0.0, 0.8])
+
+    def prepared(camera: Camera) -> tuple[list[Any], Any]:
+        leaves = [torch.tensor(values[n], dtype=torch.float32, device=device, requires_grad=True) for n in NAMES]
+        return leaves, render_torch(*leaves, camera=camera).colour.square().sum()
+
+    def finished(leaves: list[Any], loss: Any) -> list[Any]:
+        loss.backward()
+        return [leaf.grad for leaf in leaves]
+
+    alone = [finished(*prepared(camera)), finished(*prepared(nearer))]
+    waiting = [prepared(camera), prepared(nearer)]
+    together = [finished(*one) for one in reversed(waiting)][::-1]
+    for one, other in zip(alone, together, strict=True):
+        assert all(torch.equal(a, b) and a.abs().sum() > 0 for a, b in zip(one, other, strict=True))
+
+
 def test_pixels_share_memory_and_bad_tensors_are_named() -> None:
     values, camera = clear_scene()
     tensors = [torch.tensor(values[name], dtype=torch.float32) for name in NAMES]

@@ -11,7 +11,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.render import render_gaussians, render_views
 from egs_warp.render.projection import project, view_from_camera
-from egs_warp.render.tiles import _lists_by_counting, _lists_by_sorting
+from egs_warp.render.tiles import _lists_by_counting, _lists_by_sorting, lists_fit
 from tests.support.render_twin import render_twin, rotation_matrices, sh_basis
 
 EYE = np.array([0.3, -0.4, -3.0])
@@ -171,7 +171,7 @@ def test_several_cameras_and_what_does_not_fit(monkeypatch: pytest.MonkeyPatch) 
     def no_memory(*_: object, **__: object) -> None:
         raise RuntimeError("Failed to allocate 123 bytes on device 'cpu'")
 
-    monkeypatch.setattr("egs_warp.render.rasteriser.build_tile_lists", no_memory)
+    monkeypatch.setattr("egs_warp.render.compositing.build_tile_lists", no_memory)
     with pytest.raises(
         UserError, match=r"^render: 50 Gaussians at 20 x 30 do not fit into the memory of cpu; render a"
     ):
@@ -296,7 +296,7 @@ def test_impossible_cameras_and_backgrounds_are_refused() -> None:
 
 
 @pytest.mark.parametrize("spread", [1.0, 1e-5])
-def test_sorted_lists_equal_counted_ones(spread: float) -> None:
+def test_sorted_lists_equal_counted_ones(spread: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """A GPU sorts pairs and a CPU counts them: tile by tile the same Gaussians in the same order, equal depths by
     index.
 
@@ -311,8 +311,16 @@ def test_sorted_lists_equal_counted_ones(spread: float) -> None:
     projected = project(cloud, view, antialiased=False, threads=1)
     tiles = 13 * 10
     counted = [_lists_by_counting(projected, view, tiles, threads) for threads in (1, 2, 3)]
-    lists = [_lists_by_sorting(projected, view, tiles), *counted]
     pairs = projected.slot_count
+    # With no guess, with one that leaves room, and with one that leaves none.
+    monkeypatch.setattr("egs_warp.render.tiles._expected", {"cpu": pairs})
+    guessed = _lists_by_sorting(projected, view, tiles, guess=True)
+    assert lists_fit(guessed, projected) and len(guessed.gaussian_from_intersection) > pairs
+    lists = [_lists_by_sorting(projected, view, tiles), guessed, *counted]
+    monkeypatch.setattr("egs_warp.render.tiles._expected", {"cpu": pairs // 2})
+    missed = _lists_by_sorting(projected, view, tiles, guess=True)
+    assert not lists_fit(missed, projected) and (missed.tile_start.numpy() == 0).all()
+    assert len(_lists_by_sorting(projected, view, tiles, guess=True).gaussian_from_intersection) >= pairs
     assert lists[0].tile_start.numpy()[-1] == pairs > 10_000
     for other in lists[1:]:
         assert np.array_equal(lists[0].tile_start.numpy(), other.tile_start.numpy())
@@ -320,5 +328,5 @@ def test_sorted_lists_equal_counted_ones(spread: float) -> None:
             assert np.array_equal(getattr(lists[0], name).numpy()[:pairs], getattr(other, name).numpy()[:pairs])
     order = np.asarray(lists[0].gaussian_from_intersection.numpy()[:pairs], np.int32)
     depth = projected.colour_depth.numpy()[order, 3]
-    inner = np.setdiff1d(np.arange(1, pairs), lists[0].tile_start.numpy())
+    inner = np.setdiff1d(np.arange(1, pairs), np.asarray(lists[0].tile_start.numpy(), np.int64))
     assert (depth[inner] >= depth[inner - 1]).all()

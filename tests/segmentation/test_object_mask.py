@@ -17,8 +17,11 @@ from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.io import read_cameras, read_capture
 from egs_warp.io.cameras import write_cameras
 from egs_warp.pipelines.locate_plane import locate_plane
+from egs_warp.segmentation import floor_shreds
 from egs_warp.segmentation import object_mask as module
-from egs_warp.segmentation.object_mask import Box, ObjectSpec, masks_from_selection, segment
+from egs_warp.segmentation.object_mask import segment
+from egs_warp.segmentation.object_spec import Box, ObjectSpec
+from egs_warp.segmentation.selection_masks import masks_from_selection
 from egs_warp.segmentation.votes import MaskedView
 from tests.support.grounds import level
 from tests.support.scenes import FLOOR, ball_on_floor, lying, round_ones, shell
@@ -139,9 +142,12 @@ def test_object_as_the_user_writes_it(tmp_path: Path) -> None:
     for text, given, view, message in (
         ("nothing.png", posed, None, "--object nothing.png: no such file, nor numbers"),
         ("1,2,3,4", posed, None, "--object 1,2,3,4: 4 numbers"),
+        ("1e300,2,3", posed, None, "--object 1e300,2,3: further than 1e.12 units from the origin"),
         ("1,2,3,1,5,6", posed, None, "the box is flat"),
         ("5,5", [], None, "a pixel needs cameras"),
         ("5,5", posed, None, "3 cameras; say which with --view"),
+        ("5,5", posed, "\u00b2", "--view \u00b2: no such camera; there are 3"),
+        ("+5,5@" + "1" * 5000, posed, None, "no such camera; there are 3"),
         ("5,5", posed, "nobody", "--view nobody: no such camera; there are 3"),
         ("1,1", posed, "2", "the capture shows nothing there"),
         ("99,1", posed, "2", "outside of the view's 64 x 64 pixels"),
@@ -285,7 +291,7 @@ def test_how_far_a_floor_scatters_is_judged_beside_the_object() -> None:
     under = level((1.6, -1.4), (2.4, -0.6), 0.04, 0.01)
     whole = joined(round_ones(thing, 0.02), lying(np.concatenate([beside, away, under])))
     scene_ = module.AbovePlane.of(whole, FLOOR)
-    top = module._floor_top(scene_, np.arange(whole.count) < len(thing), np.sqrt(2.0))
+    top = floor_shreds.floor_top(scene_, np.arange(whole.count) < len(thing), np.sqrt(2.0))
     assert top == pytest.approx(0.003, rel=0.15)
 
 

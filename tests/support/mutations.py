@@ -85,8 +85,8 @@ EQUATIONS: dict[int, Mutation] = {
         (
             *(10, "the normal measure of the foreseen contact", "contact/coupled_step.py"),
             *(
-                "self.contacts.frame @ free, shift, friction, start",
-                "self.contacts.frame @ free, shift + 0.1, friction, start",
+                "self.contacts.speeds(free), shift, friction, start",
+                "self.contacts.speeds(free), shift + 0.1, friction, start",
             ),
             "contact/test_coupled_step.py::test_foreseen_forces_press_and_rub_no_more_than_they_may",
         ),

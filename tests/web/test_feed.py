@@ -184,7 +184,8 @@ def test_the_camera_sees_the_creature_with_room_around_it():
     [
         (["--port", "70000"], "--port 70000: cannot be used"),
         (["--friction", "-1"], "--friction -1.0: give a Coulomb coefficient"),
-        (["--nodes", "3"], "3 nodes asked; give a number from 50 to 20000"),
+        (["--nodes", "3"], "--nodes 3: give a number from 50 to 20000"),
+        (["--muscles", "missing.json"], "missing.json: no such file"),
         (["--front", "0,0,1"], "--front 0,0,1: points up or down"),
         (["--up", "w"], "--up w: give one of"),
         (["--background", "missing.ply"], "missing.ply"),

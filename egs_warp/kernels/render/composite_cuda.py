@@ -221,36 +221,47 @@ BACKWARD = (
                 if (splat < chosen) {
                     const float4 shape = s_shape[group + s_chosen[part][splat]];
                     const float dy = (float)(part_y + row) - shape.y;
-                    float u = fmaf(shape.w, dy, (float)part_x - shape.x);
+                    const float u = fmaf(shape.w, dy, (float)part_x - shape.x);
+                    float by_column = 0.0f, by_square = 0.0f;
                     #pragma unroll
                     for (int i = 0; i < 8; ++i) {
                         const float k = s_k[part][splat][row * 8 + i];
                         const float w = s_weight[part][splat][row * 8 + i];
                         const float4 by = s_gradient[part * 32 + row * 8 + i];
-                        const float ku = k * u;
                         q[0] += k;
-                        q[1] += ku;
-                        q[3] = fmaf(ku, u, q[3]);
+                        by_column = fmaf(k, (float)i, by_column);
+                        by_square = fmaf(k, (float)(i * i), by_square);
                         q[6] = fmaf(w, by.w, q[6]);
                         q[7] = fmaf(w, by.x, q[7]);
                         q[8] = fmaf(w, by.y, q[8]);
                         q[9] = fmaf(w, by.z, q[9]);
-                        u += 1.0f;
                     }
+                    // The pixels of a row stand at u, u + 1, ...
+                    q[1] = fmaf(u, q[0], by_column);
+                    q[3] = fmaf(u, q[1] + by_column, by_square);
                     q[2] = q[0] * dy;
                     q[4] = q[1] * dy;
                     q[5] = q[2] * dy;
                 }
+                // Each of the four lanes ends with the sums of the quantities row, row + 4 and row + 8.
+                const bool odd = row & 1, high = row & 2;
+                float half[5], whole[3];
                 #pragma unroll
-                for (int i = 0; i < 10; ++i) {
-                    q[i] += __shfl_xor_sync(0xffffffffu, q[i], 1);
-                    q[i] += __shfl_xor_sync(0xffffffffu, q[i], 2);
+                for (int i = 0; i < 5; ++i) {
+                    const float other = __shfl_xor_sync(0xffffffffu, odd ? q[2 * i] : q[2 * i + 1], 1);
+                    half[i] = (odd ? q[2 * i + 1] : q[2 * i]) + other;
+                }
+                #pragma unroll
+                for (int i = 0; i < 3; ++i) {
+                    const float last = i < 2 ? half[2 * i + 1] : 0.0f;
+                    const float other = __shfl_xor_sync(0xffffffffu, high ? half[2 * i] : last, 2);
+                    whole[i] = (high ? last : half[2 * i]) + other;
                 }
                 if (splat < chosen) {
                     float* sum = s_sum[part][s_chosen[part][splat]];
-                    #pragma unroll
-                    for (int i = 0; i < 10; ++i)
-                        if ((i & 3) == row) sum[i] = q[i];
+                    sum[row] = whole[0];
+                    sum[row + 4] = whole[1];
+                    if (!high) sum[row + 8] = whole[2];
                 }
                 __syncwarp();
             }

@@ -168,7 +168,7 @@ def composite_backward_tile_kernel(
     )
 
 
-@wp.kernel
+@wp.kernel(grid_stride=False)
 def composite_backward_block_kernel(
     # In:
     width: wp.int32,

@@ -11,6 +11,10 @@ from egs_warp.kernels.render.ellipse import TILE, tile_columns, tile_rows
 wp.set_module_options({"enable_backward": False})
 
 
+NO_PAIR = wp.constant(wp.uint32(0xFFFFFFFF))
+"""Sort key of room that no pair fills: behind every tile."""
+
+
 @wp.func
 def first_slot_of(slot_end: wp.array[wp.int64], g: wp.int32) -> wp.int32:
     """Where the tiles of Gaussian ``g`` begin."""
@@ -86,7 +90,7 @@ def emit_tiles_kernel(
     # In:
     width: wp.int32,
     height: wp.int32,
-    pair_count: wp.int32,
+    room: wp.int32,
     nearest_bits: wp.int32,
     dropped_bits: wp.int32,
     kept_bits: wp.int32,
@@ -98,13 +102,20 @@ def emit_tiles_kernel(
     key_out: wp.array[wp.uint32],
     slot_and_gaussian_out: wp.array[wp.int32],
 ):
-    """Sort key (tile, then the leading bits of the depth) of every slot, its number,
-    and from 2 ``pair_count`` its Gaussian.
+    """Sort key (tile, then the leading bits of the depth) of every slot, its number, and from 2 ``room`` its Gaussian.
+
+    Where there is room for fewer pairs than there are, there are none.
     """
     g = wp.tid()
+    pair_count = slot_end[slot_end.shape[0] - 1]
+    fits = pair_count >= wp.int64(0) and pair_count <= wp.int64(room)
     # Written side by side by neighbouring threads, which the loop below cannot do.
-    for i in range(g, pair_count, slot_end.shape[0]):
+    for i in range(g, room, slot_end.shape[0]):
         slot_and_gaussian_out[i] = i
+        if not fits or wp.int64(i) >= pair_count:
+            key_out[i] = NO_PAIR
+    if not fits:
+        return
     slot = first_slot_of(slot_end, g)
     if slot == wp.int32(slot_end[g]):
         return
@@ -118,14 +129,23 @@ def emit_tiles_kernel(
         span = tile_columns(e, f, row, width, height)
         for column in range(span[0], span[1] + 1):
             key_out[slot] = (wp.uint32(row * columns + column) << wp.uint32(kept_bits)) | depth_key
-            slot_and_gaussian_out[2 * pair_count + slot] = g
+            slot_and_gaussian_out[2 * room + slot] = g
             slot += 1
+
+
+@wp.func
+def tile_of_key(key: wp.uint32, kept_bits: wp.int32, tiles: wp.int32) -> wp.int32:
+    """Number of the tile; ``tiles`` for room that no pair fills."""
+    tile = tiles
+    if key != NO_PAIR:
+        tile = wp.int32(key >> wp.uint32(kept_bits))
+    return tile
 
 
 @wp.kernel
 def finish_lists_kernel(
     # In:
-    intersection_count: wp.int32,
+    room: wp.int32,
     kept_bits: wp.int32,
     key: wp.array[wp.uint32],
     slot_and_gaussian: wp.array[wp.int32],
@@ -140,15 +160,17 @@ def finish_lists_kernel(
     Thread i fills the starts of the tiles after that of pair i-1 up to that of pair i.
     """
     i = wp.tid()
+    tiles = tile_start_out.shape[0] - 1
     before = wp.int32(-1)
     if i > 0:
-        before = wp.int32(key[i - 1] >> wp.uint32(kept_bits))
-    here = tile_start_out.shape[0] - 1
-    if i < intersection_count:
+        before = tile_of_key(key[i - 1], kept_bits, tiles)
+    here = tiles
+    if i < room:
+        here = tile_of_key(key[i], kept_bits, tiles)
+    if here < tiles:
         own = key[i]
-        here = wp.int32(own >> wp.uint32(kept_bits))
         slot = slot_and_gaussian[i]
-        gaussians = 2 * intersection_count
+        gaussians = 2 * room
         g = slot_and_gaussian[gaussians + slot]
         # Pairs of equal keys stand in the order of their slots, which is that of equal depths.
         place = i
@@ -158,7 +180,7 @@ def finish_lists_kernel(
                 place -= 1
             j -= 1
         j = i + 1
-        while j < intersection_count and key[j] == own:
+        while j < room and key[j] == own:
             if colour_depth[slot_and_gaussian[gaussians + slot_and_gaussian[j]]][3] < colour_depth[g][3]:
                 place += 1
             j += 1

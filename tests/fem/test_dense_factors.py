@@ -1,0 +1,83 @@
+"""Dense factors solve as sparse ones do, and tell definiteness alike."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sparse
+import warp as wp
+
+from egs_warp.fem.factors import factors_on
+from egs_warp.fem.sparse_factors import SparseFactors
+
+pytest.importorskip("torch")
+
+from egs_warp.fem.dense_factors import DenseFactors
+
+DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
+
+
+def entries_of(upper: sparse.csc_matrix, seed: int, diagonal: float) -> np.ndarray:
+    """(nnz,) of a random symmetric matrix with the pattern of ``upper``."""
+    entries = np.random.default_rng(seed).normal(size=upper.nnz)
+    entries[upper.indptr[1:] - 1] += diagonal
+    return entries
+
+
+def pattern(count: int) -> sparse.csc_matrix:
+    """Upper triangle, a tenth of it filled, with the diagonal."""
+    filled = np.triu(np.random.default_rng(3).random((count, count)) < 0.1) | np.eye(count, dtype=bool)
+    upper = sparse.csc_matrix(filled.astype(float))
+    upper.sort_indices()
+    return upper
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("diagonal", [30.0, 1.0])
+def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
+    """Solutions and quadratic forms to rounding, with a sum and without; an indefinite matrix has no dense factors, but
+    a sum with it may have.
+    """
+    upper = pattern(60)
+    dense, thin = DenseFactors(upper, device=device), SparseFactors(upper)
+    random = np.random.default_rng(7)
+    right = random.normal(size=(60, 40))
+    across, rates = random.normal(size=(60, 8)), 0.1 * random.normal(size=8)
+    for seed in range(5):
+        entries = entries_of(upper, seed, diagonal)
+        definite = thin.update(entries)
+        assert dense.update(entries) == dense.ready == definite == (diagonal == 30.0)
+        matrix = thin.quadratic(entries, np.eye(60))
+        assert np.array_equal(matrix, matrix.T) and np.array_equal(
+            sparse.csc_matrix((entries, upper.indices, upper.indptr), upper.shape).toarray(), np.triu(matrix)
+        )
+        got = dense.give(dense.quadratic(entries, dense.take(right)))
+        assert np.abs(got - right.T @ matrix @ right).max() < 1e-10
+        if definite:
+            assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-12
+            assert np.abs(dense.solve(right[:, 0]) - thin.solve(right[:, 0])).max() < 1e-12
+        assert dense.add(across, rates) == thin.add(across, rates) == definite
+        if definite:
+            assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-12
+        # As much along every axis as makes the sum definite.
+        assert dense.add(np.eye(60), np.full(60, 40.0)) and thin.add(np.eye(60), np.full(60, 40.0)) and dense.ready
+        assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-10
+        assert np.abs((matrix + 40.0 * np.eye(60)) @ dense.solve(right) - right).max() < 1e-10
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_what_is_not_finite_has_no_factors(device: str) -> None:
+    upper = pattern(20)
+    factors = DenseFactors(upper, device=device)
+    assert not factors.update(np.full(upper.nnz, np.nan)) and not factors.ready
+    assert factors.update(entries_of(upper, 0, 30.0)) and factors.ready
+    assert not factors.add(np.full((20, 1), np.nan), np.ones(1))
+
+
+@pytest.mark.cuda
+def test_a_gpu_gets_dense_factors() -> None:
+    assert isinstance(factors_on(wp.get_device("cuda:0"), pattern(20)), DenseFactors)
+
+
+def test_a_cpu_gets_sparse_factors() -> None:
+    assert isinstance(factors_on(wp.get_device("cpu"), pattern(20)), SparseFactors)
