@@ -72,7 +72,7 @@ def run(name: str, cell: str, text: str, nodes: int) -> Row:
 def _run(name: str, cell: str, text: str, nodes: int) -> Row:
     try:
         one = modelled(name) if name in MODELLED or name in UNSEEN else body(name)
-        creature = _creature(one, nodes)
+        creature = creature_of(one, nodes)
         unit = float(np.sqrt(creature.body.height / np.linalg.norm(creature.body.gravity)))
         performance = simulate(
             creature,
@@ -124,7 +124,7 @@ def _run(name: str, cell: str, text: str, nodes: int) -> Row:
     }
 
 
-def _creature(one: Body, nodes: int) -> Creature:
+def creature_of(one: Body, nodes: int) -> Creature:
     """With a finer cage where so coarse a one falls apart."""
     try:
         return make_creature(one.cloud, plane=one.plane, nodes=nodes)
