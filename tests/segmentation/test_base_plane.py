@@ -136,12 +136,12 @@ def test_a_bevel_above_the_sole_is_not_the_support() -> None:
 
 @pytest.mark.parametrize("size", [0.1, 1.0, 10.0])
 def test_the_support_is_what_ends_within_its_band(size: float) -> None:
-    """Columns that end the denser the nearer to the floor: the plane has 15 % of those below it that end within 1.5 %
-    of the height of the densest level, whatever the unit.
+    """Columns that end the denser the nearer to the floor, and as many above: the plane has 15 % of those below it that
+    end within 1.5 % of the height of the densest level, whatever the unit.
     """
-    bottoms = 0.04 * np.linspace(-1.0, 1.0, 401) ** 3
+    bottoms = np.concatenate([0.04 * np.linspace(-1.0, 1.0, 401) ** 3, np.linspace(0.05, 0.14, 401)])
     within = bottoms[np.abs(bottoms) <= 0.015]
-    columns = np.stack([np.arange(401), np.zeros(401)], axis=1).astype(int)
+    columns = np.stack([np.arange(802), np.zeros(802)], axis=1).astype(int)
     heights = size * np.array([0.0, 1.0])
     found = _support_level(
         _Underside(heights, np.ones(2), 0.0, size, size * bottoms, columns, 0.02 * size, np.array([200.0, 0.0]))
