@@ -21,7 +21,7 @@ from egs_warp.io import read_capture
 from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene
 from egs_warp.segmentation.base_plane import find_base_plane
 from egs_warp.segmentation.clearance import Clearing
-from egs_warp.segmentation.object_mask import ObjectSpec
+from egs_warp.segmentation.object_spec import ObjectSpec
 from harness import data_folder
 
 _GAUSSIANS = 20000

@@ -69,9 +69,68 @@ MODELLED: dict[str, Distance] = {
 }
 
 
+def _toadstool(points: np.ndarray) -> np.ndarray:
+    """Heavy above, on a stem."""
+    stem = _rod(points, [0.0, 0.0, 0.0], [0.0, 0.0, 0.6], 0.17, 0.1)
+    return smooth_union(stem, ellipsoid(points, np.array([0.0, 0.0, 0.72]), np.array([0.38, 0.38, 0.2])), 0.05)
+
+
+def _giraffe(points: np.ndarray) -> np.ndarray:
+    """Four long legs under a short trunk, and a neck as long as they are."""
+    out = ellipsoid(points, np.array([0.0, 0.0, 0.52]), np.array([0.26, 0.13, 0.12]))
+    for x, y in ((0.2, 0.11), (0.2, -0.11), (-0.2, 0.11), (-0.2, -0.11)):
+        out = smooth_union(out, _rod(points, [x, 1.2 * y, -0.05], [0.9 * x, 0.8 * y, 0.5], 0.045, 0.06), 0.03)
+    neck = _rod(points, [0.2, 0.0, 0.55], [0.36, 0.0, 0.95], 0.075, 0.05)
+    head = _rod(points, [0.36, 0.0, 0.97], [0.5, 0.0, 0.92], 0.06, 0.045)
+    return smooth_union(smooth_union(out, neck, 0.05), head, 0.03)
+
+
+def _ostrich(points: np.ndarray) -> np.ndarray:
+    """Two legs with long feet under a trunk that lies along the ground, a neck in front."""
+    out = ellipsoid(points, np.array([-0.04, 0.0, 0.6]), np.array([0.26, 0.19, 0.16]))
+    for y in (0.12, -0.12):
+        leg = _rod(points, [0.0, 1.1 * y, 0.05], [-0.02, y, 0.55], 0.055, 0.075)
+        foot = _rod(points, [-0.08, 1.1 * y, 0.03], [0.2, 1.2 * y, 0.03], 0.055, 0.05)
+        out = smooth_union(out, smooth_union(leg, foot, 0.03), 0.03)
+    neck = _rod(points, [0.15, 0.0, 0.66], [0.22, 0.0, 0.95], 0.06, 0.05)
+    return smooth_union(out, neck, 0.05)
+
+
+def _spider(points: np.ndarray) -> np.ndarray:
+    """A flat trunk among eight legs that reach wider than it is high."""
+    out = ellipsoid(points, np.array([0.0, 0.0, 0.42]), np.array([0.28, 0.2, 0.14]))
+    for k in range(8):
+        x, y = np.cos(np.pi * (k + 0.5) / 4.0), np.sin(np.pi * (k + 0.5) / 4.0)
+        knee = [0.42 * x, 0.36 * y, 0.6]
+        thigh = _rod(points, [0.18 * x, 0.14 * y, 0.42], knee, 0.05, 0.045)
+        shin = _rod(points, knee, [0.62 * x, 0.52 * y, -0.04], 0.045, 0.04)
+        out = smooth_union(out, smooth_union(thigh, shin, 0.02), 0.03)
+    return out
+
+
+def _dachshund(points: np.ndarray) -> np.ndarray:
+    """Twice as long as high, on four short legs."""
+    out = _rod(points, [-0.7, 0.0, 0.45], [0.6, 0.0, 0.48], 0.19, 0.2)
+    for x, y in ((0.5, 0.13), (0.5, -0.13), (-0.6, 0.13), (-0.6, -0.13)):
+        out = smooth_union(out, _rod(points, [x, y, -0.05], [x, 0.9 * y, 0.4], 0.075, 0.085), 0.03)
+    head = ellipsoid(points, np.array([0.78, 0.0, 0.78]), np.array([0.22, 0.14, 0.16]))
+    neck = _rod(points, [0.55, 0.0, 0.5], [0.72, 0.0, 0.74], 0.14, 0.11)
+    return smooth_union(smooth_union(out, neck, 0.05), head, 0.04)
+
+
+UNSEEN: dict[str, Distance] = {
+    "toadstool": _toadstool,
+    "giraffe": _giraffe,
+    "ostrich": _ostrich,
+    "spider": _spider,
+    "dachshund": _dachshund,
+}
+"""Made when the motions were done, and not looked at while anything was set: what they do is told as it is."""
+
+
 def modelled(name: str) -> Body:
-    """One of ``MODELLED`` on the plane z = 0, about 1 high."""
-    given, random = MODELLED[name], np.random.default_rng(0)
+    """One of ``MODELLED`` or ``UNSEEN`` on the plane z = 0, about 1 high."""
+    given, random = (MODELLED | UNSEEN)[name], np.random.default_rng(0)
 
     def distance(points: np.ndarray) -> np.ndarray:
         return np.maximum(given(points), -points[:, 2])

@@ -22,7 +22,8 @@ from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.plane import Plane
 from egs_warp.io import read_capture
 from egs_warp.segmentation.base_plane import guess_up
-from egs_warp.segmentation.object_mask import ObjectSpec, segment
+from egs_warp.segmentation.object_mask import segment
+from egs_warp.segmentation.object_spec import ObjectSpec
 from egs_warp.segmentation.plane_fit import PlaneView, fit_plane, plane_depth
 from egs_warp.segmentation.plane_search import find_planes, plane_views
 from harness import Row, Table, data_folder, flags, report, timed

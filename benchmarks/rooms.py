@@ -1,4 +1,4 @@
-"""From clicks or masks to an object, in scenes as they are: how well, and how long each stage takes.
+"""From clicks or masks to an object, and from photos to a film, in scenes as they are: how well, and how long.
 
 Five scenes with objects and ground drawn by hand in eight views each (``drawn.py``). ``masks``: the outlines of every
 other view are given. ``clicks``: the first click is at the innermost place of the object in the first view; each of two
@@ -6,167 +6,84 @@ more is where the largest error is, in the third and in the fifth, at the innerm
 much, with the object drawn alone; an error thinner than 2 % of the picture is left as it is. Both are judged on the
 views between, by the overlap (IoU) of the outlines with where the object alone, static split at its plane, is more
 opaque than 0.5; pixels where the whole capture is fainter than that, and has holes, count for neither. Bonsai's cloud
-is trained first (or taken from ``--trained``).
+is trained first (or taken from ``--trained``, or from the films).
+
+``--films FOLDER``: before that, bonsai, mouse and plush dog from photos to a film, koala, fox, narcissus and playbot
+from a capture to one (``room_films.py``), ``--processes`` of them at a time; each stage is timed.
 
 The ground: planes of three built-in scenes against what is known; of the real ones against two markings, of the even
-and the odd views, by the angle between normals and the distance at the object's foot.
+and the odd views, by the angle between normals and the distance at the object's foot (``room_ground.py``).
 
 Aims: ``iou_masks`` (0.95 in the mean of each scene, the bonsai 0.90), ``iou_click`` (0.88 with three clicks and no
 model; one click and a mask model is not measured, as none that takes clicks is to be had without external data),
 ``ground`` (built-in scenes: 1 degree and 0.5 % of the object's height; real ones: twice the difference of the
-markings), ``psnr_vs_gsplat`` (held out, the same colour fit for both: at least equal on bonsai, mouse and plush dog; on
-a GPU with gsplat).
+markings), ``films`` (each asked for is there, its motion done), ``psnr_vs_gsplat`` (held out, the same colour fit for
+both: at least equal on bonsai, mouse and plush dog; on a GPU with gsplat, with ``--peers``).
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
+import subprocess
+import sys
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 
-from drawn import NAMES, DrawnScene, DrawnView, read_drawn
-from egs_warp.assets import scene
+from clicking import GIVEN, JUDGED, clicked, found_by, overlap, picture
+from drawn import NAMES, DrawnScene, read_drawn
 from egs_warp.errors import UserError
-from egs_warp.geometry.bitmaps import depth_inside
-from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.holes import hole_under
 from egs_warp.inpainting.inpaint import InpaintOptions, inpaint
 from egs_warp.io import read_cameras, read_capture
-from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, on_its_ground
-from egs_warp.pipelines.prepare_scene import SceneOptions, take_apart
 from egs_warp.pipelines.train_capture import train
-from egs_warp.render import render_gaussians
-from egs_warp.segmentation.clearance import Clearing
-from egs_warp.segmentation.clicks import Click, click_at
-from egs_warp.segmentation.object_mask import ObjectSpec
+from egs_warp.segmentation.object_spec import ObjectSpec
 from egs_warp.segmentation.votes import MaskedView
 from harness import Row, Table, data_folder, flags, report, timed
+from room_films import CLICKS, FILMS, is_here
+from room_ground import judged_ground, known_ground, real_ground
 from train_peers import has_gsplat
 
-GIVEN, JUDGED = slice(0, None, 2), slice(1, None, 2)
 IOU_MASKS, IOU_FOLIAGE, IOU_CLICKS = 0.95, 0.90, 0.88
 PEERS = ("bonsai", "mouse", "plush_dog")
-CLICKS = 3
-VISIBLE = 0.01
-"""Of a picture's shorter side: an error whose innermost place is nearer to its edge than this is not clicked on."""
+_SCRIPT = Path(__file__).with_name("room_films.py")
 
 
-def overlap(cloud: GaussianCloud, thing: GaussianCloud, view: DrawnView) -> tuple[float, np.ndarray, np.ndarray]:
-    """IoU of ``thing``, drawn alone, with the outline; and (H, W) bool of what is missing, and too much."""
-    alone, whole = (render_gaussians(one, view.camera).alpha.numpy() > 0.5 for one in (thing, cloud))
-    counts = whole | alone
-    missing, more = view.mask & ~alone & counts, alone & ~view.mask
-    union = (view.mask | alone) & counts
-    return float((view.mask & alone).sum() / max(union.sum(), 1)), missing, more
+def film_rows(options: argparse.Namespace) -> list[Row]:
+    """A row a film, each made by a process of its own; with ``said`` in place of figures where one failed."""
+    threads = str(max(1, (os.cpu_count() or 1) // options.processes))
+    limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads)
 
+    def one(name: str) -> Row:
+        out = options.films / name
+        command = [sys.executable, str(_SCRIPT), name, "--out", str(out), "--device", options.device]
+        command += ["--nodes", str(options.nodes)]
+        if options.trained and (options.trained / f"{name}.ply").exists():
+            command += ["--trained", str(options.trained / f"{name}.ply")]
+        options.films.mkdir(parents=True, exist_ok=True)
+        with (options.films / f"{name}.log").open("w") as log:
+            status = subprocess.run(command, stdout=log, stderr=log, env={**os.environ, **limits}).returncode
+        if status or not (out / "row.json").exists():
+            said = (options.films / f"{name}.log").read_text().strip().splitlines()
+            return {"scene": name, "how": "film", "ended": "failed", "said": said[-1:]}
+        return json.loads((out / "row.json").read_text())
 
-def innermost(mask: np.ndarray) -> tuple[float, tuple[float, float]]:
-    """How many pixels the innermost place of ``mask`` (H, W) is from its edge, and where it is, (u, v)."""
-    depth = depth_inside(np.pad(mask, 1))[1:-1, 1:-1]
-    row, column = np.unravel_index(int(np.argmax(depth)), depth.shape)
-    return float(depth[row, column]), (column + 0.5, row + 0.5)
-
-
-def found_by(
-    cloud: GaussianCloud, spec: ObjectSpec, cameras: Sequence[Camera], seconds: dict[str, float]
-) -> tuple[LocatedPlane, GaussianCloud, GaussianCloud]:
-    """Where the object is, it and its background; ``seconds`` of each stage."""
-    located, seconds["plane"] = timed(locate_plane, cloud, spec, cameras=cameras)
-    located, seconds["ground"] = timed(on_its_ground, cloud, located, spec, cameras)
-    parts, seconds["segment"] = timed(take_apart, cloud, located, SceneOptions(clearing=Clearing.SPLIT))
-    return located, parts[0], parts[1]
-
-
-def clicked(
-    drawn: DrawnScene, cloud: GaussianCloud, cameras: Sequence[Camera], count: int
-) -> tuple[ObjectSpec, list[str]]:
-    """What ``count`` clicks tell, and these clicks as the command takes them."""
-    views = drawn.views[GIVEN]
-    clicks: list[Click] = []
-    written: list[str] = []
-    thing: GaussianCloud | None = None
-    for number in range(count):
-        view = views[number]
-        inside, place = True, innermost(view.mask)[1]
-        if number:
-            spec = ObjectSpec.of_clicks(clicks)
-            try:
-                thing = found_by(cloud, spec, cameras, {})[1]
-            except UserError as error:
-                # What a user gets is one line; the next click is made on the object.
-                print(f"{drawn.name}: {number} clicks: {error}")
-            if thing is not None:
-                _, missing, more = overlap(cloud, thing, view)
-                (depth, lost), (extra, taken) = innermost(missing), innermost(more)
-                if max(depth, extra) < VISIBLE * min(view.mask.shape):
-                    continue
-                inside, place = (True, lost) if depth >= extra else (False, taken)
-        hit = click_at(cloud, view.camera, *place, inside=inside)
-        if hit is not None:
-            clicks.append(hit)
-            written.append(f"{'+' if inside else '-'}{place[0]:g},{place[1]:g}@{2 * number}")
-    return ObjectSpec.of_clicks(clicks), written
-
-
-def marked_plane(cloud: GaussianCloud, views: Sequence[DrawnView], up: np.ndarray) -> Plane:
-    """Through the places that are marked on the ground, the worst fifth of them left out."""
-    places = []
-    for view in views:
-        depth = render_gaussians(cloud, view.camera, geometry=True).median_depth
-        assert depth is not None
-        column, row = view.ground.astype(int).T
-        away = depth.numpy()[row, column]
-        seen = away > 0.0
-        places.append(view.camera.centre + away[seen, None] * camera_rays(view.camera)[row[seen], column[seen]])
-    points = np.concatenate(places)
-    for _ in range(2):
-        middle = points.mean(axis=0)
-        normal = np.linalg.svd(points - middle)[2][2]
-        normal *= np.sign(normal @ up)
-        off = np.abs((points - middle) @ normal)
-        points = points[off <= np.quantile(off, 0.9)]
-    middle = points.mean(axis=0)
-    normal = np.linalg.svd(points - middle)[2][2]
-    normal *= np.sign(normal @ up)
-    return Plane(normal, float(-normal @ middle))
-
-
-def apart(first: Plane, second: Plane, foot: np.ndarray, height: float) -> tuple[float, float]:
-    """Degrees between two planes, and their distance at ``foot`` (3,) in the object's heights."""
-    cosine = float(np.clip(first.normal @ second.normal, -1.0, 1.0))
-    return float(np.degrees(np.arccos(cosine))), abs(float(first.heights(foot) - second.heights(foot))) / height
-
-
-def real_ground(drawn: DrawnScene, cloud: GaussianCloud, located: LocatedPlane) -> Row:
-    """Ours against the mean of two markings, and these against each other."""
-    plane = located.plane
-    foot = located.centre - plane.heights(located.centre) * plane.normal
-    height = float(np.quantile(plane.heights(cloud.means.numpy()[located.segmentation.object_mask]), 0.995))
-    even, odd = (marked_plane(cloud, drawn.views[half], plane.normal) for half in (GIVEN, JUDGED))
-    between = even.normal + odd.normal
-    middle = foot - 0.5 * (even.heights(foot) + odd.heights(foot)) * plane.normal
-    between /= np.linalg.norm(between)
-    degrees, offset = apart(plane, Plane(between, float(-between @ middle)), foot, height)
-    told_degrees, told_offset = apart(even, odd, foot, height)
-    row = {"scene": drawn.name, "how": "ground", "degrees": degrees, "offset": offset}
-    return {**row, "markings_degrees": told_degrees, "markings_offset": told_offset}
-
-
-def known_ground(name: str, device: str) -> Row:
-    """The plane of a built-in scene from a point in the middle of its object, against the one it was made on."""
-    made = scene(name, device=device)
-    cloud, truth = made.whole()
-    heights = made.plane.heights(cloud.means.numpy()[truth])
-    low, high = np.quantile(cloud.means.numpy()[truth], [0.01, 0.99], axis=0)
-    middle = 0.5 * (low + high)
-    located = locate_plane(cloud, ObjectSpec(point=middle))
-    foot = middle - made.plane.heights(middle) * made.plane.normal
-    degrees, offset = apart(located.plane, made.plane, foot, float(heights.max()))
-    return {"scene": name, "how": "ground", "degrees": degrees, "offset": offset}
+    # Those that train first take the longest, and begin first.
+    names = [name for name in FILMS if is_here(name) and (not options.only or name in options.only)]
+    with ThreadPoolExecutor(options.processes) as pool:
+        rows = list(pool.map(one, names))
+    for row in rows:
+        stages = " ".join(f"{stage} {value:.1f}" for stage, value in row.get("seconds", {}).items())
+        print(f"{row['scene']}: {stages or row['said']} ({row['ended']})", flush=True)
+    if options.json:
+        # Should time be up before the rest is done.
+        options.json.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
+    return rows
 
 
 def cloud_of(drawn: DrawnScene, options: argparse.Namespace, seconds: dict[str, float]) -> GaussianCloud:
@@ -174,8 +91,11 @@ def cloud_of(drawn: DrawnScene, options: argparse.Namespace, seconds: dict[str, 
     if drawn.capture is not None:
         return read_capture(drawn.capture, device=options.device).cloud
     assert drawn.photos is not None
-    if options.trained:
-        return read_capture(options.trained / f"{drawn.name}.ply", device=options.device).cloud
+    made = [options.trained / f"{drawn.name}.ply"] if options.trained else []
+    made += [options.films / drawn.name / "capture.ply"] if options.films else []
+    for place in made:
+        if place.exists():
+            return read_capture(place, device=options.device).cloud
     small = options.device == "cpu"
     result, seconds["train"] = timed(
         train,
@@ -214,33 +134,18 @@ def rows_of(drawn: DrawnScene, options: argparse.Namespace, table: Table) -> tup
             continue
         if how == "masks" and not options.quick:
             hole = hole_under(cloud, located.plane, located.segmentation)
-            _, stages["inpaint"] = timed(inpaint, bare, hole, options=InpaintOptions(steps=0))
+            if hole is not None:
+                _, stages["inpaint"] = timed(inpaint, bare, hole, options=InpaintOptions(steps=0))
         seconds |= {name: 1e-3 * value for name, value in stages.items()}
         judged = [overlap(cloud, thing, view) for view in drawn.views[JUDGED]]
         ious = [one[0] for one in judged]
         rows.append({**row, "iou": float(np.mean(ious)), "ious": ious, "clicks": written, "seconds": seconds})
         if how == "masks":
             rows.append(real_ground(drawn, cloud, located))
-        pictures.append(_picture(thing, drawn.views[JUDGED][0], *judged[0][1:]))
+        pictures.append(picture(thing, drawn.views[JUDGED][0], *judged[0][1:]))
         total = sum(stages.values())
         table.row(drawn.name, how, float(np.mean(ious)), min(ious), 1e-3 * total, None)
     return rows, pictures
-
-
-def _picture(thing: GaussianCloud, view: DrawnView, missing: np.ndarray, more: np.ndarray) -> np.ndarray:
-    """(320, 320, 3) uint8: the object alone, red where it is missing, blue where it is too much."""
-    import cv2
-
-    drawn = render_gaussians(thing, view.camera, background=(0.7, 0.7, 0.7)).colour.numpy()
-    picture = np.clip(drawn.astype(np.float32), 0.0, 1.0)
-    picture[missing], picture[more] = (1.0, 0.1, 0.1), (0.1, 0.2, 1.0)
-    side = min(picture.shape[:2])
-    middle = np.argwhere(view.mask).mean(axis=0) if view.mask.any() else np.array(picture.shape[:2]) / 2.0
-    top, left = (int(np.clip(middle[k] - side / 2, 0, picture.shape[k] - side)) for k in (0, 1))
-    cropped = cv2.resize(
-        np.ascontiguousarray(picture[top : top + side, left : left + side]), (320, 320), interpolation=cv2.INTER_AREA
-    )
-    return np.rint(255.0 * cropped).astype(np.uint8)
 
 
 def psnr_rows(options: argparse.Namespace) -> list[Row]:
@@ -256,17 +161,6 @@ def psnr_rows(options: argparse.Namespace) -> list[Row]:
     return rows
 
 
-def judged_ground(rows: Sequence[Row]) -> bool:
-    """Whether every plane is near enough to what is known of it."""
-    return all(
-        row["degrees"] <= 2.0 * row["markings_degrees"] and row["offset"] <= 2.0 * row["markings_offset"]
-        if "markings_degrees" in row
-        else row["degrees"] <= 1.0 and row["offset"] <= 0.005
-        for row in rows
-        if row["how"] == "ground"
-    )
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run, print, write."""
     parser = flags(
@@ -276,8 +170,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         plot="the object alone in a judged view, by masks, one click and three; red is missing, blue too much",
     )
     parser.add_argument("--trained", type=Path, help="folder of captures that were trained before: bonsai.ply")
+    parser.add_argument("--films", type=Path, help="folder for the films, one folder a scene")
+    parser.add_argument("--processes", type=int, default=1, help="films at a time")
+    parser.add_argument("--nodes", type=int, default=500, help="of the cages of the films, about")
+    parser.add_argument("--only", nargs="*", metavar="SCENE", help="these scenes")
+    parser.add_argument("--peers", action="store_true", help="train with gsplat, too, for psnr_vs_gsplat")
     options = parser.parse_args(arguments)
-    rows: list[Row] = []
+    rows: list[Row] = film_rows(options) if options.films else []
     figure: list[np.ndarray] = []
     table = Table(scene="<10", how="<9", IoU=".3f", worst=".3f", seconds="6.1f", ground="s")
     for name in ("pawn", "stool", "figurine"):
@@ -285,7 +184,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         table.row(name, "ground", None, None, None, "{degrees:.2f} deg, {offset:.2%}".format(**rows[-1]))
     for name in NAMES:
         drawn = read_drawn(name)
-        if not drawn.is_here or (drawn.capture is None and options.quick and not options.trained):
+        if options.only and name not in options.only:
+            continue
+        has_cloud = drawn.capture is not None or options.trained or options.films or not options.quick
+        if not drawn.is_here or not has_cloud:
             print(f"{name}: left out; set EGS_WARP_DATA, or give --trained")
             continue
         more, pictures = rows_of(drawn, options, table)
@@ -296,12 +198,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             table.row(name, "ground", None, None, None, said.format(**ground))
         blank = np.full((320, 320, 3), 255, np.uint8)
         figure.append(np.concatenate([*pictures, *[blank] * (3 - len(pictures))], axis=1))
-    masks, three = (
-        [row for row in rows if row["how"] == how and row["scene"] in NAMES] for how in ("masks", f"{CLICKS} clicks")
-    )
     why_null: dict[str, str] = {}
     against: bool | None = None
-    if options.device.startswith("cuda") and has_gsplat() and not options.quick:
+    if options.device.startswith("cuda") and has_gsplat() and options.peers:
         peers = psnr_rows(options)
         rows += peers
         ours, theirs = (
@@ -310,20 +209,28 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
         against = all(ours[case] >= theirs[case] for case in theirs)
     else:
-        why_null["psnr_vs_gsplat"] = "needs a GPU with gsplat, and no --quick"
+        why_null["psnr_vs_gsplat"] = "needs a GPU with gsplat, and --peers"
+    films = [row["ended"] == "done" for row in rows if row.get("how") == "film"]
+    if not films:
+        why_null["films"] = "made with --films only"
     report(
         options,
         rows,
-        aims={
-            "iou_masks": all(row["iou"] >= (IOU_FOLIAGE if row["scene"] == "bonsai" else IOU_MASKS) for row in masks),
-            "iou_click": all(row["iou"] >= IOU_CLICKS for row in three),
-            "ground": judged_ground(rows),
-            "psnr_vs_gsplat": against,
-        },
+        aims={**judged_masks(rows), "ground": judged_ground(rows), "films": all(films) if films else None}
+        | {"psnr_vs_gsplat": against},
         why_null=why_null,
         packages=["torch"],
         picture=np.concatenate(figure) if figure else None,
     )
+
+
+def judged_masks(rows: Sequence[Row]) -> dict[str, bool]:
+    """``iou_masks`` and ``iou_click``."""
+    masks, three = ([row for row in rows if row.get("how") == how] for how in ("masks", f"{CLICKS} clicks"))
+    return {
+        "iou_masks": all(row["iou"] >= (IOU_FOLIAGE if row["scene"] == "bonsai" else IOU_MASKS) for row in masks),
+        "iou_click": all(row["iou"] >= IOU_CLICKS for row in three),
+    }
 
 
 if __name__ == "__main__":

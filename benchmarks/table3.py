@@ -27,7 +27,8 @@ from egs_warp.io import read_capture
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane
 from egs_warp.render import render_gaussians
 from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane
-from egs_warp.segmentation.object_mask import ObjectSpec, masks_from_selection
+from egs_warp.segmentation.object_spec import ObjectSpec
+from egs_warp.segmentation.selection_masks import masks_from_selection
 from egs_warp.segmentation.votes import blending_votes
 from egs_warp.training.likeness import psnr, ssim
 from harness import Row, Table, data_folder, flags, report, timed

@@ -24,7 +24,7 @@ from egs_warp.pipelines.creature import Creature, make_creature
 from egs_warp.pipelines.performance import simulate
 from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene
 from egs_warp.pipelines.progress import scene_bar, simulation_bar
-from egs_warp.segmentation.object_mask import ObjectSpec
+from egs_warp.segmentation.object_spec import ObjectSpec
 from harness import Row, Table, flags, report
 
 if TYPE_CHECKING:

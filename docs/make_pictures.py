@@ -41,6 +41,7 @@ JUMP = "python examples/jump.py --out out/jump"
 WALK = 'egs-warp animate out/captures/stool_in_room.ply --up z --object 0,0,0.97 --motion "walk 0.6" --out out/stool'
 SCENE = "egs-warp animate out/captures/figurine_in_room.ply --up z --object 0,0,0.5 --motion jump --out out/figurine"
 INFO = "egs-warp info out/captures/stool.ply --up z --plot out/info.png"
+PHOTOS = "python docs/photo_sheets.py --out out/photos"
 MUSCLES = "egs-warp muscles out/captures/pawn.ply --up z --plot out/muscles.png"
 
 
@@ -92,6 +93,9 @@ PICTURES = (
     Picture("filled.webp", SCENE, "figurine/filled.png", 1200),
     Picture("info.webp", INFO, "info.png", 1400),
     Picture("muscles.webp", MUSCLES, "muscles.png", 1200),
+    Picture("photos_taking.webp", PHOTOS, "photos/taking.png", 1200),
+    Picture("photos_wrong.webp", PHOTOS, "photos/photos.png", 1200),
+    Picture("object_wrong.webp", PHOTOS, "photos/object.png", 1200),
 )
 
 

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from egs_warp.motions.style import Style, read_style
     from egs_warp.pipelines.animate import AnimateOptions, animate
     from egs_warp.pipelines.creature import Creature, make_creature
+    from egs_warp.pipelines.many import Job, Outcome, simulate_many
     from egs_warp.pipelines.performance import Performance, simulate
     from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene
     from egs_warp.pipelines.report import Report
@@ -49,7 +50,7 @@ if TYPE_CHECKING:
     from egs_warp.render.rasteriser import render_gaussians
     from egs_warp.segmentation.clearance import Clearing, ClearingOptions, Reach
     from egs_warp.segmentation.clicks import Click, click_at
-    from egs_warp.segmentation.object_mask import Box, ObjectSpec
+    from egs_warp.segmentation.object_spec import Box, ObjectSpec
     from egs_warp.segmentation.votes import MaskedView
     from egs_warp.training.finetune import (
         Densification,
@@ -91,6 +92,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "motions.style": ("Style", "read_style"),
     "pipelines.animate": ("AnimateOptions", "animate"),
     "pipelines.creature": ("Creature", "make_creature"),
+    "pipelines.many": ("Job", "Outcome", "simulate_many"),
     "pipelines.performance": ("Performance", "simulate"),
     "pipelines.prepare_scene": ("PreparedScene", "SceneOptions", "prepare_scene"),
     "pipelines.report": ("Report",),
@@ -100,7 +102,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "render.rasteriser": ("render_gaussians",),
     "segmentation.clearance": ("Clearing", "ClearingOptions", "Reach"),
     "segmentation.clicks": ("Click", "click_at"),
-    "segmentation.object_mask": ("Box", "ObjectSpec"),
+    "segmentation.object_spec": ("Box", "ObjectSpec"),
     "segmentation.votes": ("MaskedView",),
     "training.finetune": ("Densification", "FinetuneOptions", "Rates", "TrainingView", "finetune", "views_of_capture"),
     "training.likeness": ("psnr",),
@@ -126,9 +128,11 @@ __all__ = [
     "HeightField",
     "InpaintOptions",
     "Inpainter",
+    "Job",
     "LocomotionSettings",
     "MaskedView",
     "ObjectSpec",
+    "Outcome",
     "Performance",
     "Plane",
     "PreparedScene",
@@ -173,6 +177,7 @@ __all__ = [
     "render_torch",
     "scene",
     "simulate",
+    "simulate_many",
     "train",
     "use_device",
     "views_of_capture",

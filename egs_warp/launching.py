@@ -32,6 +32,8 @@ U = TypeVar("U")
 Device: TypeAlias = wp.Device | str | None
 """A device or its name; None is Warp's current one."""
 
+THREADS = "EGS_WARP_THREADS"
+"""In the environment: how many cores the package may use at most, where that is less than there are."""
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 _MIN_ROWS_PER_CHUNK = 2048
 """Below this many light rows a launch's own cost (about 20 us) is no longer small against its work."""
@@ -45,7 +47,9 @@ _LAST_CHUNKS_PER_THREAD = 24
 
 def available_threads() -> int:
     """Number of processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    most = os.environ.get(THREADS, "")
+    return max(1, min(cores, int(most))) if most.isdecimal() else cores
 
 
 def use_device(device: str) -> None:
@@ -216,6 +220,8 @@ def _chunk_edges(row_count: int, threads: int, work: np.ndarray | None) -> list[
 
 def beside(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
     """Both results; ``second`` runs in another thread where one is free."""
+    if available_threads() == 1:
+        return first(), second()
     helper = _pool().submit(second)
     try:
         done = first()

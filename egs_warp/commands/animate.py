@@ -138,7 +138,7 @@ def _animate_capture(chosen: argparse.Namespace) -> tuple[Report, str]:
     from egs_warp.io.video import ffmpeg_program
     from egs_warp.pipelines.animate import animate
 
-    for name in ("cameras", "view", "straddling", "inpainter", "trust", "no_inpaint"):
+    for name in ("cameras", "view", "mask_model", "straddling", "inpainter", "trust", "no_inpaint"):
         if getattr(chosen, name) not in (None, False):
             raise UserError(f"--{name.replace('_', '-')}: needs --object, which says what to take out of a scene")
     asked = _asked(chosen)

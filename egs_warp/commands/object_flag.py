@@ -15,8 +15,10 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.lens import Straightening
 from egs_warp.io.cameras import PosedImage
 from egs_warp.io.limits import FURTHEST, check_pixels, picture_size, read_bytes
+from egs_warp.segmentation.carried_masks import masks_of_clicks, salient_masks
 from egs_warp.segmentation.clicks import Click, click_at
-from egs_warp.segmentation.object_mask import Box, ObjectSpec
+from egs_warp.segmentation.mask_model import OnnxClickModel, SalientModel
+from egs_warp.segmentation.object_spec import Box, ObjectSpec
 from egs_warp.segmentation.votes import MaskedView
 
 MAX_MASK_SIDE = 800
@@ -27,6 +29,7 @@ _HELP = (
 )
 _MOST_DIGITS = 10
 """Of the number of a camera."""
+_SALIENT = "salient"
 _CLICK = re.compile(r"([+-]?)([0-9.]+),([0-9.]+)@(.+)", re.DOTALL)
 
 
@@ -37,11 +40,13 @@ def read_object(
     *,
     view: str | None = None,
     flag: str = "--object",
+    mask_model: Path | None = None,
 ) -> ObjectSpec:
     """What ``--object TEXT`` means, given once or several times, or that of another ``flag``: a mask's file, a folder
-    of masks, a point, a box, or a pixel of the view ``view``; and clicks, which alone will do.
+    of masks, a point, a box, or a pixel of the view ``view``; clicks, which alone will do; or ``salient``.
 
-    Masks belong to the camera whose photo has the same name. Raises ``UserError`` with one line for anything else.
+    With ``mask_model``, a network's file, clicks become masks. Masks belong to the camera whose photo has the same
+    name. Raises ``UserError`` with one line for anything else.
     """
     given = [texts] if isinstance(texts, str) else list(texts)
     found: list[ObjectSpec] = []
@@ -55,12 +60,20 @@ def read_object(
             clicks.append(_click(cloud, one, click[2], click[3], text, inside=click[1] != "-"))
         elif not _is_there(text) and text.count(",") == 1:
             clicks.append(_pixel(text, cloud, posed, view, flag))
+        elif text == _SALIENT and not _is_there(text):
+            found.append(_salient(cloud, posed, flag))
         else:
             found.append(_place(text, posed, view, flag))
     if len(found) > 1:
         raise UserError(
             f"{flag}: {len(found)} places, {given[0]} and others; give one, and clicks +u,v@photo beside it"
         )
+    if mask_model is not None:
+        if found or not clicks:
+            raise UserError(f"--mask-model {mask_model}: it makes masks from clicks; give {flag} +u,v@photo alone")
+        model = OnnxClickModel.read(mask_model)
+        masks = masks_of_clicks(cloud, clicks, [one.camera for one in posed or ()], model)
+        return ObjectSpec(masks=tuple(masks), clicks=tuple(clicks))
     return replace(found[0], clicks=tuple(clicks)) if found else ObjectSpec.of_clicks(clicks)
 
 
@@ -70,6 +83,14 @@ def _is_there(text: str) -> bool:
     # A name that is too long.
     except OSError:
         return False
+
+
+def _salient(cloud: GaussianCloud, posed: Sequence[PosedImage] | None, flag: str) -> ObjectSpec:
+    """Masks of what stands out of the photos' pictures."""
+    if not posed:
+        raise UserError(f"{flag} {_SALIENT}: needs pictures to look at; give --cameras, or a point x,y,z")
+    masks = salient_masks(cloud, [one.camera for one in posed], SalientModel.installed())
+    return ObjectSpec(masks=tuple(masks))
 
 
 def _place(text: str, posed: Sequence[PosedImage] | None, view: str | None, flag: str) -> ObjectSpec:

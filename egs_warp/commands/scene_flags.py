@@ -14,7 +14,12 @@ def add_object_flags(parser: argparse._ActionsContainer) -> None:
         "--object",
         action="append",
         help="mask.png, folder of masks, point x,y,z, box x0,y0,z0,x1,y1,z1, pixel u,v of --view, or clicks, as many "
-        "as needed: +u,v@photo goes along, -u,v@photo does not",
+        "as needed: +u,v@photo goes along, -u,v@photo does not; salient is what stands out (egs-warp[salient])",
+    )
+    parser.add_argument(
+        "--mask-model",
+        type=named_path,
+        help="ONNX file of a network that makes masks from the clicks, such as EfficientSAM's (docs/guide/scene.md)",
     )
     parser.add_argument(
         "--cameras", type=named_path, help="cameras.json, transforms.json or COLMAP model; else a ring is used"

@@ -21,7 +21,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.io.cameras import PosedImage, read_cameras
 from egs_warp.io.capture import read_capture
 from egs_warp.io.planes import read_planes
-from egs_warp.segmentation.object_mask import ObjectSpec
+from egs_warp.segmentation.object_spec import ObjectSpec
 
 if TYPE_CHECKING:
     from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions
@@ -92,7 +92,9 @@ def read_scene(chosen: argparse.Namespace) -> SceneInput:
     plane = plane_of(chosen.plane) if chosen.plane is not None else None
     capture = read_capture(chosen.capture, device=chosen.device)
     posed = read_cameras(chosen.cameras) if chosen.cameras else []
-    spec = read_object(chosen.object, capture.cloud, posed, view=chosen.view) if chosen.object is not None else None
+    spec = None
+    if chosen.object is not None:
+        spec = read_object(chosen.object, capture.cloud, posed, view=chosen.view, mask_model=chosen.mask_model)
     if up is None and capture.up is not None:
         up = np.asarray(capture.up, dtype=float)
     return SceneInput(capture.cloud, posed, spec, up, plane, capture.notes)

@@ -23,6 +23,7 @@ from egs_warp.pipelines.locate_plane import known_of_fit, locate_plane
 from egs_warp.render.rasteriser import render_gaussians
 from egs_warp.segmentation.plane_fit import PlaneView, fit_plane
 from egs_warp.segmentation.plane_search import further_planes
+from egs_warp.segmentation.seen_surface import SeenSurface
 
 
 @dataclass(frozen=True)
@@ -59,10 +60,10 @@ def planes_of_scene(given: SceneInput, *, plane_mask: str | None, view: str | No
         masks = read_object(plane_mask, given.cloud, given.posed, view=view, flag="--plane-mask").masks
         if not masks:
             raise UserError(f"--plane-mask {plane_mask}: give a mask.png or a folder of masks")
+        seen = [SeenSurface.of(given.cloud, mask.camera) for mask in masks]
+        fit = fit_plane([PlaneView(one.camera, one.depth, mask.mask) for one, mask in zip(seen, masks, strict=True)])
         views = [
-            PlaneView(mask.camera, np.where(image.alpha.numpy() > 0.5, image.depth.numpy(), 0.0), mask.mask)
-            for mask in masks
-            for image in [render_gaussians(given.cloud, mask.camera)]
+            PlaneView(one.camera, one.depth_over(fit.plane), mask.mask) for one, mask in zip(seen, masks, strict=True)
         ]
         fit = fit_plane(views)
         points = np.concatenate(

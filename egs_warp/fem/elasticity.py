@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
@@ -71,6 +73,10 @@ class ElasticAssembly:
         self._blocks = wp.zeros((tet_count, 16), dtype=Mat33, device=device)
         self._index_corners()
         self._index_matrix()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """It is made anew wherever a copy of it is read: its arrays lie on a device."""
+        return partial(ElasticAssembly, device=str(self.device)), (self.mesh, self.material)
 
     def _index_corners(self) -> None:
         flat = self.mesh.tets.ravel()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -90,6 +92,11 @@ class GaussianCloud:
             opacity_logits=upload(opacity_logits, wp.float32),
             sh=upload(sh, wp.vec3),
         )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """The numbers, and where they lie."""
+        arrays = (self.means, self.rotations, self.log_scales, self.opacity_logits, self.sh)
+        return partial(GaussianCloud.from_numpy, device=str(self.device)), tuple(array.numpy() for array in arrays)
 
     @property
     def count(self) -> int:

@@ -18,7 +18,7 @@ from egs_warp.inpainting.rectified import PlaneWindow, rectify
 from egs_warp.io.planes import HoleOutline
 from egs_warp.segmentation.above_plane import CELLS
 from egs_warp.segmentation.connectivity import enclosed
-from egs_warp.segmentation.object_mask import Segmentation
+from egs_warp.segmentation.object_spec import Segmentation
 from egs_warp.segmentation.votes import MaskedView, check_size
 
 _TEXELS = 256
@@ -133,12 +133,14 @@ def footprint(thing: GaussianCloud, plane: Plane) -> Hole:
     return Hole(window, np.asarray(ndimage.binary_fill_holes(closed))[inner])
 
 
-def hole_under(cloud: GaussianCloud, plane: Plane, found: Segmentation) -> Hole:
-    """Where the floor is missing: the outline of the object's low part and of what was dropped from under it,
-    filled.
+def hole_under(cloud: GaussianCloud, plane: Plane, found: Segmentation) -> Hole | None:
+    """Where the floor is missing: the outline of the object's low part and of what was dropped from under it, filled;
+    None under an object that hangs above it.
     """
     means = cloud.means.numpy().astype(np.float64)
     low = found.buried_mask | (found.object_mask & (plane.heights(means) < _LOW * found.size))
+    if not low.any():
+        return None
     middle = 0.5 * (means[low].min(axis=0) + means[low].max(axis=0))
     tangents = np.stack(plane.tangents(), axis=1)
     flat = means[low] @ tangents

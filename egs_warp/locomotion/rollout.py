@@ -18,6 +18,7 @@ from egs_warp.locomotion.planner import STEPS_A_UNIT
 from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.replay import Replay, digest
 from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory, StepReport
+from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.locomotion.trajectory import Trajectory
 
 FRAME_RATE = 60
@@ -67,7 +68,8 @@ def settle(stepper: LocomotionStepper) -> BodyState:
     dt = 0.25 * body.time_unit
     memory = stepper.initial_memory()
     for _ in range(12):
-        result = stepper.passive_step(state, memory, dt)
+        with one_blas_thread():
+            result = stepper.passive_step(state, memory, dt)
         moved = dt * float(np.abs(result.velocities).max())
         state = BodyState(state.positions + dt * result.velocities, np.zeros_like(state.positions))
         memory = replace(memory, points=result.contacts.points, forces=result.forces)
@@ -91,6 +93,7 @@ def roll_out(
     resume: Path | None = None,
     finished: Callable[[], bool] = lambda: False,
     kicks: Callable[[float, float], np.ndarray | None] = lambda time, dt: None,
+    activations: np.ndarray | None = None,
     progress: Callable[[int], object] = lambda frame: None,
 ) -> Simulation:
     """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``, or a step
@@ -99,9 +102,13 @@ def roll_out(
     ``step``: seconds that a solver step takes at most, see ``solver_steps``. ``place`` is where the body lies in its
     capture; steps are written into the folder that ``parts`` tells as they are done (``Recorder``); those in the folder
     ``resume`` are not solved again (``Replay``). ``kicks`` tells the velocities (N, 3) m/s that something from outside
-    gives the nodes in the step from a time on, if anything does. ``progress`` is told each frame done.
+    gives the nodes in the step from a time on, if anything does. With ``activations`` (steps, M) metres muscles do what
+    those say, whatever the motion asks for, as long as there are any for a whole frame. ``progress`` is told each frame
+    done.
     """
     dt, per_frame = solver_steps(stepper.body, step)
+    if activations is not None:
+        frames = min(frames, len(activations) // per_frame)
     state, memory = start, stepper.initial_memory()
     reports: list[StepReport] = []
     shown = [0]
@@ -120,12 +127,13 @@ def roll_out(
     )
     replay = Replay(resume, recorder.start, stepper.detector) if resume is not None else None
     for frame in range(frames):
-        for _ in range(per_frame):
+        for part in range(per_frame):
             objectives = motion.objectives(state, reports[-1] if reports else None, dt)
             kick = kicks(state.time, dt)
-            asked = digest(objectives if kick is None else [*objectives, kick])
+            held = None if activations is None else activations[frame * per_frame + part]
+            asked = digest([*objectives, *(given for given in (kick, held) if given is not None)])
             done = replay.step(asked) if replay is not None else []
-            done = done or _advanced(stepper, state.kicked(kick), memory, objectives, dt)
+            done = done or _advanced(stepper, state.kicked(kick), memory, objectives if held is None else held, dt)
             stopped = not done
             if stopped:
                 break
@@ -142,11 +150,17 @@ def roll_out(
 
 
 def _advanced(
-    stepper: LocomotionStepper, state: BodyState, memory: StepMemory, objectives: Sequence[AnyObjective], dt: float
+    stepper: LocomotionStepper,
+    state: BodyState,
+    memory: StepMemory,
+    asked: Sequence[AnyObjective] | np.ndarray,
+    dt: float,
 ) -> list[StepReport]:
-    """A step in the parts it was divided into; none if it cannot be solved, nor any part of it."""
+    """A step in the parts it was divided into; none if it cannot be solved, nor any part of it. ``asked``: objectives,
+    or the activations themselves."""
+    advance = stepper.advance_held if isinstance(asked, np.ndarray) else stepper.advance
     try:
-        _, _, done = stepper.advance(state, memory, objectives, dt)
+        _, _, done = advance(state, memory, asked, dt)  # pyright: ignore[reportArgumentType]
     except (UnsolvableStepError, np.linalg.LinAlgError):
         return []
     return done if any(report.converged for report in done) else []

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -97,17 +99,26 @@ class LocomotionStepper:
             penetration_tolerance=self.settings.penetration_tolerance * body.height,
         )
         rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
-        problem = StepProblem(body, rest, body.time_unit / STEPS_A_UNIT)
-        tangent = problem.tangent(self._factors, rest.velocities, None)
-        full = muscle_columns(muscles, rest.positions).toarray() * muscles.bounds
+        # On one thread: what is found here must not hang on how many there are.
+        with one_blas_thread():
+            problem = StepProblem(body, rest, body.time_unit / STEPS_A_UNIT)
+            tangent = problem.tangent(self._factors, rest.velocities, None)
+            full = muscle_columns(muscles, rest.positions).toarray() * muscles.bounds
+            synergies = find_synergies(muscles, tangent.solve(full), body.node_mass)
         self.planner = StepPlanner(
             body,
             muscles,
-            find_synergies(muscles, tangent.solve(full), body.node_mass),
+            synergies,
             geometry.friction,
             self.settings,
             factors_on(body.assembly.device, body.assembly.upper_pattern),
         )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """It is made anew wherever a copy of it is read: its arrays lie on a device."""
+        device = str(self.body.assembly.device)
+        made = partial(LocomotionStepper, settings=self.settings, device=device)
+        return made, (self.body, self.muscles, self.geometry)
 
     def initial_memory(self) -> StepMemory:
         """No contacts, muscles at rest."""
@@ -132,10 +143,22 @@ class LocomotionStepper:
         is asked is asked for the whole of it.
         """
         with one_blas_thread():
-            end, after, report = self.step(state, memory, objectives, dt)
-            if report.converged:
-                return end, after, [report]
-            return self._in_halves(state, memory, report.activations, dt, _MOST_HALVINGS)
+            return self._whole(state, memory, dt, self.step(state, memory, objectives, dt))
+
+    def advance_held(
+        self, state: BodyState, memory: StepMemory, activations: np.ndarray, dt: float
+    ) -> tuple[BodyState, StepMemory, list[StepReport]]:
+        """As ``advance``, under given ``activations`` (M,) metres."""
+        with one_blas_thread():
+            return self._whole(state, memory, dt, self.held_step(state, memory, activations, dt))
+
+    def _whole(
+        self, state: BodyState, memory: StepMemory, dt: float, done: tuple[BodyState, StepMemory, StepReport]
+    ) -> tuple[BodyState, StepMemory, list[StepReport]]:
+        end, after, report = done
+        if report.converged:
+            return end, after, [report]
+        return self._in_halves(state, memory, report.activations, dt, _MOST_HALVINGS)
 
     def _in_halves(
         self, state: BodyState, memory: StepMemory, activations: np.ndarray, dt: float, left: int

@@ -26,11 +26,12 @@ from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.drawn import DrawnCreature
 from egs_warp.pipelines.film import draw_film
 from egs_warp.pipelines.finished_run import PARTS
+from egs_warp.pipelines.ground_left import ground_left
 from egs_warp.pipelines.oddities import oddities
 from egs_warp.pipelines.performance import check_frames, simulate
 from egs_warp.pipelines.plots import draw_plots
 from egs_warp.pipelines.progress import preparation_bar, simulation_bar
-from egs_warp.pipelines.report import Report, report_of_run
+from egs_warp.pipelines.report import GaussianCounts, Report, report_of_run
 from egs_warp.pipelines.shot import LARGEST_SIDE, SMALLEST_SIDE, Shot
 
 LARGEST_FRICTION = 10.0
@@ -222,12 +223,14 @@ def animate(
             muscles=None if muscles_file is None else Path(muscles_file).name,
             solids=len(solids),
         )
-        notes = (*notes, *performance.cut_short())
         simulation = performance.simulation
+        behind = creature.placed(background) if background is not None else None
+        left = ground_left(simulation.trajectory.positions[-1], behind, creature.solids[0], creature.body.height)
+        notes = (*notes, *performance.cut_short(), *left)
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),
             *(performance.sequence.done, books),
-            drawn=film.splats.count,
+            gaussians=GaussianCounts.of(creature, film.splats.count),
             drawing=film.milliseconds,
             source=source,
             notes=notes,

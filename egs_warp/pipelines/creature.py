@@ -76,6 +76,16 @@ class Creature:
         """Something else of the same capture, such as what is behind it, in the frame of the body."""
         return in_body_frame(cloud, self.frame)
 
+    def with_friction(self, friction: float) -> Creature:
+        """The same body on ground of another Coulomb coefficient, standing anew. Raises ``ArgumentError`` for one below
+        0."""
+        if not 0.0 <= friction < np.inf:
+            raise ArgumentError("friction", "give a Coulomb coefficient of at least 0", value=friction)
+        old = self.stepper
+        geometry, device = replace(old.geometry, friction=friction), str(old.body.assembly.device)
+        stepper = LocomotionStepper(old.body, old.muscles, geometry, settings=old.settings, device=device)
+        return replace(self, stepper=stepper, start=settle(stepper))
+
     @property
     def body(self) -> SoftBody:
         """The soft body."""

@@ -17,7 +17,8 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.io.planes import KnownPlane
 from egs_warp.segmentation.base_plane import guess_up
 from egs_warp.segmentation.ground import ROUGH, measure_ground
-from egs_warp.segmentation.object_mask import TOUCHING, ObjectSpec, Segmentation, segment
+from egs_warp.segmentation.object_mask import TOUCHING, segment
+from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
 from egs_warp.segmentation.plane_fit import PlaneFit
 from egs_warp.segmentation.plane_search import FoundPlane, find_planes, plane_under, refine_plane
 from egs_warp.segmentation.table_top import planes_below, surface_around

@@ -12,7 +12,7 @@ from egs_warp.errors import ArgumentError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.frames import box_corners
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.locomotion.rollout import FRAME_RATE, REST_FRAMES, Simulation, roll_out
+from egs_warp.locomotion.rollout import FRAME_RATE, REST_FRAMES, Simulation, roll_out, solver_steps
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.fall import FallWatch
 from egs_warp.motions.push import Kicks, Push
@@ -38,8 +38,11 @@ _FROM_ABOVE = 0.5
 """Up for one along the ground, in a scene, which has a floor to be seen."""
 _IN_THE_WAY = 0.7
 """Cosine of the angle to a side of the film within which things stand between."""
-_MORE = 0.02
-"""Of all that stands in the scene: so much more in the way than on another side does not matter."""
+_MORE = 0.2
+"""Steradians, a tenth of a side: so much more in the way than on another side, as a few floaters are, does not
+matter."""
+_NEARER = 2.5
+"""Of the size of what is filmed: about how far away the camera is; what is further stands behind it."""
 
 
 @dataclass(frozen=True)
@@ -91,13 +94,13 @@ class Performance:
         low[2] = min(low[2], 0.0)
         middle = 0.5 * (low + high)
         corners = box_corners(low, high)
-        direction = np.array(FILMED_FROM) if scene is None else self._clear_side(scene)
+        distance = float(np.linalg.norm(high - low))
+        direction = np.array(FILMED_FROM) if scene is None else self._clear_side(scene, middle, _NEARER * distance)
         if view_from is not None:
             direction = ground.axes @ (self.creature.frame.axes @ np.asarray(view_from, float))
         direction /= np.linalg.norm(direction)
         # From above or below, the way the body faces is up in the picture.
         upwards = ground.axes[0] if abs(direction[2]) > _STEEP else ground.axes[2]
-        distance = float(np.linalg.norm(high - low))
         for _ in range(60):
             camera = Camera.look_at(
                 ground.world(middle + distance * direction),
@@ -115,18 +118,22 @@ class Performance:
             distance *= 1.05
         return camera
 
-    def _clear_side(self, scene: GaussianCloud) -> np.ndarray:
-        """(3,) from the body to the camera, ground axes: of eight sides, from the usual one on, the nearest on which
-        hardly more stands between than on any."""
+    def _clear_side(self, scene: GaussianCloud, middle: np.ndarray, reach: float) -> np.ndarray:
+        """(3,) from ``middle`` (3,) to the camera, ground axes: of eight sides, from the usual one on, the nearest on
+        which what stands nearer than ``reach`` hides hardly more than on any."""
         height = self.creature.body.height
-        local = self.place.ground.local(scene.means.numpy().astype(np.float64))
-        level = local[(local[:, 2] > 0.1 * height) & (scene.opacities() > 0.3), :2]
+        local = self.place.ground.local(scene.means.numpy().astype(np.float64)) - middle
+        away = np.linalg.norm(local, axis=1)
+        standing = (local[:, 2] > 0.1 * height - middle[2]) & (away > 1e-3 * height) & (away < reach)
+        broad = np.sort(scene.log_scales.numpy()[standing].astype(np.float64), axis=1)[:, 1:].sum(axis=1)
+        hidden = 2.0 * np.pi * scene.opacities()[standing] * np.exp(broad) / away[standing] ** 2
+        level = local[standing, :2]
         ahead, left, _ = FILMED_FROM
         turns = np.exp(0.25j * np.pi * np.array([0, 1, -1, 2, -2, 3, -3, 4]))
         sides = (ahead + 1j * left) * turns
         ways = np.stack([sides.real, sides.imag], axis=1) / np.abs(sides)[:, None]
-        blocked = (level @ ways.T > _IN_THE_WAY * np.linalg.norm(level, axis=1)[:, None]).sum(axis=0)
-        first = int(np.flatnonzero(blocked <= blocked.min() + _MORE * len(level))[0])
+        blocked = hidden @ (level @ ways.T > _IN_THE_WAY * np.linalg.norm(level, axis=1)[:, None])
+        first = int(np.flatnonzero(blocked <= blocked.min() + _MORE)[0])
         return np.array([*ways[first], _FROM_ABOVE])
 
 
@@ -149,6 +156,7 @@ def simulate(
     style: Style | None = None,
     pushes: Sequence[Push] = (),
     get_up: bool = True,
+    activations: np.ndarray | None = None,
     parts: Callable[[], Path] | None = None,
     resume: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, expected: None,
@@ -158,11 +166,15 @@ def simulate(
 
     ``longest``: seconds after which it is cut off, if that is earlier; ``step``: those of a solver step, if not the
     usual; ``style``: how it jumps; ``pushes``: what hits it meanwhile; ``get_up``: whether a body that has fallen is to
-    get up and go on; ``parts`` tells the folder that takes the steps as they are done, ``resume`` is that of a run that
-    was cut off and goes on. ``progress`` is told after each frame how many are done, and how many are expected in all
-    by now. Raises ``UserError`` for a motion that the body cannot do, and a folder that another run has left.
+    get up and go on; ``activations`` (steps, M) metres: what muscles do in each solver step, whatever the motion would
+    have them do, which then only says what is measured; the run ends with the last of them. ``parts`` tells the folder
+    that takes the steps as they are done, ``resume`` is that of a run that was cut off and goes on. ``progress`` is
+    told after each frame how many are done, and how many are expected in all by now. Raises ``UserError`` for a motion
+    that the body cannot do, and a folder that another run has left.
     """
     check_frames(frames)
+    if activations is not None:
+        activations = _checked(creature, activations, step)
     place = first_place(creature, step=step, style=style)
     expected = motion.check(place)
     sequence = MotionSequence(place, motion.parts(creature.body.height))
@@ -190,6 +202,7 @@ def simulate(
         resume=resume,
         finished=lambda: frames is None and over(),
         kicks=Kicks(place, pushes),
+        activations=activations,
         progress=lambda last: progress(
             last + 1, max(last + 1, outlook.frames(last + 1, finished=watch.finished)) if frames is None else most
         ),
@@ -198,3 +211,17 @@ def simulate(
     trajectory = trajectory.with_plan(planned_com(sequence, creature.body, trajectory))
     simulation = replace(simulation, trajectory=trajectory)
     return Performance(creature, place, sequence, simulation, watch.fallen, tuple(pushes))
+
+
+def _checked(creature: Creature, activations: np.ndarray, step: float | None) -> np.ndarray:
+    """(steps, M) float64 metres. Raises ``ArgumentError`` for anything else, for too few of them, and for what a muscle
+    cannot do."""
+    count, least = creature.muscles.segment_count, solver_steps(creature.body, step)[1]
+    given = np.array(activations, dtype=np.float64)
+    if given.ndim != 2 or given.shape[1] != count or len(given) < least:
+        advice = f"give a row of {count} metres, one for each muscle, for each of at least {least} solver steps"
+        raise ArgumentError("activations", f"of shape {given.shape}; {advice}")
+    # Not "any beyond": NaN is beyond, too.
+    if not (np.abs(given) <= creature.muscles.bounds * (1.0 + 1e-9)).all():
+        raise ArgumentError("activations", "beyond what a muscle can do; keep each within its bounds (muscles.bounds)")
+    return given

@@ -22,7 +22,7 @@ from egs_warp.io.ply import write_ply
 from egs_warp.io.run_folder import RunFolder
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, on_its_ground
 from egs_warp.segmentation.clearance import Clearing, ClearingOptions, clear_plane, reach_across
-from egs_warp.segmentation.object_mask import ObjectSpec
+from egs_warp.segmentation.object_spec import ObjectSpec
 from egs_warp.training import has_torch
 
 if TYPE_CHECKING:
@@ -36,6 +36,11 @@ _CLEARED = {
     Clearing.FINETUNE: "fine-tuned clear of it",
     Clearing.SPLIT: "split at it",
 }
+
+
+_SOLID = 0.1
+_AFLOAT = 0.03
+"""Of the object's size: what hangs higher above its plane does not stand there."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +80,8 @@ class PreparedScene:
     bare: GaussianCloud
     """The background before inpainting."""
     plane: Plane
-    hole: Hole
-    """In the floor, under the object."""
+    hole: Hole | None
+    """In the floor, under the object; None where it hangs above it."""
     located: LocatedPlane
     notes: tuple[str, ...]
     """What was found and done, for the user."""
@@ -96,7 +101,7 @@ class PreparedScene:
         place = out.file if isinstance(out, RunFolder) else out.joinpath
         write_ply(place("object.ply"), self.object)
         write_ply(place("background.ply"), self.background)
-        first = replace(self.located.known(), hole=self.hole.outline())
+        first = replace(self.located.known(), hole=self.hole.outline() if self.hole else None)
         write_planes(place("plane.json"), [first.over(known[0]) if known else first, *known[1:]])
 
 
@@ -127,8 +132,12 @@ def prepare_scene(
     thing, bare, notes = take_apart(
         cloud, located, options, photographs, progress=lambda done: progress("segment", done)
     )
+    thing, came_down = set_down(thing, located)
+    notes = (*notes, *came_down)
     filled, hole = None, hole_under(cloud, located.plane, located.segmentation)
-    if options.inpaint:
+    if options.inpaint and hole is None:
+        notes = (*notes, "the object hangs above the ground, which is whole under it")
+    elif options.inpaint and hole is not None:
         progress("inpaint", 0.0)
         # torch may be missing, and with it the training that inpainting ends with.
         from egs_warp.inpainting.inpaint import InpaintOptions, inpaint
@@ -185,6 +194,18 @@ def take_apart(
         *closed,
     )
     return thing, cloud.subset(found.background_mask), notes
+
+
+def set_down(thing: GaussianCloud, located: LocatedPlane) -> tuple[GaussianCloud, tuple[str, ...]]:
+    """``thing``, moved down onto its plane if it hangs above it, as a robot may that was captured afloat; and what to
+    say of that.
+    """
+    plane, size = located.plane, located.segmentation.size
+    lowest = float(np.quantile(plane.heights(thing.means.numpy()[thing.opacities() > _SOLID]), 0.002))
+    if located.ground is not None or lowest <= _AFLOAT * size:
+        return thing, ()
+    note = f"the object hung {lowest / size:.2f} of its size above the ground, and was set down on it"
+    return _moved(thing, lambda means: means - lowest * plane.normal), (note,)
 
 
 def _moved(cloud: GaussianCloud, to: Callable[[np.ndarray], np.ndarray]) -> GaussianCloud:

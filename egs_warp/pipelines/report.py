@@ -156,6 +156,12 @@ class GaussianCounts:
     left_out_of_contact_opacity: float
     """Share of the opacity mass."""
 
+    @classmethod
+    def of(cls, creature: Creature, drawn: int | None = None) -> GaussianCounts:
+        """Of pictures with so many ``drawn``; all of the capture, unsplit, if None."""
+        read, geometry = creature.cloud.count, creature.geometry
+        return cls(read, read if drawn is None else drawn, geometry.left_out, geometry.left_out_opacity)
+
     def to_json(self) -> dict[str, Any]:
         """``gaussians``."""
         return {
@@ -261,7 +267,7 @@ def report_of_run(
     done: Sequence[Done],
     books: Ledger,
     *,
-    drawn: int,
+    gaussians: GaussianCounts,
     drawing: Mapping[str, Sequence[float]],
     source: str,
     notes: Sequence[str],
@@ -272,7 +278,7 @@ def report_of_run(
     """Of the motions ``done`` on a ``trajectory`` with its ``books``; ``frames`` (n,) are indices into its times.
     ``ending`` says what ended the last motion before its time.
 
-    ``drawn`` splats are in its pictures, ``drawing`` are the milliseconds of each by stage.
+    ``gaussians`` are those of its pictures, ``drawing`` the milliseconds of each by stage.
     """
     mesh = creature.cage.mesh
     return Report(
@@ -284,9 +290,7 @@ def report_of_run(
         timing=stage_times(steps, frames, drawing),
         cage=CageFacts(len(mesh.nodes), len(mesh.tets), mesh.min_dihedral_degrees(), creature.body.mass),
         muscles=MuscleFacts(creature.muscles.fibre_count, creature.muscles.segment_count),
-        gaussians=GaussianCounts(
-            creature.cloud.count, drawn, creature.geometry.left_out, creature.geometry.left_out_opacity
-        ),
+        gaussians=gaussians,
         notes=tuple(notes),
         device=str(creature.cloud.device),
         seed=seed,

@@ -39,6 +39,8 @@ class RenderedImage:
     """(H, W) float32: alpha-weighted mean z-depth divided by alpha, scene units; 0 where alpha is 0."""
     median_depth: wp.array | None = None
     """(H, W) float32: z-depth of the splat that stops half of the light, 0 where none does; only if asked for."""
+    median_gaussian: wp.array | None = None
+    """(H, W) int32: which splat that is, -1 where none does; only if asked for."""
     normal: wp.array | None = None
     """(H, W) vec3 in camera axes: blended thinnest axis of each splat, on the camera's side; only if asked for."""
 
@@ -113,7 +115,7 @@ def add_geometry(
     *,
     threads: int,
 ) -> RenderedImage:
-    """``image`` with median depth and normals."""
+    """``image`` with median depth, the splats it is of, and normals."""
     device = cloud.device
     width, height = int(view.width), int(view.height)
     splat_normals = empty(cloud.count, wp.vec3, device)
@@ -126,6 +128,7 @@ def add_geometry(
         threads=threads,
     )
     median_depth = empty(width * height, wp.float32, device)
+    median_gaussian = empty(width * height, wp.int32, device)
     normal = empty(width * height, wp.vec3, device)
     launch_rows(
         composite_geometry_kernel,
@@ -134,9 +137,14 @@ def add_geometry(
             *(width, height, lists.tile_start, lists.gaussian_from_intersection),
             *(projected.ellipse, projected.falloff, projected.colour_depth, splat_normals),
         ],
-        outputs=[median_depth, normal],
+        outputs=[median_depth, median_gaussian, normal],
         device=device,
         threads=threads,
     )
     shape = (height, width)
-    return replace(image, median_depth=median_depth.reshape(shape), normal=normal.reshape(shape))
+    return replace(
+        image,
+        median_depth=median_depth.reshape(shape),
+        median_gaussian=median_gaussian.reshape(shape),
+        normal=normal.reshape(shape),
+    )

@@ -35,8 +35,8 @@ def render_gaussians(
     """Picture of ``cloud`` through ``camera``, on the device of the cloud.
 
     ``background`` is one colour, or an image (H, W, 3) of this camera's size. ``antialiased`` dims each splat by what
-    the 0.3 px low-pass adds to its area. ``geometry`` adds median depth and normals. ``threads`` (a CPU only) defaults
-    to the available cores; the picture does not depend on it.
+    the 0.3 px low-pass adds to its area. ``geometry`` adds median depth, its splats and normals. ``threads`` (a CPU
+    only) defaults to the available cores; the picture does not depend on it.
     Raises ``UserError`` for non-finite Gaussians, which it names, for an impossible camera and for a background of
     another size.
     """

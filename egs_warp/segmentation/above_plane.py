@@ -25,6 +25,14 @@ _GAP = 2.0 / CELLS
 """Of the object's size: what hangs in the air so near to the object is held by it."""
 _CHAIN = 4
 """Leaves on leaves on leaves."""
+_HEAVY, _LIGHT = 0.05, 0.01
+"""Of the object's opacity mass: a part that hangs in the air from this share on is no stray; one below the second holds
+nothing.
+"""
+_APART, _TWICE = 0.2, 2.0
+"""Of the object's size: so far apart a part of it may hang, as a robot's hands do, if nothing else that could hold it
+is nearer than so many times that.
+"""
 _NEAR_CLICK = 0.1
 """Of the object's size: a click that hits only what makes no connection means what is so near to it."""
 
@@ -61,7 +69,8 @@ def hanging_parts(
     scene: AbovePlane, indices: np.ndarray, parts: np.ndarray, meant: np.ndarray, size: float
 ) -> np.ndarray:
     """Those of the ``parts`` (m,) of the Gaussians ``indices`` (m,) that hang in the air beside the ``meant`` ones, and
-    are less than these: where a capture is coarse, leaves come off their twigs, and nothing else holds them.
+    are less than these: where a capture is coarse, leaves come off their twigs, and nothing else holds them. What is no
+    stray may hang further away, where it is by far the nearest that could hold it.
     """
     heights, mass = scene.heights[indices], np.bincount(parts, weights=scene.opacity[indices])
     lowest = np.full(len(mass), np.inf)
@@ -77,7 +86,27 @@ def hanging_parts(
         if not more.any():
             break
         held |= more
+    own = mass[meant].sum()
+    heavy = free & ~held & (mass > _HEAVY * own)
+    if heavy.any():
+        points = scene.means[indices]
+        gaps, others = (
+            _gaps(points, parts, heavy, held),
+            _gaps(points, parts, heavy, ~free & ~held & (mass > _LIGHT * own)),
+        )
+        held |= (gaps < _APART * size) & (others > _TWICE * gaps)
     return np.setdiff1d(np.flatnonzero(held), meant)
+
+
+def _gaps(points: np.ndarray, parts: np.ndarray, these: np.ndarray, those: np.ndarray) -> np.ndarray:
+    """(k,) how far each of ``these`` (k,) bool parts of the ``points`` (m, 3) is from the nearest of ``those`` (k,)
+    bool; infinite for all others, and where there are none.
+    """
+    gaps = np.full(len(these), np.inf)
+    of, near = np.flatnonzero(these[parts]), np.flatnonzero(those[parts])
+    if len(of) and len(near):
+        np.minimum.at(gaps, parts[of], KDTree(points[near]).query(points[of])[0])
+    return gaps
 
 
 def clicked_parts(

@@ -41,6 +41,10 @@ class Click:
     """(k,) int: Gaussians that paint what is clicked on."""
     inside: bool = True
     """Whether the object is clicked on; else what is not to go along."""
+    camera: Camera | None = None
+    """Whose picture was clicked on, if any was."""
+    pixel: tuple[float, float] = (0.0, 0.0)
+    """Where in it, from its top left corner."""
 
 
 def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside: bool = True) -> Click | None:
@@ -62,7 +66,8 @@ def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside
     depth = float(depths[order[np.searchsorted(np.cumsum(weights[order]), _FIRST * weights.sum())]])
     hits = (np.abs(depths - depth) < _DEEP * depth) & (weights > 0.0)
     hits &= weights > _HIT * weights[hits].max(initial=0.0)
-    return Click(camera.centre + depth * camera_rays(window)[reach, reach], np.flatnonzero(hits), inside)
+    point = camera.centre + depth * camera_rays(window)[reach, reach]
+    return Click(point, np.flatnonzero(hits), inside, camera, (u, v))
 
 
 def hits_among(nodes: np.ndarray, clicks: Sequence[Click], *, inside: bool) -> np.ndarray:

@@ -10,13 +10,13 @@ import numpy as np
 from scipy import ndimage
 
 from egs_warp.geometry.bitmaps import connected_parts, depth_inside
-from egs_warp.geometry.camera import Camera, camera_rays, shrunk
+from egs_warp.geometry.camera import Camera, shrunk
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.soap_film import soap_film
-from egs_warp.render.rasteriser import render_gaussians
+from egs_warp.segmentation.seen_surface import SeenSurface
 
 ROUGH = 0.01
 """Of the object's height: ground that differs from its plane by more than this (standard deviation) is not flat; what
@@ -117,7 +117,7 @@ def measure_ground(
     bare = cloud.subset(~thing)
     looks = []
     for camera in above[:: -(-len(above) // _VIEWS)]:
-        points = _seen_points(cloud, bare, camera)
+        points = _seen_points(cloud, bare, camera, plane)
         points = points[np.abs(plane.heights(points)) < _BAND * size]
         looks.append(_medians(points, axes, origin, spacing, count))
     seen = np.stack(looks)
@@ -141,15 +141,13 @@ def measure_ground(
     return MeasuredGround(field, known, _roughness(whole, beside), noise)
 
 
-def _seen_points(cloud: GaussianCloud, bare: GaussianCloud, camera: Camera) -> np.ndarray:
+def _seen_points(cloud: GaussianCloud, bare: GaussianCloud, camera: Camera, plane: Plane) -> np.ndarray:
     """(n, 3) what ``bare`` shows that is seen in ``cloud``, with the object, as well: through the hole that it leaves
-    one sees under the ground.
+    one sees under the ground. Heights over ``plane`` are those of the splats.
     """
-    both = [render_gaussians(one, camera, geometry=True) for one in (cloud, bare)]
-    # Not the mean depth: of what a floor lets through of the depths below, that gets a share.
-    whole, depth = (image.median_depth.numpy() for image in both if image.median_depth is not None)
-    seen = (both[1].alpha.numpy() > 0.9) & (depth > 0.0) & (np.abs(whole - depth) < _SAME * depth)
-    return camera.centre + depth[seen][:, None] * camera_rays(camera)[seen]
+    whole, left = SeenSurface.of(cloud, camera), SeenSurface.of(bare, camera)
+    same = np.abs(whole.depth - left.depth) < _SAME * left.depth
+    return left.points(plane, left.opaque & same)
 
 
 def _walkable(heights: np.ndarray, known: np.ndarray, spacing: float) -> np.ndarray:

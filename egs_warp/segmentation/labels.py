@@ -44,7 +44,9 @@ def smoothed_labels(
     What several ``views`` say is surer by their number's root, as errors of masks drawn one by one average out.
     """
     pixels = (votes.inside + votes.outside)[nodes]
-    leaning = (2.0 * votes.share_inside()[nodes] - 1.0) * np.minimum(pixels / _SURE, 1.0) * np.sqrt(views)
+    # Beyond that it is surer by the root of their number, as of anything counted.
+    sure = np.minimum(pixels / _SURE, np.sqrt(np.maximum(pixels / _SURE, 1.0)))
+    leaning = (2.0 * votes.share_inside()[nodes] - 1.0) * sure * np.sqrt(views)
     leaning[votes.share_seen()[nodes] < _SEEN] = 0.0
     held, dropped = (hits_among(nodes, clicks, inside=inside) for inside in (True, False))
     return SplatGraph.of(cloud, nodes).cut(leaning, held & ~dropped, dropped, smoothness=_SMOOTHNESS)

@@ -5,22 +5,20 @@ then what is connected above the plane.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
+from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.above_plane import CELLS, AbovePlane, clicked_parts, hanging_parts
-from egs_warp.segmentation.clicks import Click, cut_off_by
+from egs_warp.segmentation.clicks import cut_off_by
 from egs_warp.segmentation.connectivity import close_to, connected_parts, enclosed, nearer_to
+from egs_warp.segmentation.floor_shreds import floor_top, wisps
 from egs_warp.segmentation.labels import labels_of_votes, smoothed_labels
-from egs_warp.segmentation.votes import MaskedView, votes_of_masks
+from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
+from egs_warp.segmentation.votes import votes_of_masks
 
 _NOTHING_ABOVE = (
     "object: nothing of it lies above the plane; mark it by other masks, a box or a point, or give its plane"
@@ -31,20 +29,12 @@ _PIECE = 0.05
 """Of the largest connected part: what masks claim elsewhere is another piece of the object from this share on."""
 _HOLLOW = 0.35
 """Of the object's size: a point in the middle of a hollow body is this far from its skin, or less."""
-_ROUGHEST = 0.02
-"""Of the object's size: a floor is not taken to scatter more than this."""
 TOUCHING = 0.1
 """Of the object's size: what hangs higher above a plane does not stand on it."""
 FOOTPRINT_HEIGHT = 0.08
 """Of the object's size: what it has below this height hides the floor."""
 _HALO = 0.1
 """Of the object's size: floaters this near to it are its halo."""
-_WISP, _WISP_HEIGHT = 0.015, 0.1
-"""Of the object's size: standard deviation from which, and height up to which,
-a Gaussian may be a shred of the floor.
-"""
-_NEIGHBOURS = 16
-"""Gaussians whose median colour is that of a place."""
 _HALVINGS = 6
 """Of the first guess of an object's size, about a point in a large room."""
 _LIKELY, _LARGEST = 0.3, 4.0
@@ -53,61 +43,6 @@ _HANGING = 0.5
 """Of the object's size: what is this high above the plane in all of its parts does not stand on it."""
 _FOOT = 0.015
 """Of the object's size: within this height above the plane, floor and object cannot be told apart by connection."""
-
-
-@dataclass(frozen=True)
-class Box:
-    """An axis-aligned box in the capture's frame."""
-
-    low: np.ndarray
-    """(3,)"""
-    high: np.ndarray
-    """(3,)"""
-
-    def holds(self, points: np.ndarray) -> np.ndarray:
-        """(n,) bool for points (n, 3)."""
-        return np.all((points >= self.low) & (points <= self.high), axis=1)
-
-
-@dataclass(frozen=True)
-class ObjectSpec:
-    """What the user says about where the object is: exactly one of masks, box and point; clicks add to it and take
-    from it.
-    """
-
-    masks: tuple[MaskedView, ...] = ()
-    box: Box | None = None
-    point: np.ndarray | None = None
-    """(3,) on or in the object, scene units."""
-    clicks: tuple[Click, ...] = ()
-    """What each hits goes along, with what hangs together with it, or does not."""
-
-    @classmethod
-    def of_clicks(cls, clicks: Sequence[Click]) -> ObjectSpec:
-        """The first of the ``clicks`` that are on the object says where it is. Raises ``UserError`` if none is."""
-        for click in clicks:
-            if click.inside:
-                return cls(point=click.point, clicks=tuple(clicks))
-        raise UserError("object: every click takes something away; click on the object itself as well")
-
-
-@dataclass(frozen=True)
-class Segmentation:
-    """The object among the Gaussians of a capture."""
-
-    object_mask: np.ndarray
-    """(n,) bool: the object, means above the plane."""
-    buried_mask: np.ndarray
-    """(n,) bool: of the object, but with means below the plane. Belongs to neither object nor background."""
-    floater_mask: np.ndarray
-    """(n,) bool: looks like the object's, but hangs apart from it. Belongs to neither."""
-    size: float
-    """Scene units: diagonal of the object's bounding box."""
-
-    @property
-    def background_mask(self) -> np.ndarray:
-        """(n,) bool."""
-        return ~(self.object_mask | self.buried_mask | self.floater_mask)
 
 
 def segment(
@@ -175,7 +110,7 @@ def _of_size(
         size = _diagonal(scene.means[chosen])
         if size == 0.0:
             raise UserError(_NOTHING_ABOVE, check=("plane",))
-        floor = _floor_top(scene, chosen, size)
+        floor = floor_top(scene, chosen, size)
         foot = max(_FOOT * size, 1.2 * floor)
     outline = scene.under(chosen, max(3.0 * foot, FOOTPRINT_HEIGHT * size), size)
     near = close_to(scene.means, scene.means[chosen], 2.0 * size / CELLS)
@@ -199,9 +134,11 @@ def _of_size(
     buried = ~object_mask & ~above & (scene.heights > -0.25 * size) & (outline | claimed)
     halo = (small | ~scene.solid) & above & close_to(scene.means, scene.means[chosen], _HALO * size)
     if not spec.masks:
-        wisps = _wisps(scene, object_mask, size)
-        object_mask &= ~wisps
-        halo |= wisps
+        shreds = wisps(scene, object_mask, size)
+        for click in spec.clicks:
+            shreds[click.hits] = False
+        object_mask &= ~shreds
+        halo |= shreds
     floaters = (halo | (claimed & above)) & ~object_mask & ~buried & ~cut_off
     return Segmentation(object_mask, buried, floaters, size)
 
@@ -270,34 +207,6 @@ def _body(
     return chosen & ~cut_off, small, cut_off
 
 
-def _wisps(scene: AbovePlane, chosen: np.ndarray, size: float) -> np.ndarray:
-    """(n,) bool: wide Gaussians at the object's foot in the floor's colour, on uneven ground those that lie flat, too,
-    which would go along as shreds of the floor.
-    """
-    low = scene.heights < _WISP_HEIGHT * size
-    length = np.exp(scene.cloud.log_scales.numpy().max(axis=1))
-    wide = length > max(_WISP * size, 2.0 * float(np.median(length[chosen])))
-    if isinstance(scene.plane, HeightField):
-        # Under the object the ground is a guess, and what lies there may be higher.
-        wide |= scene.level
-    suspects = np.flatnonzero(chosen & low & wide)
-    own = np.flatnonzero(chosen & low & ~wide & scene.solid)
-    floor = np.flatnonzero(~chosen & low & scene.level & scene.solid & (np.abs(scene.heights) < 0.05 * size))
-    found = np.zeros(len(chosen), bool)
-    if min(len(suspects), len(own), len(floor)) < 1:
-        return found
-    colours = scene.cloud.sh.numpy()[:, 0].astype(np.float64) * SH_BAND_0
-
-    def apart(others: np.ndarray) -> np.ndarray:
-        tree = KDTree(scene.means[others])
-        _, nearest = tree.query(scene.means[suspects], k=min(_NEIGHBOURS, len(others)))
-        nearest = np.reshape(nearest, (len(suspects), -1))
-        return np.linalg.norm(np.median(colours[others[nearest]], axis=1) - colours[suspects], axis=1)
-
-    found[suspects[apart(floor) < 0.5 * apart(own)]] = True
-    return found
-
-
 def _first_size(scene: AbovePlane, wanted: np.ndarray, spec: ObjectSpec) -> float:
     """First guess of the object's size, scene units: half of the capture's where only a point is known."""
     if spec.box is not None:
@@ -319,44 +228,3 @@ def _within(points: np.ndarray, chosen: np.ndarray, margin: float) -> np.ndarray
         return chosen
     low, high = np.quantile(points[chosen], [0.005, 0.995], axis=0)
     return np.all((points >= low - margin) & (points <= high + margin), axis=1)
-
-
-def _floor_top(scene: AbovePlane, chosen: np.ndarray, size: float) -> float:
-    """Height up to which the floor's own Gaussians scatter, judged beside the object ``chosen`` (n,) bool;
-    at least 0.
-    """
-    middle = np.median(scene.flat[chosen], axis=0)
-    beside = scene.level & scene.solid & ~chosen & (np.abs(scene.heights) < 0.05 * size)
-    beside &= np.linalg.norm(scene.flat - middle, axis=1) < size
-    beside &= ~close_to(scene.flat, scene.flat[chosen & (scene.heights < 0.2 * size)], 0.03 * size)
-    if beside.sum() < 20:
-        return 0.0
-    level = float(np.median(scene.heights[beside]))
-    spread = 1.4826 * float(np.median(np.abs(scene.heights[beside] - level)))
-    return float(np.clip(level + 3.0 * spread, 0.0, _ROUGHEST * size))
-
-
-def masks_from_selection(cloud: GaussianCloud, selection: np.ndarray, cameras: Sequence[Camera]) -> list[MaskedView]:
-    """Masks of where the Gaussians ``selection`` (n,) bool make up more than half of what shows,
-    through ``cameras``.
-    """
-    from egs_warp.render.rasteriser import render_gaussians
-
-    sh = np.zeros((cloud.count, 1, 3), np.float32)
-    sh[:, 0, :] = np.where(selection, 0.5, -0.5)[:, None] / SH_BAND_0
-    painted = GaussianCloud.from_numpy(
-        cloud.means.numpy(),
-        cloud.rotations.numpy(),
-        cloud.log_scales.numpy(),
-        cloud.opacity_logits.numpy(),
-        sh,
-        device=str(cloud.device),
-    )
-    return [
-        MaskedView(
-            camera,
-            render_gaussians(painted, camera, background=(0.0, 0.0, 0.0)).colour.numpy()[..., 0] > 0.5,
-            f"view {k}",
-        )
-        for k, camera in enumerate(cameras)
-    ]

@@ -9,7 +9,8 @@ from egs_warp.geometry.bitmaps import distance_to
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.connectivity import enclosed
-from egs_warp.segmentation.object_mask import FOOTPRINT_HEIGHT, Segmentation
+from egs_warp.segmentation.object_mask import FOOTPRINT_HEIGHT
+from egs_warp.segmentation.object_spec import Segmentation
 from egs_warp.segmentation.plane_search import find_planes, lies_along
 
 _LEVELS = 4

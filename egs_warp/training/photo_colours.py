@@ -46,10 +46,13 @@ def photographs_in_colours_of(cloud: GaussianCloud, posed: Sequence[PosedImage])
         small = shrunk(picture.camera, _PHOTO_SIDE)
         size = (small.width, small.height)
         whole = np.rint(picture.colour * 255.0).astype(np.uint8)
-        photo = cv2.resize(whole, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
+        # Blocks of whole pixels, as the camera has them: stretched to all of the photo it would be off by a pixel.
+        block = picture.camera.width // small.width
+        used = np.ix_(range(block * small.height), range(block * small.width))
+        photo = cv2.resize(whole[used], size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
         known = np.ones(photo.shape[:2], bool)
         if picture.known is not None:
-            known = cv2.resize(picture.known.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+            known = cv2.resize(picture.known[used].astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
         image = render_gaussians(cloud, small, background=(0.0, 0.0, 0.0))
         shared = (image.alpha.numpy() > _OPAQUE) & known
         matched = in_colours_of(np.clip(image.colour.numpy(), 0.0, 1.0), photo, shared)

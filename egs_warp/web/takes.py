@@ -21,7 +21,7 @@ from egs_warp.motions.sequence import Done
 from egs_warp.pipelines import drawn
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.drawn import DrawnCreature
-from egs_warp.pipelines.report import report_of_run
+from egs_warp.pipelines.report import GaussianCounts, report_of_run
 
 LONGEST_TAKE = 120.0
 """Seconds of the creature's own time, after which a take ends by itself."""
@@ -94,7 +94,7 @@ class Take:
         report = report_of_run(
             *(self.creature, trajectory, self.reports, np.arange(len(trajectory.time))),
             *([entry for entry, _ in chosen], ledger(trajectory)),
-            drawn=drawn_as.splats.count,
+            gaussians=GaussianCounts.of(self.creature, drawn_as.splats.count),
             drawing={},
             source=source,
             notes=notes,

@@ -26,9 +26,15 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 @pytest.fixture
-def rooms(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def clicking(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
-    return module_of("rooms")
+    return module_of("clicking")
+
+
+@pytest.fixture
+def ground(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return module_of("room_ground")
 
 
 def front() -> Camera:
@@ -55,47 +61,47 @@ def test_outlines_within_outlines_are_holes(drawn: ModuleType) -> None:
     assert mask[2, 2] and not mask[7, 7] and not mask[18, 18]
 
 
-def test_overlap_counts_what_is_missing_and_too_much(drawn: ModuleType, rooms: ModuleType) -> None:
+def test_overlap_counts_what_is_missing_and_too_much(drawn: ModuleType, clicking: ModuleType) -> None:
     """A ball against its own outline, and against one that is shifted by its radius."""
     ball = round_ones(shell(), 0.03)
     cloud = joined(ball, lying(level((-2.0, -2.0), (2.0, 2.0), 0.0, 0.05)))
     camera = front()
-    own = rooms.render_gaussians(ball, camera).alpha.numpy() > 0.5
+    own = clicking.render_gaussians(ball, camera).alpha.numpy() > 0.5
     view = drawn.DrawnView(camera, own, np.zeros((0, 2)))
-    iou, missing, more = rooms.overlap(cloud, ball, view)
+    iou, missing, more = clicking.overlap(cloud, ball, view)
     assert iou == 1.0 and not missing.any() and not more.any()
     shifted = np.roll(own, 8, axis=1)
-    iou, missing, more = rooms.overlap(cloud, ball, drawn.DrawnView(camera, shifted, np.zeros((0, 2))))
+    iou, missing, more = clicking.overlap(cloud, ball, drawn.DrawnView(camera, shifted, np.zeros((0, 2))))
     both = (own & shifted).sum()
     # Where the shifted outline lies on sky, the capture has nothing, and it does not count.
     assert both / (own | shifted).sum() <= iou < 1.0
     assert more.sum() == (own & ~shifted).sum() and 0 < missing.sum() <= (shifted & ~own).sum()
 
 
-def test_clicks_go_to_the_innermost_place(rooms: ModuleType) -> None:
+def test_clicks_go_to_the_innermost_place(clicking: ModuleType) -> None:
     mask = np.zeros((60, 80), bool)
     mask[10:31, 20:61] = True
-    depth, (u, v) = rooms.innermost(mask)
+    depth, (u, v) = clicking.innermost(mask)
     assert depth == 11.0 and v == 20.5 and 30.0 <= u <= 51.0
-    assert rooms.innermost(np.zeros((5, 5), bool))[0] == 0.0
+    assert clicking.innermost(np.zeros((5, 5), bool))[0] == 0.0
 
 
-def test_a_marked_plane_and_how_far_it_is_from_another(drawn: ModuleType, rooms: ModuleType) -> None:
+def test_a_marked_plane_and_how_far_it_is_from_another(drawn: ModuleType, ground: ModuleType) -> None:
     cloud: GaussianCloud = lying(level((-2.0, -2.0), (2.0, 2.0), 0.0, 0.05))
     pixels = np.array([[30.0, 70.0], [90.0, 70.0], [60.0, 90.0], [40.0, 85.0], [80.0, 85.0], [60.0, 65.0]])
     view = drawn.DrawnView(front(), np.zeros((120, 120), bool), pixels)
-    plane = rooms.marked_plane(cloud, [view], UP)
-    degrees, offset = rooms.apart(plane, Plane(UP, 0.0), np.zeros(3), 1.0)
-    assert degrees < 0.5 and offset < 0.02
+    plane = ground.marked_plane(cloud, [view], UP)
+    degrees, offset = ground.apart(plane, Plane(UP, 0.0), np.zeros(3), 1.0)
+    assert degrees < 0.05 and offset < 0.001
     tilted = Plane(np.array([np.sin(0.02), 0.0, np.cos(0.02)]), -0.05)
-    degrees, offset = rooms.apart(tilted, Plane(UP, 0.0), np.zeros(3), 2.0)
+    degrees, offset = ground.apart(tilted, Plane(UP, 0.0), np.zeros(3), 2.0)
     assert degrees == pytest.approx(np.degrees(0.02), rel=1e-6) and offset == pytest.approx(0.025)
 
 
-def test_ground_is_judged_by_what_is_known_of_it(rooms: ModuleType) -> None:
+def test_ground_is_judged_by_what_is_known_of_it(ground: ModuleType) -> None:
     known = {"how": "ground", "degrees": 0.9, "offset": 0.004}
     real = {"how": "ground", "degrees": 3.0, "offset": 0.01, "markings_degrees": 1.6, "markings_offset": 0.006}
-    assert rooms.judged_ground([known, real, {"how": "masks", "iou": 0.1}])
-    assert not rooms.judged_ground([known | {"offset": 0.006}])
-    assert not rooms.judged_ground([real | {"degrees": 3.3}])
-    assert not rooms.judged_ground([real | {"offset": 0.013}])
+    assert ground.judged_ground([known, real, {"how": "masks", "iou": 0.1}])
+    assert not ground.judged_ground([known | {"offset": 0.006}])
+    assert not ground.judged_ground([real | {"degrees": 3.3}])
+    assert not ground.judged_ground([real | {"offset": 0.013}])

@@ -10,7 +10,7 @@ from egs_warp.commands.scene_input import SceneInput
 from egs_warp.commands.scene_planes import planes_of_scene
 from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.pipelines.pictures import picture_cameras, plane_picture
-from egs_warp.segmentation.object_mask import ObjectSpec
+from egs_warp.segmentation.object_spec import ObjectSpec
 from tests.support.scenes import FLOOR
 
 

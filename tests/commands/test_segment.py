@@ -22,7 +22,8 @@ from egs_warp.io.planes import KnownPlane, read_planes, write_planes
 from egs_warp.io.run_folder import MANIFEST
 from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene
 from egs_warp.segmentation.clearance import Clearing
-from egs_warp.segmentation.object_mask import ObjectSpec, masks_from_selection
+from egs_warp.segmentation.object_spec import ObjectSpec
+from egs_warp.segmentation.selection_masks import masks_from_selection
 from tests.support.scenes import FLOOR, ball_on_floor
 
 

@@ -12,7 +12,7 @@ from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.pipelines.doubts import doubts
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane
 from egs_warp.pipelines.pictures import segmentation_picture
-from egs_warp.segmentation.object_mask import ObjectSpec
+from egs_warp.segmentation.object_spec import ObjectSpec
 from tests.support.grounds import level
 from tests.support.scenes import FLOOR, lying, round_ones, shell
 

@@ -14,10 +14,11 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.inpainting.inpainters import OpenCvInpainter, OpenCvMethod
 from egs_warp.io import read_capture, write_ply
+from egs_warp.io.planes import read_planes
 from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene, viewing_direction
 from egs_warp.segmentation.clearance import Clearing
-from egs_warp.segmentation.object_mask import ObjectSpec
+from egs_warp.segmentation.object_spec import ObjectSpec
 from tests.support.grounds import on_folds
 from tests.support.scenes import FLOOR, ball_on_floor
 
@@ -218,3 +219,19 @@ def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:
     assert direction is not None
     np.testing.assert_allclose(direction, cameras[1].centre - prepared.located.centre)
     assert viewing_direction(prepared, []) is None
+
+
+def test_what_hangs_above_the_ground_leaves_no_hole(tmp_path: Path) -> None:
+    """A ball a fifth of its size above the floor comes down; nothing is painted, ``plane.json`` tells of no hole."""
+    cloud, truth = ball_on_floor(lift=0.33)
+    spec = ObjectSpec(point=np.array([0.0, -0.5, 0.83]))
+    scene = prepare_scene(cloud, spec, options=SceneOptions(clearing=Clearing.SPLIT))
+    assert scene.hole is None and scene.filled is None and scene.background is scene.bare
+    assert "the object hangs above the ground, which is whole under it" in scene.notes
+    assert scene.object.count >= 0.99 * truth.sum()
+    heights = scene.plane.heights(scene.object.means.numpy())
+    assert abs(float(heights.min())) < 0.02 and float(heights.max()) == pytest.approx(1.0, abs=0.02)
+    assert any("and was set down on it" in note for note in scene.notes)
+    scene.write(tmp_path)
+    (known,) = read_planes(tmp_path / "plane.json")
+    assert known.hole is None and known.plane.normal[2] > 0.999

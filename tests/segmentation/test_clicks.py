@@ -16,7 +16,8 @@ from egs_warp.io.cameras import write_cameras
 from egs_warp.pipelines.locate_plane import locate_plane
 from egs_warp.segmentation.above_plane import AbovePlane, hanging_parts
 from egs_warp.segmentation.clicks import click_at
-from egs_warp.segmentation.object_mask import ObjectSpec, segment
+from egs_warp.segmentation.object_mask import segment
+from egs_warp.segmentation.object_spec import ObjectSpec
 from tests.support.clicking import balls, click, front
 from tests.support.grounds import level
 from tests.support.scenes import FLOOR, ball_on_floor, lying, round_ones, shell
@@ -105,6 +106,29 @@ def test_what_hangs_in_the_air_is_held_by_what_is_near() -> None:
     scene = AbovePlane.of(round_ones(np.concatenate([thing, near, far + [0, 0, 0.3], low]), 0.01), FLOOR)
     parts = np.repeat([0, 1, 2, 3], [800, 2, 2, 2])
     assert hanging_parts(scene, np.arange(806), parts, np.array([0]), size).tolist() == [1]
+
+
+@pytest.mark.parametrize(
+    ("count", "post", "goes_along"), [(200, None, True), (30, None, False), (200, 1.15, False), (200, 1.6, True)]
+)
+def test_a_hand_that_hangs_apart_is_held_by_the_nearest(count: int, post: float | None, goes_along: bool) -> None:
+    """A fifth of the ball away it is the ball's, unless it is a stray, or a post stands less than twice as far from
+    it.
+    """
+    random = np.random.default_rng(5)
+    skin = random.normal(size=(count, 3))
+    hand = 0.1 * skin / np.linalg.norm(skin, axis=1, keepdims=True) + [0.8, 0.0, 0.6]
+    parts = [shell(), hand]
+    if post is not None:
+        angle, height = np.meshgrid(np.linspace(0.0, 6.2, 16), np.linspace(0.03, 1.2, 30))
+        parts.append(
+            np.column_stack([post + 0.05 * np.cos(angle.ravel()), 0.05 * np.sin(angle.ravel()), height.ravel()])
+        )
+    things = round_ones(np.concatenate(parts), 0.02)
+    cloud = joined(things, lying(level((-2.0, -2.0), (2.0, 2.0), 0.0, 0.05)))
+    found = segment(cloud, FLOOR, ObjectSpec.of_clicks([click(cloud, (0.0, -0.5, 0.5))]), size=1.7)
+    assert found.object_mask[1500 : 1500 + count].mean() == float(goes_along)
+    assert not found.object_mask[1500 + count : things.count].any()
 
 
 def test_the_plane_lies_below_the_lowest_click() -> None:

@@ -17,7 +17,8 @@ from egs_warp.io.capture import read_capture
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, on_its_ground
 from egs_warp.segmentation import ground as module
 from egs_warp.segmentation.ground import MeasuredGround, measure_ground
-from egs_warp.segmentation.object_mask import ObjectSpec, segment
+from egs_warp.segmentation.object_mask import segment
+from egs_warp.segmentation.object_spec import ObjectSpec
 from tests.support.grounds import RADIUS, ball, level, on_folds, sheet
 from tests.support.waves import wave
 
@@ -166,7 +167,7 @@ def test_what_the_object_hid_is_not_taken_for_ground(scale: float) -> None:
     bare = joined(*floors)
     eye = scale * np.array([0.3, -0.3, 4.0])
     camera = Camera.look_at(eye, np.zeros(3), np.array([0.0, 1.0, 0.0]), width=64, height=64, near=0.01 * scale)
-    seen = module._seen_points(joined(bare, ball()).scaled(scale), bare.scaled(scale), camera)
+    seen = module._seen_points(joined(bare, ball()).scaled(scale), bare.scaled(scale), camera, LEVEL)
     assert len(seen) > 1000 and np.abs(seen[:, 2]).max() < 0.05 * scale
 
 

@@ -15,10 +15,13 @@ from egs_warp.geometry.bitmaps import depth_inside, distance_to
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.segmentation import labels as module
 from egs_warp.segmentation.labels import labels_of_votes, smoothed_labels
-from egs_warp.segmentation.object_mask import ObjectSpec, masks_from_selection, segment
+from egs_warp.segmentation.object_mask import segment
+from egs_warp.segmentation.object_spec import ObjectSpec
+from egs_warp.segmentation.selection_masks import masks_from_selection
 from egs_warp.segmentation.votes import MaskedView, Votes, votes_of_masks
 from tests.support.clicking import balls, click
-from tests.support.scenes import FLOOR, round_ones
+from tests.support.grounds import level
+from tests.support.scenes import FLOOR, lying, round_ones
 
 
 def test_the_closed_form_paints_the_masks_with_the_least_error() -> None:
@@ -67,15 +70,30 @@ def test_rough_masks_of_three_views_find_a_stool_with_its_legs() -> None:
     assert overlap((found.object_mask | found.floater_mask)[nodes]) > 0.95
 
 
-def test_however_many_pixels_agree_a_vote_is_no_surer_than_sure() -> None:
-    """One of two neighbours alike is out for sure, the other in by less than their link costs: both are out."""
+def test_a_vote_is_surer_by_the_root_of_its_pixels() -> None:
+    """One of two neighbours alike is out for sure, the other in by less than their link costs: both are out. Nine times
+    the pixels weigh three times as much.
+    """
     pair = round_ones(np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0]]), 0.02)
-    pixels, share = 10.0 * module._SURE, np.array([0.5 + 0.35 * module._SMOOTHNESS, 0.0])
-    assert share[0] < 1.0
+    pixels, share = 9.0 * module._SURE, np.array([0.5 + 0.35 * module._SMOOTHNESS / 3.0, 0.0])
     for links, labels in ((1.0, [False, False]), (0.5, [True, False])):
         votes = Votes(pixels * share, pixels * (1.0 - share), np.full(2, pixels))
         with patch.object(module, "_SMOOTHNESS", links * module._SMOOTHNESS):
             assert smoothed_labels(pair, votes, np.arange(2)).tolist() == labels
+
+
+@pytest.mark.parametrize(("pixels", "kept_out"), [(66.0, True), (4.0, False)])
+def test_what_many_pixels_say_no_neighbour_overrules(pixels: float, kept_out: bool) -> None:
+    """One of a sheet of the object's, of which 62 % shows outside of the masks: in 66 pixels that is so, in four it may
+    be the masks' edge.
+    """
+    cloud = lying(level((-0.3, -0.3), (0.3, 0.3), 0.5, 0.03))
+    inside, outside = np.full(cloud.count, 20.0), np.zeros(cloud.count)
+    middle = int(np.argmin(np.linalg.norm(cloud.means.numpy()[:, :2], axis=1)))
+    inside[middle], outside[middle] = 0.38 * pixels, 0.62 * pixels
+    votes = Votes(inside, outside, inside + outside)
+    labels = smoothed_labels(cloud, votes, np.arange(cloud.count), views=18)
+    assert labels[middle] != kept_out and labels.sum() >= cloud.count - 1
 
 
 def test_masks_mean_every_piece_and_clicks_correct_them() -> None:

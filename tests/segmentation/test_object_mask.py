@@ -17,8 +17,11 @@ from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.io import read_cameras, read_capture
 from egs_warp.io.cameras import write_cameras
 from egs_warp.pipelines.locate_plane import locate_plane
+from egs_warp.segmentation import floor_shreds
 from egs_warp.segmentation import object_mask as module
-from egs_warp.segmentation.object_mask import Box, ObjectSpec, masks_from_selection, segment
+from egs_warp.segmentation.object_mask import segment
+from egs_warp.segmentation.object_spec import Box, ObjectSpec
+from egs_warp.segmentation.selection_masks import masks_from_selection
 from egs_warp.segmentation.votes import MaskedView
 from tests.support.grounds import level
 from tests.support.scenes import FLOOR, ball_on_floor, lying, round_ones, shell
@@ -298,7 +301,7 @@ def test_how_far_a_floor_scatters_is_judged_beside_the_object() -> None:
     under = level((1.6, -1.4), (2.4, -0.6), 0.04, 0.01)
     whole = joined(round_ones(thing, 0.02), lying(np.concatenate([beside, away, under])))
     scene_ = module.AbovePlane.of(whole, FLOOR)
-    top = module._floor_top(scene_, np.arange(whole.count) < len(thing), np.sqrt(2.0))
+    top = floor_shreds.floor_top(scene_, np.arange(whole.count) < len(thing), np.sqrt(2.0))
     assert top == pytest.approx(0.003, rel=0.15)
 
 

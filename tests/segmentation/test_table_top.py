@@ -10,7 +10,9 @@ from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.geometry.plane import Plane
 from egs_warp.pipelines.locate_plane import locate_plane
 from egs_warp.segmentation import table_top as module
-from egs_warp.segmentation.object_mask import Box, ObjectSpec, Segmentation, masks_from_selection, segment
+from egs_warp.segmentation.object_mask import segment
+from egs_warp.segmentation.object_spec import Box, ObjectSpec, Segmentation
+from egs_warp.segmentation.selection_masks import masks_from_selection
 from egs_warp.segmentation.table_top import planes_below, surface_around
 from tests.support.grounds import ball, furnished_room, level, sheet
 

@@ -25,6 +25,11 @@ def tensor(name: str, shape: Sequence[int], values: Sequence[float], *, external
     return _all(1, shape) + _field(2, 1) + _field(8, name) + numbers
 
 
+def integers(name: str, values: Sequence[int]) -> bytes:
+    """Whole numbers, as shapes and axes are."""
+    return _all(1, [len(values)]) + _field(2, 7) + _field(8, name) + _field(9, struct.pack(f"<{len(values)}q", *values))
+
+
 def value(name: str, shape: Sequence[int | str]) -> bytes:
     """An input or an output; sides that are names are free."""
     sides = b"".join(_field(1, _field(2 if isinstance(side, str) else 1, side)) for side in shape)

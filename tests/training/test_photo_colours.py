@@ -60,3 +60,25 @@ def test_photographs_beside_the_cameras_clear_the_plane(tmp_path: Path) -> None:
 
     assert thing.count - 10 <= tuned.count <= thing.count
     assert crossing(tuned) < 0.6 * crossing(thing)
+
+
+def test_a_photo_is_reduced_in_blocks_of_whole_pixels_as_its_camera_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 97 pixels at a third 32 are left, of the first 96; stretched to all of them it would be off at its edge."""
+    pytest.importorskip("torch")
+    from egs_warp.io import read_cameras
+    from egs_warp.training import photo_colours
+
+    monkeypatch.setattr(photo_colours, "_PHOTO_SIDE", 40)
+    monkeypatch.setattr(photo_colours, "in_colours_of", lambda reference, photo, shared: photo)
+    cloud, _ = ball_on_floor()
+    cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.9, count=1, size=97)
+    write_cameras(tmp_path / "cameras.json", cameras, ["photo.png"])
+    (tmp_path / "images").mkdir()
+    picture = np.random.default_rng(0).integers(0, 256, (97, 97, 3)).astype(np.uint8)
+    Image.fromarray(picture).save(tmp_path / "images" / "photo.png")
+    (view,) = photo_colours.photographs_in_colours_of(cloud, read_cameras(tmp_path / "cameras.json"))
+    assert (view.camera.width, view.camera.height) == (32, 32)
+    blocks = picture[:96, :96].reshape(32, 3, 32, 3, 3).mean(axis=(1, 3)) / 255.0
+    np.testing.assert_allclose(view.image, blocks, atol=0.51 / 255)

@@ -46,6 +46,7 @@ def composite_geometry_kernel(
     normal: wp.array[wp.vec3],
     # Out:
     median_depth_out: wp.array[wp.float32],
+    median_gaussian_out: wp.array[wp.int32],
     normal_out: wp.array[wp.vec3],
 ):
     """One thread walks one pixel for what is seldom asked: where half of the light is stopped, and the mean normal."""
@@ -54,7 +55,7 @@ def composite_geometry_kernel(
     if pixel[0] >= width or pixel[1] >= height:
         return
     tile = thread / TILE_PIXELS
-    median = wp.float32(0.0)
+    median = wp.int32(-1)
     normal_sum = wp.vec3()
     passing = wp.float32(1.0)
     intersection = tile_start[tile]
@@ -70,8 +71,12 @@ def composite_geometry_kernel(
             else:
                 normal_sum += passing * alpha * normal[g]
                 if passing > 0.5 and after <= 0.5:
-                    median = colour_depth[g][3]
+                    median = g
                 passing = after
     i = pixel[1] * width + pixel[0]
-    median_depth_out[i] = median
+    depth = wp.float32(0.0)
+    if median >= 0:
+        depth = colour_depth[median][3]
+    median_depth_out[i] = depth
+    median_gaussian_out[i] = median
     normal_out[i] = normal_sum

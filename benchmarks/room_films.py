@@ -1,0 +1,228 @@
+"""From photos or a capture to a film, each stage timed: what a user does, with three clicks at most.
+
+``python benchmarks/room_films.py koala --out out/koala``: one scene; ``rooms.py --films FOLDER`` runs all of them.
+Clicks are those of ``clicking.py`` where outlines were drawn, else the ones below. Into ``--out`` go the film, its
+contact sheet ``sheet.png`` of twelve frames, the pictures that ``egs-warp animate`` leaves of each step, the capture
+that was trained, and ``row.json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from clicking import clicked
+from drawn import DrawnScene, read_drawn
+from egs_warp.commands.object_flag import read_object
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.inpainting.holes import hole_under
+from egs_warp.inpainting.inpaint import inpaint
+from egs_warp.inpainting.picture import before_and_after
+from egs_warp.io import read_cameras, read_capture
+from egs_warp.io.ply import write_ply
+from egs_warp.io.run_folder import RunFolder, run_folder
+from egs_warp.io.video import write_png
+from egs_warp.launching import use_device
+from egs_warp.locomotion.ledger import ledger
+from egs_warp.motions.script import motion
+from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.doubts import doubts
+from egs_warp.pipelines.film import draw_film
+from egs_warp.pipelines.front import mean_view
+from egs_warp.pipelines.ground_left import ground_left
+from egs_warp.pipelines.locate_plane import locate_plane, on_its_ground
+from egs_warp.pipelines.performance import simulate
+from egs_warp.pipelines.pictures import picture_cameras, plane_picture, segmentation_picture
+from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, set_down, take_apart, viewing_direction
+from egs_warp.pipelines.report import report_of_run
+from egs_warp.pipelines.train_capture import train
+from egs_warp.segmentation.object_spec import ObjectSpec
+from egs_warp.training.finetune import TrainingView
+from egs_warp.training.photo_colours import photographs_in_colours_of
+from harness import Row, data_folder, timed
+
+CLICKS = 3
+STAGES = ("load", "train", "plane", "object", "hole", "body", "animate", "film")
+
+
+@dataclass(frozen=True)
+class Filmed:
+    """A scene, and what its object is to do."""
+
+    motion: str
+    photos: str | None = None
+    """Folder of posed photos below ``posed``, where nothing was drawn."""
+    clicks: tuple[str, ...] = ()
+    """As ``--object`` takes them, where nothing was drawn."""
+
+
+FILMS: Mapping[str, Filmed] = {
+    "bonsai": Filmed("walk 0.3"),
+    "mouse": Filmed("jump", "mouse", ("+268,358@59F01D40A7083FB991B8FBE5285F0C94.jpg",)),
+    "plush_dog": Filmed("jump", "plush_dog", ("+403,309@IMG_3496.jpg",)),
+    "koala": Filmed("jump"),
+    "fox": Filmed("jump distance=0.2"),
+    "narcissus": Filmed("twist 90"),
+    "playbot": Filmed("jump"),
+}
+
+
+def is_here(name: str) -> bool:
+    """Whether the data of a scene are."""
+    photos = FILMS[name].photos
+    return (data_folder() / "posed" / photos).exists() if photos else read_drawn(name).is_here
+
+
+def film(
+    name: str, out: Path, *, device: str, nodes: int, frames: int | None = None, trained: Path | None = None
+) -> Row:
+    """The whole way of one scene into the folder ``out``; seconds of each stage, and how it ended."""
+    asked = FILMS[name]
+    seconds: dict[str, float] = {}
+    drawn = None if asked.photos else read_drawn(name)
+    photos = data_folder() / "posed" / asked.photos if asked.photos else drawn.photos if drawn else None
+    with run_folder(out, overwrite=True) as run:
+        cloud = _capture(drawn, photos, seconds, device, trained)
+        if photos is not None and trained is None:
+            write_ply(run.file("capture.ply"), cloud)
+        posed, seconds["load"] = timed(read_cameras, photos) if photos else ([], seconds["load"])
+        cameras = [one.camera for one in posed]
+        spec = (
+            clicked(drawn, cloud, cameras, CLICKS)[0] if drawn is not None else read_object(asked.clicks, cloud, posed)
+        )
+        photographs = photographs_in_colours_of(cloud, posed) or None
+        scene = _taken_apart(cloud, spec, cameras, photographs, seconds)
+        said = _pictures(run, cloud, scene, cameras)
+        creature, seconds["body"] = timed(
+            make_creature,
+            scene.object,
+            plane=scene.plane,
+            ground=scene.ground,
+            seen_from=mean_view(cameras, scene.located.centre),
+            nodes=nodes,
+        )
+        performance, seconds["animate"] = timed(simulate, creature, motion(asked.motion), frames=frames)
+        made, seconds["film"] = timed(
+            draw_film,
+            performance,
+            run,
+            name="film",
+            size=512,
+            background=scene.background,
+            view_from=viewing_direction(scene, cameras),
+            quiet=True,
+        )
+        simulation = performance.simulation
+        behind = creature.placed(scene.background)
+        left = ground_left(simulation.trajectory.positions[-1], behind, creature.solids[0], creature.body.height)
+        report = report_of_run(
+            *(creature, simulation.trajectory, simulation.reports, simulation.frames),
+            *(performance.sequence.done, ledger(performance.trajectory)),
+            drawn=made.splats.count,
+            drawing=made.milliseconds,
+            source=name,
+            notes=(*scene.notes, *performance.cut_short(), *left),
+            seed=0,
+            asked={},
+            ending=performance.ending,
+        )
+        report.write(run.file("report.json"))
+        row: Row = {
+            "scene": name,
+            "how": "film",
+            "gaussians": cloud.count,
+            "object": scene.object.count,
+            "nodes": len(creature.cage.mesh.nodes),
+            "frames": len(simulation.frames),
+            "seconds": {stage: 1e-3 * seconds[stage] for stage in STAGES if stage in seconds},
+            "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+            "ended": report.state.value,
+            "said": [*said, *left],
+            "notes": list(scene.notes),
+        }
+        run.file("row.json").write_text(json.dumps(row, indent=1) + "\n")
+        run.finish()
+    return row
+
+
+def _capture(
+    drawn: DrawnScene | None, photos: Path | None, seconds: dict[str, float], device: str, trained: Path | None
+) -> GaussianCloud:
+    """Read, or trained from photos as ``egs-warp train`` does on this device."""
+    place = trained or (drawn.capture if drawn is not None else None)
+    if place is not None:
+        read, seconds["load"] = timed(read_capture, place, device=device)
+        return read.cloud
+    assert photos is not None
+    seconds["load"] = 0.0
+    small = device == "cpu"
+    result, seconds["train"] = timed(
+        train,
+        photos,
+        iterations=2500 if small else 7000,
+        max_gaussians=40_000 if small else 200_000,
+        max_side=360 if small else 1600,
+        device=device,
+    )
+    return result.cloud
+
+
+def _taken_apart(
+    cloud: GaussianCloud,
+    spec: ObjectSpec,
+    cameras: Sequence[Camera],
+    photographs: list[TrainingView] | None,
+    seconds: dict[str, float],
+) -> PreparedScene:
+    """As ``prepare_scene`` does, stage by stage."""
+    options = SceneOptions()
+    located, first = timed(locate_plane, cloud, spec, cameras=cameras)
+    located, second = timed(on_its_ground, cloud, located, spec, cameras)
+    seconds["plane"] = first + second
+    (thing, bare, notes), seconds["object"] = timed(take_apart, cloud, located, options, photographs)
+    thing, came_down = set_down(thing, located)
+    notes = (*notes, *came_down)
+    hole = hole_under(cloud, located.plane, located.segmentation)
+    if hole is None:
+        return PreparedScene(thing, bare, bare, located.plane, hole, located, (*located.notes, *notes))
+    filled, seconds["hole"] = timed(inpaint, bare, hole)
+    notes = (*located.notes, *notes, *filled.notes)
+    return PreparedScene(thing, filled.cloud, bare, located.plane, hole, located, notes, filled)
+
+
+def _pictures(run: RunFolder, cloud: GaussianCloud, scene: PreparedScene, cameras: Sequence[Camera]) -> list[str]:
+    """Written as ``egs-warp animate`` does; returns what looks wrong, in words."""
+    centre, size = scene.located.centre, scene.located.size
+    eyes = picture_cameras(scene.plane, centre, size, cameras)
+    words = doubts(cloud, scene.located, scene.object, eyes)
+    write_png(run.file("plane.png"), plane_picture(cloud, [scene.plane], eyes, centre=centre, size=size))
+    write_png(run.file("segment.png"), segmentation_picture(cloud, scene.object, scene.bare, eyes, words))
+    if scene.filled is not None:
+        write_png(run.file("filled.png"), before_and_after(scene.filled))
+    scene.write(run)
+    return words
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """One scene."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", choices=FILMS)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--nodes", type=int, default=500, help="of the cage, about (500, as egs-warp animate)")
+    parser.add_argument("--frames", type=int, help="pictures, at most; else until the object rests")
+    parser.add_argument("--trained", type=Path, help="a capture that was trained from the photos before")
+    chosen = parser.parse_args(arguments)
+    use_device(chosen.device)
+    given = {name: getattr(chosen, name) for name in ("device", "nodes", "frames", "trained")}
+    row = film(chosen.scene, chosen.out, **given)
+    print(", ".join(f"{stage} {value:.1f} s" for stage, value in row["seconds"].items()), row["ended"], sep="; ")
+
+
+if __name__ == "__main__":
+    main()

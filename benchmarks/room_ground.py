@@ -1,0 +1,99 @@
+"""How near a plane is to what is known of the ground: of built-in scenes its truth, of real ones what was marked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from clicking import GIVEN, JUDGED
+from drawn import DrawnScene, DrawnView
+from egs_warp.assets import scene
+from egs_warp.geometry.camera import camera_rays
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane
+from egs_warp.segmentation.object_spec import ObjectSpec
+from egs_warp.segmentation.seen_surface import SeenSurface
+from harness import Row
+
+
+def marked_plane(cloud: GaussianCloud, views: Sequence[DrawnView], up: np.ndarray) -> Plane:
+    """Through the places that are marked on the ground, the worst fifth of them left out; where a mark is, the heights
+    of splats tell, as their depths would put it too high.
+    """
+    seen = [SeenSurface.of(cloud, view.camera) for view in views]
+    plane = _through(seen, views, up, None)
+    return _through(seen, views, up, plane)
+
+
+def _through(seen: Sequence[SeenSurface], views: Sequence[DrawnView], up: np.ndarray, about: Plane | None) -> Plane:
+    """Through the marks, by depth, or by height over a plane ``about`` there."""
+    places = []
+    for surface, view in zip(seen, views, strict=True):
+        depth = surface.depth if about is None else surface.depth_over(about)
+        column, row = view.ground.astype(int).T
+        away = depth[row, column]
+        held = away > 0.0
+        places.append(view.camera.centre + away[held, None] * camera_rays(view.camera)[row[held], column[held]])
+    points = np.concatenate(places)
+    for _ in range(2):
+        plane = _fitted(points, up)
+        off = np.abs(plane.heights(points))
+        points = points[off <= np.quantile(off, 0.9)]
+    return _fitted(points, up)
+
+
+def _fitted(points: np.ndarray, up: np.ndarray) -> Plane:
+    middle = points.mean(axis=0)
+    normal = np.linalg.svd(points - middle)[2][2]
+    normal *= np.sign(normal @ up)
+    return Plane(normal, float(-normal @ middle))
+
+
+def apart(first: Plane, second: Plane, foot: np.ndarray, height: float) -> tuple[float, float]:
+    """Degrees between two planes, and their distance at ``foot`` (3,) in the object's heights."""
+    cosine = float(np.clip(first.normal @ second.normal, -1.0, 1.0))
+    return float(np.degrees(np.arccos(cosine))), abs(float(first.heights(foot) - second.heights(foot))) / height
+
+
+def real_ground(drawn: DrawnScene, cloud: GaussianCloud, located: LocatedPlane) -> Row:
+    """Ours, the ground where that is not flat, against the mean of two markings, and these against each other."""
+    plane = located.plane
+    foot = located.centre - plane.heights(located.centre) * plane.normal
+    height = float(np.quantile(plane.heights(cloud.means.numpy()[located.segmentation.object_mask]), 0.995))
+    even, odd = (marked_plane(cloud, drawn.views[half], plane.normal) for half in (GIVEN, JUDGED))
+    between = even.normal + odd.normal
+    middle = foot - 0.5 * (even.heights(foot) + odd.heights(foot)) * plane.normal
+    between /= np.linalg.norm(between)
+    degrees, offset = apart(plane, Plane(between, float(-between @ middle)), foot, height)
+    if located.ground is not None:
+        # What it stands on is not the plane there.
+        offset = abs(float(located.ground.heights(middle[None])[0])) / height
+    told_degrees, told_offset = apart(even, odd, foot, height)
+    row = {"scene": drawn.name, "how": "ground", "degrees": degrees, "offset": offset}
+    return {**row, "markings_degrees": told_degrees, "markings_offset": told_offset}
+
+
+def known_ground(name: str, device: str) -> Row:
+    """The plane of a built-in scene from a point in the middle of its object, against the one it was made on."""
+    made = scene(name, device=device)
+    cloud, truth = made.whole()
+    heights = made.plane.heights(cloud.means.numpy()[truth])
+    low, high = np.quantile(cloud.means.numpy()[truth], [0.01, 0.99], axis=0)
+    middle = 0.5 * (low + high)
+    located = locate_plane(cloud, ObjectSpec(point=middle))
+    foot = middle - made.plane.heights(middle) * made.plane.normal
+    degrees, offset = apart(located.plane, made.plane, foot, float(heights.max()))
+    return {"scene": name, "how": "ground", "degrees": degrees, "offset": offset}
+
+
+def judged_ground(rows: Sequence[Row]) -> bool:
+    """Whether every plane is near enough to what is known of it."""
+    return all(
+        row["degrees"] <= 2.0 * row["markings_degrees"] and row["offset"] <= 2.0 * row["markings_offset"]
+        if "markings_degrees" in row
+        else row["degrees"] <= 1.0 and row["offset"] <= 0.005
+        for row in rows
+        if row.get("how") == "ground"
+    )

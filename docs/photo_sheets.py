@@ -1,0 +1,198 @@
+"""Advice for photos, and what goes wrong with them, as pictures of the built-in rooms.
+
+python docs/photo_sheets.py --out out/photos writes taking.png, photos.png and object.png: each failure is made, not
+drawn.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from egs_warp.assets import scene
+from egs_warp.assets.scene import Scene
+from egs_warp.geometry.camera import Camera
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.plane import Plane
+from egs_warp.io.video import contact_sheet, write_png
+from egs_warp.pipelines.pictures import plane_picture
+from egs_warp.render import render_gaussians
+
+SIDE = 300
+MIDDLE = np.array([0.0, 0.0, 0.4])
+BACKDROP = (0.55, 0.75, 0.55)
+
+
+def eye(degrees: float, elevation: float = 28.0, away: float = 3.2) -> np.ndarray:
+    """(3,) where a photographer stands on the way round."""
+    a, e = np.radians([degrees, elevation])
+    return MIDDLE + away * np.array([np.sin(a) * np.cos(e), -np.cos(a) * np.cos(e), np.sin(e)])
+
+
+def camera(place: np.ndarray, fov: float = 38.0, target: np.ndarray = MIDDLE) -> Camera:
+    """A look at the object."""
+    return Camera.look_at(place, target, np.array([0.0, 0.0, 1.0]), width=SIDE, height=SIDE, vertical_fov_degrees=fov)
+
+
+def drawn(cloud: GaussianCloud, view: Camera, background: tuple[float, float, float] = (0.75, 0.78, 0.8)) -> np.ndarray:
+    """(SIDE, SIDE, 3) uint8."""
+    return render_gaussians(cloud, view, background=background).colour_srgb8()
+
+
+def way_round(cloud: GaussianCloud, places: list[np.ndarray]) -> np.ndarray:
+    """The scene from above, with a dot where each photo is taken, the higher the lighter."""
+    above = camera(np.array([0.0, -3.2, 7.5]), 50.0)
+    picture = np.ascontiguousarray(drawn(cloud, above))
+    for place in places:
+        x, y, z = above.rotation @ place + above.translation
+        at = (round(above.cx + above.fx * x / z), round(above.cy + above.fy * y / z))
+        cv2.circle(picture, at, 5, (255, 255, 255), -1, cv2.LINE_AA)
+        cv2.circle(picture, at, 4, (230, 40, 60) if place[2] < 2.2 else (255, 170, 60), -1, cv2.LINE_AA)
+    return picture
+
+
+def blurred(picture: np.ndarray) -> np.ndarray:
+    """As a hand shakes."""
+    kernel = np.zeros((25, 25), np.float32)
+    cv2.line(kernel, (2, 6), (22, 18), 1.0)
+    return cv2.filter2D(picture, -1, kernel / kernel.sum())
+
+
+def toned(picture: np.ndarray, gains: tuple[float, float, float]) -> np.ndarray:
+    """At another exposure and white balance."""
+    return np.clip(picture * np.array(gains), 0, 255).astype(np.uint8)
+
+
+def moved(cloud: GaussianCloud, way: np.ndarray) -> GaussianCloud:
+    """``cloud`` elsewhere."""
+    fields = (getattr(cloud, name).numpy() for name in ("rotations", "log_scales", "opacity_logits", "sh"))
+    return GaussianCloud.from_numpy(cloud.means.numpy() + way, *fields)
+
+
+def foggy(cloud: GaussianCloud) -> GaussianCloud:
+    """What a capture of too few photos is like: few Gaussians, too large and too faint, strays among them."""
+    random = np.random.default_rng(0)
+    kept = cloud.subset(np.sort(random.choice(cloud.count, cloud.count // 9, replace=False)))
+    means, scales = kept.means.numpy(), kept.log_scales.numpy()
+    strays = random.random(kept.count) < 0.05
+    means = means + np.where(strays[:, None], random.normal(0.0, 0.6, means.shape), 0.0)
+    rest = (kept.rotations.numpy(), scales + 0.9, kept.opacity_logits.numpy() - 1.5, kept.sh.numpy())
+    return GaussianCloud.from_numpy(means, *rest)
+
+
+def taking(made: Scene) -> np.ndarray:
+    """Ten photos' worth of advice."""
+    whole, _ = made.whole()
+    round_once = [eye(d, e, a) for e, a in ((22.0, 3.4), (48.0, 3.2)) for d in range(0, 360, 18)]
+    spin = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+    on_the_spot = [eye(0.0, 22.0, 3.4) + 0.25 * np.array([np.cos(a), np.sin(a), 0.0]) for a in spin]
+    good = drawn(whole, camera(eye(0.0)))
+    shade = np.linspace(0.0, 1.0, SIDE)[None, :, None] + np.linspace(-0.4, 0.4, SIDE)[:, None, None] > 0.62
+    turned_away = drawn(joined_at(made, np.array([0.35, 0.25, 0.0])), camera(eye(0.0)))
+    pictures = [
+        (way_round(whole, round_once), "1 round it, from two heights"),
+        (np.concatenate([good, drawn(whole, camera(eye(18.0)))], axis=1), "2 each shows most of the last"),
+        (good, "3 it fills a third to a half"),
+        (drawn(whole, camera(eye(0.0), 110.0)), "4 not: too small"),
+        (drawn(whole, camera(eye(0.0), 17.0)), "5 not: no ground beside it"),
+        (blurred(good), "6 not: shaken"),
+        (np.concatenate([good, toned(good, (0.55, 0.6, 0.75))], axis=1), "7 better: one exposure"),
+        (np.concatenate([good, turned_away], axis=1), "8 not: it was moved"),
+        (np.where(shade, (0.45 * good).astype(np.uint8), good), "9 not: your own shadow"),
+        (way_round(whole, on_the_spot), "10 not: turning on the spot"),
+    ]
+    return sheet(pictures, 5)
+
+
+def joined_at(made: Scene, way: np.ndarray) -> GaussianCloud:
+    """The room with its object elsewhere in it."""
+    return replace(made, object=moved(made.object, way)).whole()[0]
+
+
+def photos(made: Scene) -> np.ndarray:
+    """What goes wrong between photos and capture."""
+    whole, _ = made.whole()
+    good = drawn(whole, camera(eye(0.0)))
+    arcs = [eye(d, 22.0, 3.4) for d in (*range(-40, 41, 10), *range(150, 211, 10))]
+    cut = good.copy()
+    cut[int(0.55 * SIDE) :] = 128
+    cropped = np.full_like(good, 255)
+    cropped[40:260, 20:240] = good[60:280, 60:280]
+    noise = np.random.default_rng(1).integers(170, 256, (SIDE // 10, SIDE // 10, 3)).astype(np.uint8)
+    pictures = [
+        (way_round(whole, arcs), "a two groups"),
+        (blurred(blurred(good)), "b nothing to match"),
+        (np.concatenate([good, drawn(joined_at(made, np.array([0.35, 0.25, 0.0])), camera(eye(0.0)))], 1), "c moved"),
+        (cropped, "d cropped afterwards"),
+        (cv2.resize(noise, (SIDE, SIDE), interpolation=cv2.INTER_NEAREST), "e no picture to us"),
+        (cut, "f cut short"),
+        (drawn(foggy(whole), camera(eye(70.0))), "g fog in new views"),
+        (np.concatenate([good, toned(good, (0.5, 0.55, 0.7))], axis=1), "h exposures differ: found"),
+    ]
+    return sheet(pictures, 4)
+
+
+def taken_out(made: Scene) -> np.ndarray:
+    """What goes wrong between capture and object."""
+    whole, thing = made.whole()
+    heights, means = made.plane.heights(whole.means.numpy()), whole.means.numpy()
+    view = camera(eye(-20.0))
+
+    def alone(chosen: np.ndarray) -> np.ndarray:
+        return drawn(whole.subset(chosen), view, BACKDROP)
+
+    def grid(lift: float) -> np.ndarray:
+        plane = Plane(made.plane.normal, made.plane.offset - lift)
+        picture = plane_picture(whole, [plane], [view], centre=MIDDLE, size=1.3)
+        # Without the words of the picture itself.
+        return cv2.resize(picture[24:SIDE, 12 : SIDE - 12], (SIDE, SIDE), interpolation=cv2.INTER_AREA)
+
+    near = np.linalg.norm(means[:, :2], axis=1)
+    foot = (heights < 0.02) & (near < 0.75)
+    left = drawn(whole.subset(~thing & ~((near < 0.3) & (heights < 0.02))), view)
+    pictures = [
+        (grid(0.0), "i the plane as it should lie"),
+        (grid(0.3), "j it lies too high"),
+        (alone(thing), "k the object as it should be"),
+        (alone(thing & (heights < 0.62)), "l a part is missing"),
+        (alone(thing & (heights > 0.12)), "m its foot is missing"),
+        (alone(thing | foot), "n floor taken along"),
+        (left, "o the hole, not filled"),
+        (
+            drawn(joined_at(made, np.array([1.9, 0.0, 0.0])), camera(eye(-20.0), 60.0, np.array([0.7, 0.0, 0.3]))),
+            "p beyond the edge",
+        ),
+    ]
+    return sheet(pictures, 4)
+
+
+def sheet(pictures: list[tuple[np.ndarray, str]], columns: int) -> np.ndarray:
+    """Tiles of one size, each with its words; pairs are shown at half their size."""
+    tiles = []
+    for picture, _ in pictures:
+        wide = picture.shape[1] > picture.shape[0]
+        small = cv2.resize(picture, (SIDE, SIDE // 2), interpolation=cv2.INTER_AREA) if wide else picture
+        tile = np.full((SIDE, SIDE, 3), 255, np.uint8)
+        top = (SIDE - len(small)) // 2
+        tile[top : top + len(small)] = small
+        tiles.append(tile)
+    return contact_sheet(tiles, columns, [words for _, words in pictures])
+
+
+def main() -> None:
+    """Write the sheets."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True)
+    out = parser.parse_args().out
+    out.mkdir(parents=True, exist_ok=True)
+    made = scene("figurine")
+    for name, make in (("taking", taking), ("photos", photos), ("object", taken_out)):
+        write_png(out / f"{name}.png", make(made))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,212 @@
+"""One creature, many runs of it, over processes of this machine or over the hosts of a Ray cluster."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from egs_warp.errors import ArgumentError, UserError
+from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.launching import available_threads, use_device
+from egs_warp.locomotion.ledger import ledger
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.push import Push
+from egs_warp.motions.script import Script
+from egs_warp.motions.style import Style
+from egs_warp.pipelines.creature import Creature
+from egs_warp.pipelines.crew import Crew, Ended, Processes, Tell, Work, ended_tasks
+from egs_warp.pipelines.ending import State
+from egs_warp.pipelines.performance import Performance, simulate
+from egs_warp.pipelines.ray_crew import HERE, RayCrew
+from egs_warp.pipelines.report import GaussianCounts, Report, report_of_run
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run: what ``simulate`` takes, under the same names, and the ground."""
+
+    motion: Script
+    friction: float | None = None
+    """Of the ground (``Creature.with_friction``), if not the creature's own."""
+    frames: int | None = None
+    longest: float | None = None
+    """Seconds."""
+    step: float | None = None
+    """Seconds."""
+    style: Style | None = None
+    pushes: tuple[Push, ...] = ()
+    get_up: bool = True
+    activations: np.ndarray | None = None
+    """(steps, M) metres."""
+
+    def perform(
+        self, creature: Creature, *, progress: Callable[[int, int], object] = lambda done, expected: None
+    ) -> Performance:
+        """The run alone, here."""
+        if self.friction is not None:
+            creature = creature.with_friction(self.friction)
+        asked = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in ("motion", "friction")}
+        return simulate(creature, self.motion, **asked, progress=progress)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a job ended."""
+
+    job: Job
+    runs: int
+    """How often it was begun: more than once where a worker was lost."""
+    error: str | None
+    """Why there is nothing else, in a line."""
+    report: Report | None
+    """As ``animate`` writes it."""
+    frames: np.ndarray
+    """(n,) index into the trajectory's times for each frame of a video at 60 Hz."""
+    file: Path | None
+    """Where the trajectory was written, if that was asked for."""
+    held: Trajectory | None
+    """The trajectory, otherwise."""
+
+    @property
+    def state(self) -> State | None:
+        """How the motion ended, None where it has not."""
+        return None if self.report is None else self.report.state
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Every solver step, read from its file where it lies in one. Raises ``UserError`` where there is none."""
+        if self.held is None and self.file is None:
+            raise UserError(f"job: it has no trajectory: {self.error}")
+        return self.held if self.held is not None else Trajectory.load(self.file)  # pyright: ignore[reportArgumentType]
+
+
+def simulate_many(
+    creature: Creature,
+    jobs: Sequence[Job],
+    *,
+    workers: int | str | None = None,
+    out: Path | str | None = None,
+    ended: Callable[[int, Outcome], object] = lambda number, outcome: None,
+    progress: Callable[[int, int], object] = lambda done, expected: None,
+) -> tuple[Outcome, ...]:
+    """Run all ``jobs`` of one ``creature``, several at a time; the outcomes are in the order of the jobs. Each has the
+    bits of its run alone (``Job.perform``) on a machine of this kind.
+
+    ``workers``: how many processes of this machine, as many as it has cores if None; ``"ray"``, or the address of a Ray
+    cluster, for its cores (docs/guide/many.md). Each is sent the creature once, and uses one core. A job whose worker
+    is lost is begun again, at most twice; one that ends in an error says so in its outcome, and the others go on.
+    ``out``: a folder for trajectories, ``job-0000.npz`` and so on, which then do not lie in memory. ``ended`` is told
+    the number of each job as it ends, from 0, and its outcome; ``progress`` after each frame how many are done, and how
+    many are expected in all by now. Raises ``UserError`` for workers that cannot be had.
+    """
+    folder = None if out is None else Path(out)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+    outcomes: list[Outcome | None] = [None] * len(jobs)
+    counts = _Frames(len(jobs), progress)
+    for task in farmed(_Performing(creature), jobs, workers=workers, told=counts.told):
+        report, frames, trajectory = task.value or (None, np.zeros(0, int), None)
+        if report is not None:
+            report = replace(report, gaussians=GaussianCounts.of(creature))
+        file = None
+        if folder is not None and trajectory is not None:
+            file = folder / f"job-{task.number:04d}.npz"
+            trajectory.save(file)
+        outcome = Outcome(
+            jobs[task.number], task.runs, task.error, report, frames, file, trajectory if file is None else None
+        )
+        outcomes[task.number] = outcome
+        counts.over(task.number)
+        ended(task.number, outcome)
+    return tuple(outcome for outcome in outcomes if outcome is not None)
+
+
+def farmed(
+    work: Work,
+    tasks: Sequence[Any],
+    *,
+    workers: int | str | None = None,
+    told: Callable[..., object] = lambda number, *values: None,
+) -> Iterator[Ended]:
+    """Each of ``tasks`` as ``work(task, tell)`` ends it, in whatever order; ``workers`` as in ``simulate_many``,
+    ``told`` gets the number of a task and what it tells.
+
+    Raises ``UserError`` for workers that cannot be had.
+    """
+    if not tasks:
+        return
+    yield from ended_tasks(_crew(work, workers, len(tasks)), tasks, told)
+
+
+def _crew(work: Work, workers: int | str | None, tasks: int) -> Crew:
+    if isinstance(workers, str):
+        if workers not in (HERE, "auto") and ":" not in workers:
+            raise ArgumentError("workers", "give a number of processes, ray, or a Ray cluster's address", value=workers)
+        return RayCrew(work, tasks, workers)
+    if workers is not None and workers < 1:
+        raise ArgumentError("workers", "give a number of processes, at least 1", value=workers)
+    return Processes(work, min(tasks, workers or available_threads()))
+
+
+class _Performing:
+    """What a worker does with a job."""
+
+    def __init__(self, creature: Creature) -> None:
+        self._device = str(creature.cloud.device)
+        # A dot in place of its splats, which no motion sees.
+        dot = [np.zeros((1, *shape)) for shape in ((3,), (4,), (3,), (), (1, 3))]
+        cloud = GaussianCloud.from_numpy(*dot, device=self._device)
+        # Read in the worker once it has said that Warp is to be quiet.
+        self._sent: bytes = pickle.dumps(replace(creature, cloud=cloud))
+        self._creature: Creature | None = None
+
+    def __call__(self, job: Job, tell: Tell) -> tuple[Report, np.ndarray, Trajectory]:
+        if self._creature is None:
+            use_device(self._device)
+            self._creature = pickle.loads(self._sent)
+            assert self._creature is not None, "it was sent"
+        creature = self._creature
+        performance = job.perform(creature, progress=tell)
+        simulation = performance.simulation
+        report = report_of_run(
+            *(creature, simulation.trajectory, simulation.reports, simulation.frames),
+            *(performance.sequence.done, ledger(simulation.trajectory)),
+            gaussians=GaussianCounts.of(creature),
+            drawing={},
+            source="",
+            notes=performance.cut_short(),
+            seed=0,
+            asked=_asked(job),
+            ending=performance.ending,
+        )
+        return report, simulation.frames, simulation.trajectory
+
+
+def _asked(job: Job) -> dict[str, Any]:
+    """``asked`` of the report."""
+    given = {name: getattr(job, name) for name in ("friction", "frames", "longest", "step", "get_up")}
+    return {**given, "pushes": len(job.pushes), "activations": job.activations is not None}
+
+
+class _Frames:
+    """Frames of all jobs, done and expected; those not begun are expected to have as many as the others have."""
+
+    def __init__(self, jobs: int, progress: Callable[[int, int], object]) -> None:
+        self._jobs, self._progress = jobs, progress
+        self._known: dict[int, tuple[int, int]] = {}
+
+    def told(self, number: int, done: int, expected: int) -> None:
+        """By a job, after a frame."""
+        self._known[number] = done, expected
+        done, expected = np.sum(list(self._known.values()), axis=0).tolist()
+        self._progress(done, round(expected * self._jobs / len(self._known)))
+
+    def over(self, number: int) -> None:
+        """Once a job has ended: with what it has done."""
+        done, _ = self._known.get(number, (0, 0))
+        self.told(number, done, done)
