@@ -311,7 +311,7 @@ def test_hardly_any_floor_says_nothing_of_its_roughness() -> None:
         place = np.linspace(0.7, 1.2, count)
         floor = np.column_stack([place, np.zeros(count), np.full(count, 0.01)])
         whole = joined(round_ones(shell(), 0.02), lying(floor))
-        top = module._floor_top(module.AbovePlane.of(whole, FLOOR), np.arange(whole.count) < 1500, np.sqrt(3.0))
+        top = floor_shreds.floor_top(module.AbovePlane.of(whole, FLOOR), np.arange(whole.count) < 1500, np.sqrt(3.0))
         assert top == pytest.approx(0.01 if rough else 0.0, abs=1e-6)
 
 
