@@ -97,6 +97,17 @@ def test_leaves_that_hang_in_the_air_go_along_and_what_stands_beside_does_not() 
     assert not found.object_mask[1560:1620].any()
 
 
+def test_what_hangs_in_the_air_is_held_by_what_is_near() -> None:
+    """Within two of the 64 cells across the object; further off it is on its own, as is what reaches the floor."""
+    thing, leaf = shell(800), np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]])
+    size = 1.7
+    near, far = (leaf + [0.5 + gap * size, 0.0, 0.5] for gap in (1.6 / 64.0, 2.6 / 64.0))
+    low = leaf + [0.0, 0.51, 0.05]
+    scene = AbovePlane.of(round_ones(np.concatenate([thing, near, far + [0, 0, 0.3], low]), 0.01), FLOOR)
+    parts = np.repeat([0, 1, 2, 3], [800, 2, 2, 2])
+    assert hanging_parts(scene, np.arange(806), parts, np.array([0]), size).tolist() == [1]
+
+
 @pytest.mark.parametrize(
     ("count", "post", "goes_along"), [(200, None, True), (30, None, False), (200, 1.15, False), (200, 1.6, True)]
 )
@@ -118,17 +129,6 @@ def test_a_hand_that_hangs_apart_is_held_by_the_nearest(count: int, post: float 
     found = segment(cloud, FLOOR, ObjectSpec.of_clicks([click(cloud, (0.0, -0.5, 0.5))]), size=1.7)
     assert found.object_mask[1500 : 1500 + count].mean() == float(goes_along)
     assert not found.object_mask[1500 + count : things.count].any()
-
-
-def test_what_hangs_in_the_air_is_held_by_what_is_near() -> None:
-    """Within two of the 64 cells across the object; further off it is on its own, as is what reaches the floor."""
-    thing, leaf = shell(800), np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]])
-    size = 1.7
-    near, far = (leaf + [0.5 + gap * size, 0.0, 0.5] for gap in (1.6 / 64.0, 2.6 / 64.0))
-    low = leaf + [0.0, 0.51, 0.05]
-    scene = AbovePlane.of(round_ones(np.concatenate([thing, near, far + [0, 0, 0.3], low]), 0.01), FLOOR)
-    parts = np.repeat([0, 1, 2, 3], [800, 2, 2, 2])
-    assert hanging_parts(scene, np.arange(806), parts, np.array([0]), size).tolist() == [1]
 
 
 def test_the_plane_lies_below_the_lowest_click() -> None:

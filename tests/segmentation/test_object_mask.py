@@ -305,6 +305,16 @@ def test_how_far_a_floor_scatters_is_judged_beside_the_object() -> None:
     assert top == pytest.approx(0.003, rel=0.15)
 
 
+def test_hardly_any_floor_says_nothing_of_its_roughness() -> None:
+    """Nineteen of its Gaussians beside the object; twenty do."""
+    for count, rough in ((19, False), (20, True)):
+        place = np.linspace(0.7, 1.2, count)
+        floor = np.column_stack([place, np.zeros(count), np.full(count, 0.01)])
+        whole = joined(round_ones(shell(), 0.02), lying(floor))
+        top = floor_shreds.floor_top(module.AbovePlane.of(whole, FLOOR), np.arange(whole.count) < 1500, np.sqrt(3.0))
+        assert top == pytest.approx(0.01 if rough else 0.0, abs=1e-6)
+
+
 def test_what_hovers_over_the_only_floor_is_taken_and_said() -> None:
     """A ball a fifth of its size, the diagonal of its box, above it; twice as high it is refused."""
     cloud, truth = ball_on_floor(lift=0.35)
