@@ -171,6 +171,15 @@ def test_what_the_object_hid_is_not_taken_for_ground(scale: float) -> None:
     assert len(seen) > 1000 and np.abs(seen[:, 2]).max() < 0.05 * scale
 
 
+def test_specks_of_ground_are_left_out() -> None:
+    """A patch counts from a twentieth of the widest on: one of 2 of 40 nodes, not one of 1."""
+    ground = np.zeros((12, 12), bool)
+    ground[:4, :10] = ground[6, :2] = ground[9, 9] = True
+    kept = ground.copy()
+    kept[9, 9] = False
+    assert np.array_equal(module._one_patch(ground), kept)
+
+
 @pytest.mark.parametrize("count", [5, 12])
 def test_medians_of_what_is_nearest_to_each_node(count: int) -> None:
     """Of odd and even numbers of points; none of those off the grid, nor any where there are none."""
