@@ -1,4 +1,5 @@
-"""Get up: a body that lies throws itself up with the spin that turns it onto its feet, lands on them and stands.
+"""Get up: a body that lies presses itself up about the edge of its base, rolls over it, and comes to stand from a
+crouch.
 
 See docs/concepts/motions.md.
 """
@@ -19,6 +20,7 @@ from egs_warp.locomotion.objectives import (
     AnyObjective,
     SpinObjective,
     centre_of_mass_velocity,
+    node_velocities,
     straining_velocities,
 )
 from egs_warp.locomotion.stepper import StepReport
@@ -31,33 +33,44 @@ from egs_warp.motions.stand import Stand
 
 UPRIGHT = 15.0
 """Degrees: a body that stands at rest within this is up."""
-_LEANS = 40.0
-"""Degrees within which a body that has come down is caught as one that stands."""
-_RISES = (0.12, 0.2, 0.3)
-"""Body heights over that of a standing body's centre of mass to which each throw takes it, one after the other."""
-_DEPTH, _CROUCH = 0.25, 1.2
-"""Of the height at which its centre of mass lies, and of sqrt(H / g): how far, and in what time, it draws down."""
-_EXTENDED = 1.15
-"""Of that height: where the thrust ends at the latest."""
-_FLAT, _SLOW = 8.0, 0.15
-"""Degrees and sqrt(g H) within which it stands with all of its feet on the ground."""
-_STRAIGHTENS = 10.0
-"""Of sqrt(H / g), in which it must have come upright on its feet."""
-_SPIN, _MOST_SPIN = 1.4, 2.5
-"""Times what turns it upright until it comes down: a soft body leaves the ground with so much less than is asked; and
-the most, of a throw after others that did not turn it enough."""
-_LIES, _TURNS = 6.0, 3.5
-"""Of sqrt(H / g): for how long it waits to lie calm, and to come down."""
+_TRIES = ((1.2, 0.1), (1.6, 0.1), (1.0, 0.05), (1.3, 0.2), (2.2, 0.1), (1.6, 0.2), (3.0, 0.15), (1.0, 0.15))
+"""Of each try, one after the other: its push over the one that would just do in ``_STROKE``, and the height, in body
+heights, that it is to have in hand over the top."""
+_STROKE = 0.35
+"""Radians of the roll over which a body can press itself up."""
+_SWITCHED = 0.4
+"""Of sqrt(H / g), in which a push grows to its full size."""
+_OVER = 0.25
+"""Radians in sqrt(H / g): how fast it is to roll over the top at the least."""
+_BRAKES = 4.0
+"""Radians in H / g: the most that it slows down by."""
+_BASE = 0.3
+"""Body heights: what is at most this high above a standing body's sole turns as its base does."""
+_EDGE = 35.0
+"""Degrees: the body rolls over what would touch first if the ground were steeper by this, or by half of what its base
+is still off the ground."""
+_LANDED = 20.0
+"""Degrees from the ground within which its base has come down."""
+_CROUCH = 0.75
+"""Of the height at which its centre of mass stands: how low it is held until it is calm. Held low, it has further to
+go over the other side of its base."""
+_ASIDE = 0.1
+"""Body heights behind the edge: what presses there can push."""
+_LIES, _ROLLS, _STRAIGHTENS = 6.0, 6.0, 10.0
+"""Of sqrt(H / g): for how long it waits to lie calm, may roll, and may take to come to rest on its feet."""
+_SINKS_AFTER, _SINKS = 0.6, 0.05
+"""Of sqrt(H / g), and radians in it: what by then rolls back so fast has not got over."""
+_LOST = 60.0
+"""Degrees: with its base further off the ground it does not stand."""
 
 
 class GetUpPhase(Enum):
     """Phases of getting up."""
 
     LIE = "lie"
-    CROUCH = "crouch"
-    THRUST = "thrust"
-    TURN = "turn"
-    LAND = "land"
+    ROLL = "roll"
+    CATCH = "catch"
+    """It comes to rest on its base, held low."""
     STAND = "stand"
     GIVEN_UP = "given up"
 
@@ -66,14 +79,14 @@ class GetUpPhase(Enum):
 class GetUpPlan:
     """How often it may try."""
 
-    throws: float
+    tries: float
 
 
 @dataclass(frozen=True)
 class GetUpReached:
     """How it got up."""
 
-    throws: float
+    tries: float
 
 
 @dataclass(frozen=True)
@@ -83,17 +96,33 @@ class GetUpControl:
     com: float = 600.0
     spin: float = 600.0
     pose: float = 0.05
-    airborne: float = 2.0
-    landing: float = 0.1
-    """Share of ``com`` and ``spin`` that is asked for from touch-down until it stands."""
-    righting: float = 2.0
-    """Of the tilt from then on, in sqrt(g / H)."""
+    """Of the standing shape while it pushes."""
+    carried: float = 0.3
+    """Of the shape that it has once it only rolls on."""
     follow: float = 8.0
     """Of the shape, in sqrt(g / H)."""
 
 
+@dataclass(frozen=True)
+class _Roll:
+    """How the body rolls over its edge; world axes."""
+
+    axis: np.ndarray
+    """(3,) unit, level: about it the body turns up."""
+    arm: np.ndarray
+    """(3,) metres from the edge to the centre of mass, square to ``axis``."""
+    inertia: float
+    """kg m^2 about the edge."""
+    rate: float
+    """rad/s about it."""
+    missing: float
+    """Metres by which the centre of mass has to rise on its way over the top."""
+    pushes: bool
+    """Whether anything bears it behind the edge."""
+
+
 class GetUp:
-    """Throws itself up and stands, or gives up after ``_RISES``."""
+    """Presses itself up and stands, or gives up after ``_TRIES``."""
 
     def __init__(self, place: Place, *, control: GetUpControl | None = None) -> None:
         """``place``: how the body stands where it does; it lies anyhow. Raises ``UserError`` for a ball."""
@@ -105,14 +134,16 @@ class GetUp:
         self._gravity = float(np.linalg.norm(body.gravity))
         self._unit = body.time_unit
         self._arms = place.standing - body.centre_of_mass(place.standing)
-        self._standing_height = float(place.ground.local(body.centre_of_mass(place.standing))[2])
+        heights = place.standing @ place.ground.surface_normal
+        self._base = np.flatnonzero(heights < heights.min() + _BASE * body.height)
+        if len(self._base) < 4:
+            self._base = np.argsort(heights)[:8]
         self._calm = Calm(body)
         self.phase, self._entered = GetUpPhase.LIE, -1.0
-        self.throws = 0
+        self.tries = 0
+        self._push, self._in_hand = 0.0, 0.0
         self._stand: Stand | None = None
-        self._low = self._speed = 0.0
-        self._spin, self._asked = _SPIN, 0.0
-        self._degrees = 180.0
+        self._degrees = self._base_degrees = 180.0
 
     @property
     def resting(self) -> bool:
@@ -128,174 +159,141 @@ class GetUp:
 
     @property
     def expected_time(self) -> float:
-        """Seconds, of one throw."""
+        """Seconds, of one try."""
         return 8.0 * self._unit
 
     def planned(self) -> GetUpPlan:
         """How often it may try."""
-        return GetUpPlan(float(len(_RISES)))
+        return GetUpPlan(float(len(_TRIES)))
 
     def planned_com(self, elapsed: float) -> None:
         """Nothing: it goes on from how it lies."""
 
     def notes(self) -> list[str]:
         """What kept it from its feet, for the user."""
-        return [f"it does not get up: it lies after {self.throws} throws"] if self.phase is GetUpPhase.GIVEN_UP else []
+        return [f"it does not get up: it lies after {self.tries} tries"] if self.phase is GetUpPhase.GIVEN_UP else []
 
     def reached(self, trajectory: Trajectory, first: int, last: int) -> GetUpReached:
-        """How often it threw itself up."""
-        return GetUpReached(float(self.throws))
+        """How often it tried."""
+        return GetUpReached(float(self.tries))
 
     def objectives(self, state: BodyState, report: StepReport | None, dt: float) -> Sequence[AnyObjective]:
         """Objectives of the step of ``dt`` that starts at ``state``; ``report`` of the step before."""
-        local = self.ground.local(state.positions)
-        com = self.body.centre_of_mass(local)
-        moving = self.ground.axes @ self.body.centre_of_mass(state.velocities)
-        self._advance(state, report, com, moving)
-        elapsed = state.time - self._entered
-        if self.phase is GetUpPhase.STAND:
+        roll = self._measured(state, report)
+        self._advance(state, report, roll)
+        if self.phase in (GetUpPhase.CATCH, GetUpPhase.STAND):
             assert self._stand is not None
             return self._stand.objectives(state, report, dt)
-        if self.phase is GetUpPhase.CROUCH:
-            depth = _DEPTH * self._low
-            goal = self._low - depth * smooth((elapsed + dt) / (_CROUCH * self._unit))
-            return self._shaped(state, com, moving, [0.0, 0.0, 6.0 / self._unit * (goal - com[2])], 0.0, dt)
-        if self.phase is GetUpPhase.THRUST:
-            stroke = (_EXTENDED - 1.0 + _DEPTH) * self._low
-            push = 0.5 * self._speed**2 / (0.7 * stroke)
-            share = 0.3 + 0.7 * min((com[2] - (1.0 - _DEPTH) * self._low) / (0.4 * stroke), 1.0)
-            up = moving[2] + dt * max(share, 0.3) * push
-            angle, _ = self._tilt(state.positions)
-            gained = min(max(up, 0.0) / self._speed, 1.0)
-            self._asked = self._spin * gained * angle / self._flight(self._speed)
-            return self._shaped(state, com, moving, [0.0, 0.0, up], self._asked, dt)
-        if self.phase is GetUpPhase.TURN:
-            return self._turning(state, com, moving)
-        if self.phase is GetUpPhase.LAND:
-            return self._landing(state, moving, dt)
-        return []
+        return self._rolling(state, roll, dt) if self.phase is GetUpPhase.ROLL else []
 
-    def _advance(self, state: BodyState, report: StepReport | None, com: np.ndarray, moving: np.ndarray) -> None:
+    def _measured(self, state: BodyState, report: StepReport | None) -> _Roll:
+        body, up, normal = self.body, self.ground.axes[2], self.ground.surface_normal
+        x, com = state.positions, body.centre_of_mass(state.positions)
+        angle, axis = self._tilt(x)
+        base_angle, _ = self._tilt(x, self._base)
+        self._degrees, self._base_degrees = float(np.degrees(angle)), float(np.degrees(base_angle))
+        ahead = np.cross(axis, up)
+        steeper = min(0.5 * base_angle, np.radians(_EDGE))
+        first = np.cos(steeper) * ((x - self.ground.origin) @ normal) - np.sin(steeper) * (x @ ahead)
+        edge = x[first < first.min() + 0.005 * body.height].mean(axis=0)
+        arm = com - edge
+        arm = arm - (arm @ axis) * axis
+        inertia = float(axis @ body.inertia(x) @ axis) + body.mass * float(arm @ arm)
+        momentum = body.angular_momentum(x, state.velocities)
+        momentum = momentum + body.mass * np.cross(arm, body.centre_of_mass(state.velocities))
+        rise = max(self._top(x - com, axis, angle) - float((com - self.ground.origin) @ normal), 0.0)
+        behind = 0.0
+        if report is not None and report.contacts.count:
+            points = np.einsum("cw,cwi->ci", report.contacts.weights, x[report.contacts.nodes])
+            behind = float(report.forces[(points - edge) @ ahead < -_ASIDE * body.height, 0].sum())
+        return _Roll(axis, arm, inertia, float(axis @ momentum) / inertia, rise, behind > 0.02 * body.weight)
+
+    def _advance(self, state: BodyState, report: StepReport | None, roll: _Roll) -> None:
         if self._entered < 0.0:
             self._entered = state.time
-        elapsed, unit = state.time - self._entered, self._unit
+        elapsed = (state.time - self._entered) / self._unit
+        calm = self._calm.held(self.body.centre_of_mass(state.velocities), state.time)
         load = 0.0 if report is None else float(report.forces[:, 0].sum()) / self.body.weight
-        calm = self._calm.held(moving, state.time)
-        angle, _ = self._tilt(state.positions)
-        degrees = self._degrees = float(np.degrees(angle))
-        if self.phase is GetUpPhase.LIE and (calm or elapsed > _LIES * unit):
-            if degrees < UPRIGHT:
-                self._catch(state)
-            elif self.throws == len(_RISES):
+        upright = self._degrees < UPRIGHT
+        if self.phase is GetUpPhase.LIE and (calm or elapsed > _LIES):
+            if upright:
+                self._catch(state, GetUpPhase.STAND, 1.0)
+            elif self.tries == len(_TRIES):
                 self._enter(GetUpPhase.GIVEN_UP, state.time)
             else:
-                self._low = float(com[2])
-                rise = max(self._standing_height - self._low, 0.0) + _RISES[self.throws] * self.body.height
-                self._speed = float(np.sqrt(2.0 * self._gravity * rise))
-                self.throws += 1
-                self._enter(GetUpPhase.CROUCH, state.time)
-        elif self.phase is GetUpPhase.CROUCH and elapsed >= _CROUCH * unit:
-            self._enter(GetUpPhase.THRUST, state.time)
-        elif self.phase is GetUpPhase.THRUST:
-            flies = moving[2] >= 0.3 * self._speed and load <= 0.0
-            fast = moving[2] >= np.sqrt(max(self._speed**2 - 2.0 * self._gravity * (com[2] - self._low), 0.0))
-            if fast or flies or com[2] > 1.5 * _EXTENDED * self._low or elapsed > 2.0 * unit:
-                # The next throw, if it comes to that, asks for what this one has fallen short by.
-                self._spin = float(np.clip(self._spin * self._asked / max(self._rate(state), 1e-9), _SPIN, _MOST_SPIN))
-                self._enter(GetUpPhase.TURN, state.time)
-        elif self.phase is GetUpPhase.TURN:
-            if degrees < _LEANS and load > 0.05 and moving[2] < 0.2 * self.body.speed_unit:
-                self._enter(GetUpPhase.LAND, state.time)
-            elif elapsed > (1.0 if calm else 2.0) * _TURNS * unit:
+                push, in_hand = _TRIES[self.tries]
+                needed = max(roll.missing, 0.02 * self.body.height)
+                self._push = push * self.body.mass * self._gravity * needed / (roll.inertia * _STROKE)
+                self._in_hand = in_hand * self.body.height
+                self.tries += 1
+                self._enter(GetUpPhase.ROLL, state.time)
+        elif self.phase is GetUpPhase.ROLL:
+            sinks = roll.rate * self._unit < -_SINKS and self._degrees > _LANDED
+            if self._base_degrees < _LANDED and load > 0.05:
+                self._catch(state, GetUpPhase.CATCH, _CROUCH)
+            elif elapsed > _ROLLS or (elapsed > _SINKS_AFTER and sinks):
                 self._enter(GetUpPhase.LIE, state.time)
-        elif self.phase is GetUpPhase.LAND and (
-            (degrees < _FLAT and float(np.linalg.norm(moving)) < _SLOW * self.body.speed_unit)
-            or elapsed > _TURNS * unit
-        ):
-            self._catch(state)
-        elif (self.phase in (GetUpPhase.LAND, GetUpPhase.STAND) and degrees > 60.0) or (
-            self.phase is GetUpPhase.STAND and elapsed > _STRAIGHTENS * unit and degrees > UPRIGHT
-        ):
-            self._enter(GetUpPhase.LIE, state.time)
+        elif self.phase in (GetUpPhase.CATCH, GetUpPhase.STAND):
+            assert self._stand is not None
+            late = elapsed > _STRAIGHTENS
+            if self._base_degrees > _LOST or (late and not upright):
+                self._enter(GetUpPhase.LIE, state.time)
+            elif self.phase is GetUpPhase.CATCH and upright and (self._stand.resting or late):
+                self._catch(state, GetUpPhase.STAND, 1.0)
 
     def _enter(self, phase: GetUpPhase, time: float) -> None:
         self.phase, self._entered = phase, time
 
-    def _catch(self, state: BodyState) -> None:
-        self._stand = Stand(self._place.now(state.positions))
-        self._stand._resting = False
-        self._enter(GetUpPhase.STAND, state.time)
+    def _catch(self, state: BodyState, phase: GetUpPhase, crouch: float) -> None:
+        self._stand = Stand(self._place.now(state.positions), at_rest=False, crouch=crouch)
+        self._enter(phase, state.time)
 
-    def _tilt(self, positions: np.ndarray) -> tuple[float, np.ndarray]:
-        """Radians by which the body is off upright, and the level axis (3,), world axes, about which that is undone."""
-        turn = best_turn(self.body.node_mass, self._arms, positions - self.body.centre_of_mass(positions))
-        up = self.ground.axes[2]
+    def _tilt(self, positions: np.ndarray, nodes: np.ndarray | slice = slice(None)) -> tuple[float, np.ndarray]:
+        """Radians by which the body, or what some of its ``nodes`` are of it, is off upright, and the level axis (3,),
+        world axes, about which that is undone."""
+        mass, arms, up = self.body.node_mass[nodes], self._arms[nodes], self.ground.axes[2]
+        now = positions[nodes]
+        turn = best_turn(mass, arms - mass @ arms / mass.sum(), now - mass @ now / mass.sum())
         head = turn @ up
         axis = np.cross(head, up)
         size = float(np.linalg.norm(axis))
         angle = float(np.arctan2(size, head @ up))
         return angle, axis / size if size > 1e-9 else self.ground.axes[0]
 
-    def _rate(self, state: BodyState) -> float:
-        """Radians a second at which it turns up."""
-        body = self.body
-        momentum = body.angular_momentum(state.positions, state.velocities)
-        _, axis = self._tilt(state.positions)
-        return float(axis @ np.linalg.solve(body.inertia(state.positions), momentum))
+    def _top(self, arms: np.ndarray, axis: np.ndarray, angle: float) -> float:
+        """Metres over the ground: the highest that the centre of mass of a body of ``arms`` (N, 3) comes on its way, as
+        it rolls about ``axis`` (3,) by ``angle`` radians, whatever edges it rolls over."""
+        normal = self.ground.surface_normal
+        turns = Rotation.from_rotvec(np.linspace(0.0, angle, max(int(np.degrees(angle) / 3.0), 2))[:, None] * axis)
+        return float((-(turns.inv().apply(normal) @ arms.T).min(axis=1)).max())
 
-    def _flight(self, speed: float) -> float:
-        """Seconds in which a body that leaves at ``speed`` m/s comes down to the height at which it stands."""
-        rise = max(self._standing_height - self._low, 0.0)
-        return (speed + float(np.sqrt(max(speed**2 - 2.0 * self._gravity * rise, 0.0)))) / self._gravity
-
-    def _shape(self, positions: np.ndarray, stretch: float) -> np.ndarray:
-        """(N, 3) arms of the standing shape, turned as the body is and stretched along up."""
-        turn = best_turn(self.body.node_mass, self._arms, positions - self.body.centre_of_mass(positions))
-        bulge = stretch**-0.25
-        strain = self.ground.axes.T @ np.diag([bulge, bulge, stretch]) @ self.ground.axes
-        return self._arms @ turn.T @ strain
-
-    def _shaped(
-        self, state: BodyState, com: np.ndarray, moving: np.ndarray, velocity: Sequence[float], rate: float, dt: float
-    ) -> list[AnyObjective]:
-        """The centre of mass at ``velocity`` (3,), ground axes, the body turning up at ``rate`` rad/s."""
-        body, control = self.body, self.control
-        _, axis = self._tilt(state.positions)
+    def _rolling(self, state: BodyState, roll: _Roll, dt: float) -> list[AnyObjective]:
+        """The centre of mass and the spin of a body that turns about its edge as a whole, as fast as brings it over
+        the top; once nothing pushes it any more, as it does by itself."""
+        body, control, unit = self.body, self.control, self._unit
+        weight = body.mass * self._gravity
+        elapsed = state.time - self._entered + dt
+        ahead = np.cross(roll.axis, self.ground.axes[2])
         arms = state.positions - body.centre_of_mass(state.positions)
-        stretch = float(np.clip((com[2] + dt * velocity[2]) / self._low, 0.7, 1.25))
-        shape = control.follow / self._unit * (self._shape(state.positions, stretch) - arms)
+        carried = not roll.pushes and elapsed - dt > 0.3 * unit
+        if carried:
+            rate = roll.rate + dt * weight * float(roll.arm @ ahead) / roll.inertia
+        else:
+            rise = roll.missing + (self._in_hand if roll.missing > 0.01 * body.height else 0.0)
+            enough = float(np.sqrt(2.0 * weight * rise / roll.inertia + (_OVER / unit) ** 2))
+            push = self._push * max(smooth(elapsed / (_SWITCHED * unit)), 0.1)
+            rate = roll.rate + float(np.clip(enough - roll.rate, -_BRAKES * dt / unit**2, push * dt))
+        velocity = rate * np.cross(roll.axis, roll.arm)
+        if carried:
+            pose = node_velocities(body, velocity + rate * np.cross(roll.axis, arms), control.carried)
+        else:
+            turn = best_turn(body.node_mass, self._arms, arms)
+            shape = control.follow / unit * (self._arms @ turn.T - arms)
+            pose = straining_velocities(body, state.positions, shape, control.pose)
         return [
-            centre_of_mass_velocity(body, np.asarray(velocity) @ self.ground.axes, control.com),
-            SpinObjective(body.inertia(state.positions) @ (rate * axis), control.spin),
-            straining_velocities(body, state.positions, shape, control.pose),
-        ]
-
-    def _turning(self, state: BodyState, com: np.ndarray, moving: np.ndarray) -> list[AnyObjective]:
-        """In the air, and on an edge: to the standing shape, and the spin that brings it upright when it comes down."""
-        body, control = self.body, self.control
-        angle, axis = self._tilt(state.positions)
-        fall = com[2] - self._standing_height
-        left = (moving[2] + float(np.sqrt(max(moving[2] ** 2 + 2.0 * self._gravity * fall, 0.0)))) / self._gravity
-        rate = self._spin * angle / max(left, 0.3 * self._unit)
-        arms = state.positions - body.centre_of_mass(state.positions)
-        shape = control.follow / self._unit * (self._shape(state.positions, 1.0) - arms)
-        return [
-            SpinObjective(body.inertia(state.positions) @ (rate * axis), 0.1 * control.spin),
-            straining_velocities(body, state.positions, shape, control.airborne),
-        ]
-
-    def _landing(self, state: BodyState, moving: np.ndarray, dt: float) -> list[AnyObjective]:
-        """On an edge of its feet: it comes to rest and goes over onto all of them, in the shape in which it stands."""
-        body, control = self.body, self.control
-        angle, axis = self._tilt(state.positions)
-        arms = state.positions - body.centre_of_mass(state.positions)
-        shape = control.follow / self._unit * (self._shape(state.positions, 1.0) - arms)
-        velocity = (1.0 - 2.0 * dt / self._unit) * moving
-        righting = control.righting / self._unit * angle
-        return [
-            centre_of_mass_velocity(body, velocity @ self.ground.axes, control.landing * control.com),
-            SpinObjective(body.inertia(state.positions) @ (righting * axis), control.landing * control.spin),
-            straining_velocities(body, state.positions, shape, control.airborne),
+            centre_of_mass_velocity(body, velocity, control.com),
+            SpinObjective(body.inertia(state.positions) @ (rate * roll.axis), control.spin),
+            pose,
         ]
 
 

@@ -7,7 +7,6 @@ From take-off on it is told in the frame of the landing, which may be turned, hi
 from __future__ import annotations
 
 from dataclasses import replace
-from enum import Enum
 
 import numpy as np
 
@@ -17,7 +16,19 @@ from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.carriage import OnLegs, carried_on
 from egs_warp.motions.facing import Facing, Straight
-from egs_warp.motions.jump_plan import FURTHEST_LEAN, LEAN, JumpPlan, JumpTarget, plan_jump, stopping_time
+from egs_warp.motions.jump_plan import (
+    FURTHEST_LEAN,
+    LANDING,
+    LEAN,
+    RUN_ON,
+    SETTLING,
+    JumpPhase,
+    JumpPlan,
+    JumpTarget,
+    plan_jump,
+    stopping_time,
+    sufficient_speed,
+)
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.stance import Calm, Ground, Measurement, PoseFamily, Weights
 
@@ -30,13 +41,6 @@ THRUST_LEAD = 0.7
 """Part of the time of a thrust in which the speed forward is to be reached."""
 FOOTHOLD = 0.4
 """Of the footprint: how far from the capture point the feet may be put down for the sake of the target."""
-RUN_ON = 0.08
-"""Of sqrt(H / g): for how long the feet go on at the body's speed when they touch down, swinging and sliding (measured
-on the pawn)."""
-LANDING = 0.35
-"""Of sqrt(H / g): in which the fall of a body on legs is stopped, while it goes on over its feet (measured on the
-robot, whose feet stay where they touch down).
-"""
 CLEARANCE = 0.15
 """Of the height of a step: how far above it the feet are before they swing ahead."""
 IN_TIME = 2.5
@@ -46,16 +50,12 @@ TOUCH_DOWN = 0.06
 foot."""
 LONGEST_LANDING = 9.0
 """Of sqrt(H / g): a body that is not calm by then counts as at rest."""
-USUAL_LANDING, USUAL_LANDING_AHEAD = 0.7, 1.0
-"""The same, as it usually takes, and more for each body height ahead (measured on the pawn)."""
 TOUCHING_DOWN = 0.5
 """Of sqrt(H / g): the time from touch-down until balance and upright are asked for in full."""
 FLAT = 0.7
 """Of the lean of the landing: what the body is not to be turned by at touch-down. It shears by so much less than its
 feet are ahead, and on its heels it would be thrown over them.
 """
-SETTLING = 0.3
-"""Of sqrt(H / g): when it begins to crouch."""
 BLEND = 0.3
 """Of sqrt(H / g): the time in which a phase's pose takes over from the last one's."""
 URGENT = 0.5
@@ -63,17 +63,6 @@ URGENT = 0.5
 with more than the usual share of the weights."""
 LEGS = 5.0
 """Weight of the feet of a body on legs in the air: they swing ahead under a trunk that keeps its shape."""
-
-
-class JumpPhase(Enum):
-    """Phases of a jump in their order."""
-
-    SETTLE = "settle"
-    CROUCH = "crouch"
-    THRUST = "thrust"
-    FLIGHT = "flight"
-    LAND = "land"
-    REST = "rest"
 
 
 class Jump:
@@ -143,9 +132,7 @@ class Jump:
     @property
     def expected_time(self) -> float:
         """Seconds until it is at rest."""
-        plan, ahead = self.plan, abs(self.target.distance) / self.body.height
-        landing = USUAL_LANDING + USUAL_LANDING_AHEAD * ahead
-        return plan.crouch_time + plan.thrust_time + plan.flight_time + (SETTLING + landing) * self._time_unit
+        return self.plan.usual_time(abs(self.target.distance) / self.body.height, self._time_unit)
 
     def _planned(self, target: JumpTarget) -> JumpPlan:
         return plan_jump(
@@ -163,10 +150,7 @@ class Jump:
     def take_off_time(self, height: float) -> float:
         """Seconds from the crouch of a jump on the spot, ``height`` metres high, until its thrust ends as planned;
         both take whole steps."""
-        plan = self._planned(JumpTarget(0.0, height))
-        return self._step * float(
-            sum(np.ceil(seconds / self._step - 1e-6) for seconds in (plan.crouch_time, plan.thrust_time))
-        )
+        return self._planned(JumpTarget(0.0, height)).take_off_time(self._step)
 
     @property
     def resting(self) -> bool:
@@ -182,19 +166,7 @@ class Jump:
         touch-down."""
         plan, ground = self.plan, self.ground
         axes = ground.axes @ ground.turn(self.facing.turn) if self.left_ground else ground.axes
-        elapsed = max(elapsed - SETTLING * self._time_unit, 0.0)
-        nothing = np.zeros(3)
-        if elapsed <= plan.crouch_time:
-            return plan.crouch(nothing, elapsed)[0] @ axes
-        elapsed -= plan.crouch_time
-        if elapsed <= plan.thrust_time:
-            return plan.thrust(nothing, elapsed)[0] @ axes
-        position, _ = plan.thrust(nothing, plan.thrust_time)
-        elapsed -= plan.thrust_time
-        if elapsed > plan.flight_time:
-            return np.full(3, np.nan)
-        speed = np.array([plan.speed_forward, 0.0, plan.speed_up])
-        return (position + elapsed * speed - 0.5 * self.gravity * elapsed**2 * np.array([0.0, 0.0, 1.0])) @ axes
+        return plan.way(max(elapsed - SETTLING * self._time_unit, 0.0), self.gravity) @ axes
 
     def reached(self, trajectory: Trajectory, first: int, last: int) -> None:
         """Nothing beside what is measured of all motions."""
@@ -357,8 +329,7 @@ class Jump:
     def _sufficient_speed(self, seen: Measurement, dt: float) -> float:
         """Speed up, m/s, at the end of this step from which free flight reaches the asked height."""
         rise = self._start_com[2] + FULL_RISE * self.target.height - seen.com[2]
-        step_gain = self.gravity * dt  # v dt + (v - g dt/2)^2 / 2g = rise, solved for v
-        return float(max(-0.5 * step_gain + np.sqrt(max(2.0 * self.gravity * rise, 0.0)), 0.0))
+        return sufficient_speed(rise, self.gravity, dt)
 
     def _base_of_landing(self) -> np.ndarray:
         """(2,) where the middle of the feet shall land, in the frame of the start."""

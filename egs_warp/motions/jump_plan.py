@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 
@@ -27,6 +28,29 @@ is reached.
 
 _EXTENSION, _EXTENDED = 0.04, 0.25
 """How much higher than it stands a body leaves the ground: body heights, and of the height of the jump at most."""
+SETTLING = 0.3
+"""Of sqrt(H / g): when it begins to crouch."""
+USUAL_LANDING, USUAL_LANDING_AHEAD = 0.7, 1.0
+"""Of sqrt(H / g): from touch-down until it is at rest, as a rule, and more for each body height ahead (measured on the
+pawn)."""
+RUN_ON = 0.08
+"""Of sqrt(H / g): for how long the feet go on at the body's speed when they touch down, swinging and sliding (measured
+on the pawn)."""
+LANDING = 0.35
+"""Of sqrt(H / g): in which the fall of a body on legs is stopped, while it goes on over its feet (measured on the
+robot, whose feet stay where they touch down).
+"""
+
+
+class JumpPhase(Enum):
+    """Phases of a jump in their order."""
+
+    SETTLE = "settle"
+    CROUCH = "crouch"
+    THRUST = "thrust"
+    FLIGHT = "flight"
+    LAND = "land"
+    REST = "rest"
 
 
 @dataclass(frozen=True)
@@ -85,6 +109,38 @@ class JumpPlan:
         speed, way = ramped(elapsed / self.thrust_time)
         position = start + self._down + self._onset * elapsed + way * self.thrust_time * gained
         return position, self._onset + speed * gained
+
+    def usual_time(self, ahead: float, time_unit: float) -> float:
+        """Seconds until a jump of ``ahead`` body heights is at rest; ``time_unit`` is sqrt(H / g)."""
+        landing = USUAL_LANDING + USUAL_LANDING_AHEAD * ahead
+        return self.crouch_time + self.thrust_time + self.flight_time + (SETTLING + landing) * time_unit
+
+    def take_off_time(self, step: float) -> float:
+        """Seconds from the crouch until the thrust ends; both take whole steps of ``step`` s."""
+        return step * float(sum(np.ceil(seconds / step - 1e-6) for seconds in (self.crouch_time, self.thrust_time)))
+
+    def way(self, elapsed: float, gravity: float) -> np.ndarray:
+        """(3,) metres from where the centre of mass stood, ``elapsed`` seconds after the crouch began; NaN after
+        touch-down."""
+        nothing = np.zeros(3)
+        if elapsed <= self.crouch_time:
+            return self.crouch(nothing, elapsed)[0]
+        elapsed -= self.crouch_time
+        if elapsed <= self.thrust_time:
+            return self.thrust(nothing, elapsed)[0]
+        position, _ = self.thrust(nothing, self.thrust_time)
+        elapsed -= self.thrust_time
+        if elapsed > self.flight_time:
+            return np.full(3, np.nan)
+        speed = np.array([self.speed_forward, 0.0, self.speed_up])
+        return position + elapsed * speed - 0.5 * gravity * elapsed**2 * np.array([0.0, 0.0, 1.0])
+
+
+def sufficient_speed(rise: float, gravity: float, dt: float) -> float:
+    """Speed up, m/s, at the end of a step of ``dt`` s from which free flight rises by ``rise`` metres from where the
+    step began."""
+    step_gain = gravity * dt  # v dt + (v - g dt/2)^2 / 2g = rise, solved for v
+    return float(max(-0.5 * step_gain + np.sqrt(max(2.0 * gravity * rise, 0.0)), 0.0))
 
 
 def ramped(share: float) -> tuple[float, float]:

@@ -37,15 +37,16 @@ class StandReached:
 class Stand:
     """Balances over the feet where they are, as a landed jump does, however long."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, place: Place, *, at_rest: bool = True, crouch: float = 1.0) -> None:
+        """``at_rest``: it begins as the motion before has ended, calm; ``crouch``: of the height of the centre of mass
+        of a body that stands straight, how high it is held."""
         self.body = place.body
         self.pose = PoseFamily(place.body, place.ground, place.standing, place.touching, place.friction)
         self._gravity = float(np.linalg.norm(place.body.gravity))
         self._time_unit = float(np.sqrt(place.body.height / self._gravity))
-        self._height = self.pose.standing_height
+        self._height = crouch * self.pose.standing_height
         self._calm = Calm(place.body)
-        # It begins as the motion before has ended, at rest.
-        self._resting = True
+        self._resting = at_rest
 
     @property
     def resting(self) -> bool:

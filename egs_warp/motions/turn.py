@@ -10,8 +10,8 @@ from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.jump import Jump, JumpPhase
-from egs_warp.motions.jump_plan import JumpPlan, JumpTarget
+from egs_warp.motions.jump import Jump
+from egs_warp.motions.jump_plan import JumpPhase, JumpPlan, JumpTarget
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.twist import AIRBORNE_SHARE, twist
 

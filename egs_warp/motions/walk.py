@@ -6,8 +6,6 @@ See docs/concepts/motions.md.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -36,6 +34,7 @@ from egs_warp.motions.gait import Gait, smooth
 from egs_warp.motions.pendulum import PendulumPlan, drift, nearest_in_hull
 from egs_warp.motions.route import Pace, Route
 from egs_warp.motions.sequence import Place
+from egs_warp.motions.walk_plan import WalkControl, WalkPhase, WalkPlan
 from egs_warp.motions.way import check_way
 
 LOADED = 0.01
@@ -46,58 +45,6 @@ _SHIFT, _GATHER, _REST = 1.5, 3.0, 1.0
 """Of sqrt(H / g): how long the first and the last phase take, and how long the body stands then."""
 _PLAN_STEP, _PLANNED = 1.0 / 12.0, 8
 """Of sqrt(H / g), and phases: the steps of a plan, and how far it looks ahead."""
-
-
-class WalkPhase(Enum):
-    """Phases of a walk; swing and stand alternate."""
-
-    SHIFT = "shift"
-    """The body leans to where it can lift its first feet."""
-    SWING = "swing"
-    STAND = "stand"
-    GATHER = "gather"
-    """Back to the pose it stood in."""
-    REST = "rest"
-
-
-@dataclass(frozen=True)
-class WalkPlan:
-    """Numbers of a walk; metres, seconds."""
-
-    paces: float
-    pace_length: float
-    """The longest."""
-    swing_time: float
-    double_time: float
-    lift: float
-    stride: float
-    """Longest way between two footprints of one foot."""
-
-
-@dataclass(frozen=True)
-class WalkControl:
-    """Weights of the objectives (speeds are compared in sqrt(g H)) and gains of the feedback."""
-
-    com: float = 600.0
-    spin: float = 600.0
-    pose: float = 1.0
-    swing: float = 40.0
-    unload: float = 100.0
-    """Of what contact points of a foot carry that is lifted."""
-    balance: float = 3.0
-    """How far the centre of pressure goes for each metre that the divergent part of the motion is off."""
-    turn_rate: float = 4.0
-    """Of the body's tilt, in sqrt(g / H)."""
-    follow: float = 12.0
-    """Of the pose, in sqrt(g / H)."""
-    foot_share: float = 0.3
-    """Of a swinging foot's error that is removed in one step."""
-    margin: float = 0.8
-    """Part of each sole over which the centre of pressure may move."""
-    planned_margin: float = 0.6
-    """Part of each sole over which it is planned to be."""
-    sidestep: float = 5.5
-    """Rate, in sqrt(g / H), at which a swinging foot's goal goes to where it would catch the body."""
 
 
 class Walk:

@@ -42,6 +42,9 @@ def test_a_body_that_is_pushed_is_judged_by_its_soles(script: Any) -> None:
     found = gaits.summary(rows, whole=True)
     assert found["aims"]["pushes"] is True and "pushes" not in found["why_null"]
     assert gaits.summary([*rows, rows[0] | {"success": False}], whole=True)["aims"]["pushes"] is False
-    assert gaits.summary(rows[:3], whole=True)["why_null"]["pushes"] == "not all cells of 14 bodies were run"
+    told = gaits.summary(rows[:3], whole=True)["why_null"]["pushes"]
+    assert told == "not all cells of 14 bodies, or of the unseen ones, were run"
+    unseen = [rows[0] | {"body": name} for name in gaits.UNSEEN]
+    assert gaits.summary(unseen, whole=True)["aims"]["pushes"] is True
     others = [row | {"cell": "walk"} for row in rows]
     assert gaits.summary(others, whole=True)["why_null"]["pushes"] == "no such cells were run"

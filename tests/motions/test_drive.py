@@ -17,7 +17,7 @@ from egs_warp.motions.command import Drive, DrivePlan, read_drive
 from egs_warp.motions.drive import Driven, DrivenBy, DrivenWalk, onward
 from egs_warp.motions.route import Pace
 from egs_warp.motions.stand import Stand
-from egs_warp.motions.walk import WalkPhase
+from egs_warp.motions.walk_plan import WalkPhase
 from tests.support.creatures import CoarseCreature, coarse_creature
 from tests.support.meshes import ball_mesh, coarse_stool, worm_mesh
 from tests.support.places import DT, FORWARD

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from egs_warp.fem.body import BodyState
-from egs_warp.motions.jump import Jump, JumpPhase
-from egs_warp.motions.jump_plan import JumpTarget
+from egs_warp.motions.jump import Jump
+from egs_warp.motions.jump_plan import JumpPhase, JumpTarget
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.turn import Turn, largest_turn
 from egs_warp.motions.twist import twist

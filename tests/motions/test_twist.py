@@ -9,8 +9,8 @@ import pytest
 
 from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import Objective, SpinObjective
-from egs_warp.motions.jump import Jump, JumpPhase
-from egs_warp.motions.jump_plan import JumpTarget
+from egs_warp.motions.jump import Jump
+from egs_warp.motions.jump_plan import JumpPhase, JumpTarget
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.twist import SLIDE, twist
 from tests.support.meshes import box_mesh

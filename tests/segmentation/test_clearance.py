@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
+from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.clearance import (
@@ -23,6 +24,7 @@ from egs_warp.segmentation.clearance import (
     reach_across,
     views_above,
 )
+from tests.support.scenes import FLOOR, round_ones, shell
 
 PLANE = Plane.from_coefficients(0.3, -0.5, 0.8, 0.1)
 
@@ -166,6 +168,20 @@ def test_cameras_about_the_foot_look_at_it_from_low_down() -> None:
         seen = (foot - camera.centre) @ camera.rotation.T
         aside = camera.fx * seen[:, 0] / seen[:, 2] / (0.5 * camera.width)
         assert abs(aside.max() + aside.min()) < 0.05 and 0.6 < aside.max() < 1.0
+
+
+@pytest.mark.parametrize("above", [True, False])
+def test_a_camera_under_the_plane_says_nothing_of_what_it_sees_through_it(above: bool) -> None:
+    """Of a ball over the floor pixels count from above; from below those alone that show nothing."""
+    pytest.importorskip("torch")
+    ball = round_ones(shell() + [0.0, 0.0, 0.2], 0.04)
+    eye = np.array([2.0, 0.0, 2.0 if above else -2.0])
+    camera = Camera.look_at(eye, np.array([0.0, 0.0, 0.7]), np.array([0.0, 0.0, 1.0]), width=48, height=48)
+    (view,) = views_above(ball, FLOOR, [camera])
+    assert view.alpha is not None and view.weight is not None
+    shown = view.alpha > 0.0
+    assert 0.1 < shown.mean() < 0.9
+    assert (view.weight[shown] == float(above)).all() and (view.weight[~shown] == 1.0).all()
 
 
 def test_flat_splats_survive_the_cut() -> None:

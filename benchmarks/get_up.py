@@ -1,0 +1,122 @@
+"""Getting up: bodies laid over by 80, 90 and 95 degrees on two sides, and left to get up by themselves.
+
+python benchmarks/get_up.py [--quick] [--workers 2] [--nodes 150] [--bodies NAME ...] [--json PATH]
+
+A body lies with nothing moving, just over the ground, and is told to get up. It has if it stands at rest within 15
+degrees of upright. Work is what muscles give, in m g H, in all of its tries; time is from lying down, in sqrt(H/g).
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from bodies import body
+from egs_warp.errors import UserError
+from egs_warp.fem.body import BodyState
+from egs_warp.locomotion.audit import audit
+from egs_warp.locomotion.ledger import ledger
+from egs_warp.locomotion.rollout import roll_out
+from egs_warp.motions.get_up import GetUp, lie_down
+from egs_warp.pipelines.creature import first_place
+from gaits import creature_of
+from harness import Row, Table, flags, record, report, timed
+from modelled import MODELLED, UNSEEN, modelled
+from sweep import bounds_broken
+
+BODIES = ("pawn", "bottle", "biped", "box", "stool")
+DEGREES = (80.0, 90.0, 95.0)
+SIDES = {"front": 1, "side": 0}
+"""Axis of the ground about which it is laid over: its left, its front."""
+LONGEST = 60.0
+"""sqrt(H / g)."""
+CALM_WORK = 10.0
+"""m g H."""
+
+
+def run(name: str, degrees: float, side: str, nodes: int) -> Row:
+    """Lay one body over and see whether it gets up."""
+    wp.config.log_level = wp.LOG_WARNING
+    told, milliseconds = timed(_run, name, degrees, side, nodes)
+    return {"body": name, "degrees": degrees, "side": side, **told, "seconds": 1e-3 * milliseconds}
+
+
+def _run(name: str, degrees: float, side: str, nodes: int) -> Row:
+    one = modelled(name) if name in MODELLED or name in UNSEEN else body(name)
+    creature = creature_of(one, nodes)
+    place = first_place(creature)
+    laid = lie_down(place, degrees, place.ground.axes[SIDES[side]])
+    motion = GetUp(place)
+    unit = creature.body.time_unit
+    try:
+        simulation = roll_out(
+            creature.stepper,
+            creature.geometry,
+            BodyState(laid, np.zeros_like(laid)),
+            motion,
+            frames=round(60.0 * LONGEST * unit),
+            place=creature.frame,
+            finished=lambda: motion.resting,
+        )
+    except (UserError, ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
+        return {"up": False, "tries": motion.tries, "reason": f"stopped: {error}"}
+    trajectory = simulation.trajectory
+    books = ledger(trajectory)
+    checked = asdict(audit(trajectory, newton_unconverged=sum(not r.converged for r in simulation.reports)))
+    up = motion.up and motion.resting
+    return {
+        "up": up,
+        "tries": motion.tries,
+        "work": float(books.muscle_work.sum() / books.unit),
+        "time": float(trajectory.time[-1]) / unit,
+        "reason": None if up else "; ".join(motion.notes()) or f"not within {LONGEST:g} sqrt(H/g)",
+        "audit": bounds_broken(checked),
+    }
+
+
+def summary(rows: list[Row]) -> dict[str, Any]:
+    """The aims, of the rows so far."""
+    works = [row["work"] for row in rows if row["up"]]
+    enough = {row["body"] for row in rows} >= set(BODIES)
+    aims = {
+        "all_get_up": all(row["up"] for row in rows) if enough else None,
+        "calm": (float(np.median(works)) <= CALM_WORK if works else False) if enough else None,
+        "audit": all(row.get("audit") is None for row in rows),
+    }
+    return {"aims": aims, "why_null": {name: "not all bodies were run" for name, aim in aims.items() if aim is None}}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the cells."""
+    parser = flags(__doc__, quick="three bodies, laid over by 90 degrees", device="cpu")
+    parser.add_argument("--workers", type=int, default=os.cpu_count())
+    parser.add_argument("--nodes", type=int, default=150, help="of the cages, about")
+    parser.add_argument("--bodies", nargs="*", help="only these")
+    parser.add_argument("--degrees", nargs="*", type=float, help="only these")
+    options = parser.parse_args(arguments)
+    chosen = options.bodies or (BODIES[:3] if options.quick else BODIES)
+    angles = options.degrees or ((90.0,) if options.quick else DEGREES)
+    cells = [(name, degrees, side) for name in chosen for degrees in angles for side in SIDES]
+    os.environ["OMP_NUM_THREADS"] = "1"
+    rows: list[Row] = []
+    table = Table(body="<10", degrees=".0f", side="<5", tries="d", work=".1f", time=".1f", seconds=".0f", outcome="<7")
+    with ProcessPoolExecutor(options.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        for future in as_completed([pool.submit(run, *cell, options.nodes) for cell in cells]):
+            rows.append(row := future.result())
+            told = row["reason"] or row["audit"] or "up"
+            figures = [row.get(key) for key in ("work", "time", "seconds")]
+            table.row(row["body"], row["degrees"], row["side"], row["tries"], *figures, told)
+            record(options, rows, **summary(rows))
+    print(f"{sum(row['up'] for row in rows)} of {len(rows)} get up")
+    report(options, rows, **summary(rows))
+
+
+if __name__ == "__main__":
+    main()
