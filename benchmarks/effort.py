@@ -13,10 +13,7 @@ every body: ``work`` (at most 1.5), ``internal_energy`` (kinetic energy of defor
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,7 +28,7 @@ from egs_warp.locomotion.trajectory import Trajectory, measure
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.performance import simulate
-from harness import Row, Table, data_folder, flags, record, report, timed
+from harness import Row, Table, data_folder, flags, record, report, rows_of, timed, workers_flag
 from sweep import CAPTURES
 
 if TYPE_CHECKING:
@@ -109,7 +106,7 @@ def _run(body: str, name: str, *, device: str, seed: int, frames: int | None) ->
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run all bodies and motions."""
     parser = flags(__doc__, quick="the pawn's jump", device="cpu", seed="of the Gaussians of the built-in bodies")
-    parser.add_argument("--workers", type=int, default=os.cpu_count())
+    workers_flag(parser)
     parser.add_argument("--join", type=Path, help="JSON of an earlier run of the same code: its rows are not run again")
     options = parser.parse_args(arguments)
     rows: list[Row] = json.loads(options.join.read_text())["rows"] if options.join else []
@@ -118,20 +115,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     one = partial(run, device=options.device, seed=options.seed)
     # Kernels compile once, here, not in every worker.
     one("pawn", "jump", frames=4)
-    # Workers share the cores between them.
-    os.environ["OMP_NUM_THREADS"] = "1"
     table = Table(
         **{"body": "<8", "motion": "<14", "work": ".2f", "elastic": ".2f", "deformation": ".3f", "reversed": ".1%"},
         **{"largest": ".2f", "residual": ".0e", "seconds": ".0f", "stopped": "<8"},
     )
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(options.workers, mp_context=context) as pool:
-        pending = [pool.submit(one, *case) for case in chosen if case not in known]
-        for future in as_completed(pending):
-            rows.append(row := future.result())
-            figures = ("work", "peak_elastic", "peak_deformation", "reversed", "largest_reversal", "energy_residual")
-            table.row(row["body"], row["motion"], *map(row.get, figures), row["seconds"], row["stopped"] or "")
-            record(options, **summary(rows))
+    for row in rows_of(one, [case for case in chosen if case not in known], options.workers):
+        rows.append(row)
+        figures = ("work", "peak_elastic", "peak_deformation", "reversed", "largest_reversal", "energy_residual")
+        table.row(row["body"], row["motion"], *map(row.get, figures), row["seconds"], row["stopped"] or "")
+        record(options, **summary(rows))
     report(options, **summary(rows), draw=lambda figure: draw(figure, rows), size=(8.0, 7.0))
 
 

@@ -17,10 +17,7 @@ were made.
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -38,7 +35,7 @@ from egs_warp.motions.push import read_pushes
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import Creature, make_creature
 from egs_warp.pipelines.performance import Performance, simulate
-from harness import Row, Table, flags, record, report, timed
+from harness import Row, Table, flags, record, report, rows_of, timed, workers_flag
 from modelled import MODELLED, UNSEEN, modelled
 from sweep import bounds_broken, judge
 
@@ -171,7 +168,7 @@ def _swept(reached: dict[str, Any]) -> str | None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the cells."""
     parser = flags(__doc__, quick="three bodies, short ways", device="cpu")
-    parser.add_argument("--workers", type=int, default=os.cpu_count())
+    workers_flag(parser)
     parser.add_argument("--nodes", type=int, default=500, help="of the cages, about")
     parser.add_argument("--bodies", nargs="*", help="only these")
     parser.add_argument("--unseen", action="store_true", help="the five bodies that were made last, and only these")
@@ -184,15 +181,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     chosen = options.bodies or (list(UNSEEN) if options.unseen else usual)
     cells = [(name, cell, text) for cell, text in told.items() for name in chosen if cell in (options.cells or told)]
     known = {(row["body"], row["cell"], row["told"]) for row in rows}
-    os.environ["OMP_NUM_THREADS"] = "1"
     table = Table(body="<10", cell="<8", seconds=".0f", time=".0f", slip=".1%", cost=".1f", outcome="<7")
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(options.workers, mp_context=context) as pool:
-        for future in as_completed([pool.submit(run, *cell, options.nodes) for cell in cells if cell not in known]):
-            rows.append(row := future.result())
-            figures = [row.get(key) for key in ("time", "slip", "cost_of_transport")]
-            table.row(row["body"], row["cell"], row["seconds"], *figures, row["reason"] or "success")
-            record(options, rows, **summary(rows, whole=not options.quick))
+    for row in rows_of(run, [(*cell, options.nodes) for cell in cells if cell not in known], options.workers):
+        rows.append(row)
+        figures = [row.get(key) for key in ("time", "slip", "cost_of_transport")]
+        table.row(row["body"], row["cell"], row["seconds"], *figures, row["reason"] or "success")
+        record(options, rows, **summary(rows, whole=not options.quick))
     good = sum(row["success"] for row in rows)
     print(f"{good} of {len(rows)} cells succeed")
     report(options, rows, **summary(rows, whole=not options.quick))

@@ -13,7 +13,8 @@ import json
 import os
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
@@ -22,6 +23,8 @@ import warp as wp
 
 from egs_warp.io.video import write_png
 from egs_warp.launching import available_threads
+from egs_warp.pipelines.crew import Tell
+from egs_warp.pipelines.many import farmed
 from egs_warp.pipelines.report import MECHANICS, versions
 
 if TYPE_CHECKING:
@@ -50,6 +53,37 @@ def flags(
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--plot", type=Path, help=plot or "file for the picture")
     return parser
+
+
+def workers_flag(parser: argparse.ArgumentParser) -> None:
+    """``--workers``: what ``rows_of`` takes."""
+    parser.add_argument(
+        "--workers",
+        type=lambda text: int(text) if text.isdecimal() else text,
+        help="processes, as many as there are cores unless told; ray, or the address of a Ray cluster",
+    )
+
+
+def rows_of(run: Callable[..., Row], tasks: Sequence[tuple[Any, ...]], workers: int | str | None) -> Iterator[Row]:
+    """What ``run`` makes of the arguments in each of ``tasks``, as soon as it is known. One whose process dies is done
+    again. Raises ``RuntimeError`` for those that failed, after all others.
+    """
+    failed = []
+    for ended in farmed(_Run(run), tasks, workers=workers):
+        if ended.error is None:
+            yield ended.value
+        else:
+            failed.append(f"{tasks[ended.number]}: {ended.error}")
+    if failed:
+        raise RuntimeError("; ".join(failed))
+
+
+@dataclass(frozen=True)
+class _Run:
+    run: Callable[..., Row]
+
+    def __call__(self, task: tuple[Any, ...], tell: Tell) -> Row:
+        return self.run(*task)
 
 
 def data_folder() -> Path:

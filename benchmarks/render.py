@@ -2,8 +2,9 @@
 
 Aims: ``cuda_beats_gswarp`` (faster in every cell), ``cuda_within_1_3_of_gsplat`` (geometric mean of all cells),
 ``ahead_of_gsplat_every_cell`` (packed or not, whichever is faster), ``same_picture`` (mean difference below 1e-5, and
-below 1e-3 off the alpha-cut boundaries), ``same_in_every_mode`` (likewise antialiased, the depth over its mean, three
-cameras with a background each), ``cpu_vs_twin`` (20 times a tile-batched PyTorch rasteriser with the same culling),
+below 1e-3 off the alpha-cut boundaries), ``same_in_every_mode`` (likewise antialiased, the depth over its mean, tiles
+left out, three cameras with a background each), ``cpu_vs_twin`` (20 times a tile-batched PyTorch rasteriser with the
+same culling),
 ``cpu_two_threads`` (1.7 times one thread).
 
 No peer that claims a CPU runs on one: ``render_peers.cpu_peers`` tries and says why.

@@ -28,7 +28,8 @@ def difference(ours: torch.Tensor, other: torch.Tensor) -> dict[str, float]:
 
 
 def mode_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
-    """Antialiased pictures, mean depth, and three cameras with a background each, with the time of the last."""
+    """Antialiased pictures, mean depth, tiles left out, three cameras with a background each, and the time of these."""
+    from gsplat import rasterize_to_pixels  # type: ignore[import-not-found]
     from gsplat.rendering import rasterization  # type: ignore[import-not-found]
 
     plain = peers.garden_scene(points, grid=1, seed=seed, device="cuda")
@@ -45,10 +46,24 @@ def mode_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
             picture, alpha, _ = rasterization(*values, poses[which], intrinsics[which], _WIDTH, _HEIGHT, **options)
         return picture, alpha
 
+    def their_masked(mask: np.ndarray) -> torch.Tensor:
+        """gsplat offers masks a step below its face."""
+        with torch.no_grad():
+            made = rasterization(*values, poses[:1], intrinsics[:1], _WIDTH, _HEIGHT, packed=False)[2]
+            picture, _ = rasterize_to_pixels(
+                *(made["means2d"], made["conics"], scene.colours[None].contiguous(), made["opacities"]),
+                *(_WIDTH, _HEIGHT, made["tile_size"], made["isect_offsets"], made["flatten_ids"]),
+                backgrounds=colours[:1],
+                masks=torch.as_tensor(mask, device="cuda")[None],
+            )
+        return picture[0]
+
     one, every = slice(0, 1), slice(0, 3)
     sharp = wp.to_torch(render_gaussians(cloud, cameras[0], background=(0, 0, 0), antialiased=True).colour)
     depth = wp.to_torch(render_gaussians(cloud, cameras[0]).depth)
     their_depth, alpha = theirs(one, render_mode="ED")
+    mask = np.random.default_rng(seed).random((-(-_HEIGHT // 16), -(-_WIDTH // 16))) < 0.5
+    masked = wp.to_torch(render_gaussians(cloud, cameras[0], background=_BACKGROUNDS[0], mask=mask).colour)
     seen = alpha[0, :, :, 0] > _SEEN
     unit = float(depth[seen].mean())
     # Packed, gsplat takes no more than one background.
@@ -65,6 +80,7 @@ def mode_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
         "difference": {
             "antialiased": difference(sharp, theirs(one, rasterize_mode="antialiased")[0][0]),
             "depth": difference(depth[seen] / unit, their_depth[0, :, :, 0][seen] / unit),
+            "mask": difference(masked, their_masked(mask)),
             "three cameras": difference(torch.stack(ours_of_three()), their_three),
         },
         "three_cameras": median_ms(

@@ -39,7 +39,7 @@ from egs_warp.pipelines.locate_plane import locate_plane, on_its_ground
 from egs_warp.pipelines.performance import simulate
 from egs_warp.pipelines.pictures import picture_cameras, plane_picture, segmentation_picture
 from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, set_down, take_apart, viewing_direction
-from egs_warp.pipelines.report import report_of_run
+from egs_warp.pipelines.report import GaussianCounts, report_of_run
 from egs_warp.pipelines.train_capture import train
 from egs_warp.segmentation.object_spec import ObjectSpec
 from egs_warp.training.finetune import TrainingView
@@ -123,7 +123,7 @@ def film(
         report = report_of_run(
             *(creature, simulation.trajectory, simulation.reports, simulation.frames),
             *(performance.sequence.done, ledger(performance.trajectory)),
-            drawn=made.splats.count,
+            gaussians=GaussianCounts.of(creature, made.splats.count),
             drawing=made.milliseconds,
             source=name,
             notes=(*scene.notes, *performance.cut_short(), *left),

@@ -12,11 +12,8 @@ part where they are found (``EGS_WARP_DATA``, else ../shared/data).
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
 from collections import Counter
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import product
@@ -36,7 +33,7 @@ from egs_warp.locomotion.trajectory import Trajectory, measure
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import first_place, make_creature, stand
 from egs_warp.pipelines.performance import simulate
-from harness import Row, Table, data_folder, flags, record, report, timed
+from harness import Row, Table, data_folder, flags, record, report, rows_of, timed, workers_flag
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -211,7 +208,7 @@ def friction_spent(trajectory: Trajectory) -> float:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the sweep."""
     parser = flags(__doc__, quick="three runs", device="cpu", seed="of the Gaussians of the built-in bodies")
-    parser.add_argument("--workers", type=int, default=os.cpu_count())
+    workers_flag(parser)
     parser.add_argument("--join", type=Path, help="JSON of an earlier run of the same code: its rows are not run again")
     options = parser.parse_args(arguments)
     rows = json.loads(options.join.read_text())["rows"] if options.join else []
@@ -220,20 +217,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # Kernels compile once, here, not in every worker.
     one = partial(run, device=options.device, seed=options.seed)
     one(Case("pawn", "jump", 0.6, 0.05, 1 / 60), frames=4)
-    # Workers share the cores between them.
-    os.environ["OMP_NUM_THREADS"] = "1"
-    context = multiprocessing.get_context("spawn")
     print(f"{len(runs) + len(known)} runs, {len(known)} of them known")
     table = Table(
         **{"run": "d", "body": "<8", "motion": "<16", "friction": "g", "sag": "g", "slope": "g", "height": "g"},
         **{"step_rate": ".0f", "seconds": ".0f", "outcome": "<7"},
     )
-    with ProcessPoolExecutor(options.workers, mp_context=context) as pool:
-        for future in as_completed([pool.submit(one, case) for case in runs]):
-            rows.append(row := future.result())
-            case = [row[name] for name in ("body", "motion", "friction", "sag", "slope", "height")]
-            table.row(len(rows), *case, 1 / row["step"], row["seconds"], row["reason"] or "success")
-            record(options, **summary(rows))
+    for row in rows_of(one, [(case,) for case in runs], options.workers):
+        rows.append(row)
+        case = [row[name] for name in ("body", "motion", "friction", "sag", "slope", "height")]
+        table.row(len(rows), *case, 1 / row["step"], row["seconds"], row["reason"] or "success")
+        record(options, **summary(rows))
     result = summary(rows)
     print_summary(result)
     report(options, **result, draw=lambda figure: draw(figure, rows), size=(7.0, 4.0))

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import warp as wp
 
-from egs_warp.launching import empty_together, launch_again, launch_rows, with_room
+from egs_warp.launching import (
+    THREADS,
+    available_threads,
+    beside,
+    empty_together,
+    launch_again,
+    launch_rows,
+    with_room,
+)
 
 
 @wp.kernel
@@ -122,3 +131,22 @@ def test_sizes_with_room_are_few_and_not_much_larger() -> None:
     sizes = [with_room(count) for count in range(1, 100_000)]
     assert all(count <= size <= max(1.25 * count, count + 1) for count, size in enumerate(sizes, 1))
     assert len(set(sizes)) < 100
+
+
+@pytest.mark.parametrize(("told", "most"), [("1", 1), ("0", 1), ("100000", None), ("", None), ("two", None)])
+def test_the_environment_may_ask_for_fewer_threads(
+    told: str, most: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Never for more than there are, and none is one."""
+    monkeypatch.delenv(THREADS, raising=False)
+    there = available_threads()
+    monkeypatch.setenv(THREADS, told)
+    assert available_threads() == (most or there)
+
+
+@pytest.mark.parametrize("told", ["1", ""])
+def test_beside_on_one_thread_is_one_after_the_other(told: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(THREADS, told)
+    used = beside(threading.get_ident, lambda: (threading.get_ident(), 7))
+    assert used[0] == threading.get_ident() and used[1][1] == 7
+    assert told == "" or used[1][0] == used[0]

@@ -93,6 +93,8 @@ def read_scene(chosen: argparse.Namespace) -> SceneInput:
     capture = read_capture(chosen.capture, device=chosen.device)
     posed = read_cameras(chosen.cameras) if chosen.cameras else []
     spec = None
+    if chosen.object is None and chosen.mask_model is not None:
+        raise UserError("--mask-model: it makes masks from clicks; give --object +u,v@photo")
     if chosen.object is not None:
         spec = read_object(chosen.object, capture.cloud, posed, view=chosen.view, mask_model=chosen.mask_model)
     if up is None and capture.up is not None:

@@ -198,10 +198,12 @@ class Processes:
     def _listen(self, worker: int, running: _Running) -> None:
         process = running.process
         assert process.stdout is not None, "it was asked for"
-        with contextlib.suppress(EOFError, OSError, ValueError, pickle.UnpicklingError), process.stdout:
+        # Its end, in the midst of a message or not; a message that cannot be read is no better.
+        with contextlib.suppress(Exception), process.stdout:
             while True:
                 kind, value = pickle.load(process.stdout)
                 self._events.put((process.pid, Event(worker, kind, value)))
+        process.kill()
         status = process.wait()
         how = f"it ended by signal {-status}" if status < 0 else f"it ended with status {status}"
         self._events.put((process.pid, Event(worker, "lost", how)))

@@ -28,6 +28,10 @@ _PLANE_ELEVATIONS = (40.0, 58.0, 75.0)
 """Degrees: seen at a grazing angle, splats in front hide those behind, and the floor seems to lie higher."""
 _CLEAR_SUPPORT = 0.1
 """Share of the visible surface: a plane as wide as this is no accident."""
+_TILT_DEGREES, _HELD_DEGREES = 25.0, 10.0
+"""What is level may be so far off an up that was guessed, or told by an axis; and off one that many cameras tell: a
+white desk that no photo could be matched on is a haze through which planes of any tilt can be laid.
+"""
 _LEVEL_DEGREES = 5.0
 _TOP = 0.995
 """Quantile of the Gaussians' heights that is the object's."""
@@ -87,10 +91,11 @@ def locate_plane(
     if plane is not None:
         found = segment(cloud, plane, spec)
         return LocatedPlane(plane, None, _middle(cloud, found), found.size, found, ())
+    tilt = _TILT_DEGREES
     if up is None:
-        up, reason = _up_of(cloud, cameras)
+        up, reason, tilt = _up_of(cloud, cameras)
         notes.append(f"up is taken to be {','.join(f'{x:.2f}' for x in up)} ({reason}); if not, say which way is up")
-    coarse, found = _standing(cloud, spec, up)
+    coarse, found = _standing(cloud, spec, up, tilt)
     centre = _middle(cloud, found)
     radius = 0.75 * found.size
     if cameras:
@@ -100,6 +105,8 @@ def locate_plane(
         views = ring_cameras(coarse, level, radius, count=9, elevations=_PLANE_ELEVATIONS, size=_PLANE_SIDE)
     fit = refine_plane(cloud, coarse, views, centre=centre, radius=radius, object_mask=~found.background_mask)
     found = segment(cloud, fit.plane, spec, hover=_HOVERING)
+    if tilt == _HELD_DEGREES:
+        notes += _leaning(fit.plane, up)
     notes += _hovering(cloud, fit.plane, found)
     notes.append(
         f"plane {','.join(f'{x:.4f}' for x in (*fit.plane.normal, fit.plane.offset))}: fits {fit.pixel_count} pixels "
@@ -143,6 +150,14 @@ def on_its_ground(
     )
 
 
+def _leaning(plane: Plane, up: np.ndarray) -> tuple[str, ...]:
+    """What there is to say of a plane that is not level by the cameras."""
+    degrees = float(np.degrees(np.arccos(np.clip(plane.normal @ up / np.linalg.norm(up), -1.0, 1.0))))
+    if degrees <= _LEVEL_DEGREES:
+        return ()
+    return (f"the plane leans by {degrees:.0f} degrees if the cameras were held upright; look at plane.png",)
+
+
 def _hovering(cloud: GaussianCloud, plane: Plane, found: Segmentation) -> tuple[str, ...]:
     """What there is to say of an object that hangs in the air."""
     lowest = float(np.quantile(plane.heights(cloud.means.numpy()[found.object_mask]), 0.002))
@@ -158,7 +173,8 @@ def _middle(cloud: GaussianCloud, found: Segmentation) -> np.ndarray:
     return 0.5 * (np.quantile(means, 0.01, axis=0) + np.quantile(means, 0.99, axis=0))
 
 
-def _up_of(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray, str]:
+def _up_of(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray, str, float]:
+    """(3,) up, why, and by how many degrees what is level may be off it."""
     if len(cameras) >= 3:
         # Photographers hold cameras upright: the directions to the right span the level plane.
         rights = np.stack([camera.rotation[0] for camera in cameras])
@@ -166,15 +182,15 @@ def _up_of(cloud: GaussianCloud, cameras: Sequence[Camera]) -> tuple[np.ndarray,
         ups = -np.stack([camera.rotation[1] for camera in cameras]).mean(axis=0)
         if values[0] < 0.1 * values[1]:
             axis = vectors[:, 0]
-            return axis * (1.0 if axis @ ups > 0 else -1.0), "the cameras are held upright"
-    return guess_up(cloud)
+            return axis * (1.0 if axis @ ups > 0 else -1.0), "the cameras are held upright", _HELD_DEGREES
+    return *guess_up(cloud), _TILT_DEGREES
 
 
-def _standing(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray) -> tuple[Plane, Segmentation]:
+def _standing(cloud: GaussianCloud, spec: ObjectSpec, up: np.ndarray, tilt: float) -> tuple[Plane, Segmentation]:
     """A coarse plane, and the object on it: that of the capture's wide planes that is under the object, or a higher one
     that only its surroundings show (a table top).
     """
-    everywhere = find_planes(cloud, up)
+    everywhere = find_planes(cloud, up, tilt_degrees=tilt)
     found, wide, failure = None, None, None
     try:
         wide = _coarse_plane(cloud, spec, up, everywhere)

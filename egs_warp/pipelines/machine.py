@@ -26,6 +26,7 @@ OPTIONAL = {
     "torch": ("training, fine-tuning where it straddles the ground", "egs-warp[torch]"),
     "pycolmap": ("egs-warp pose", "egs-warp[pose]"),
     "usd-core": ("exports to USD", "egs-warp[usd]"),
+    "ray": ("runs over the hosts of a cluster", "egs-warp[ray]"),
 }
 """What each package that may be missing is for, and what installs it."""
 _ENCODERS = {"libx264": "mp4", "prores_ks": "ProRes 4444", "libvpx-vp9": "WebM with alpha"}

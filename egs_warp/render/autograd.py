@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 
@@ -18,7 +19,7 @@ from egs_warp.launching import available_threads
 from egs_warp.render.backward import backward
 from egs_warp.render.compositing import RenderedImage, list_and_composite
 from egs_warp.render.projection import ProjectedGaussians, project, view_from_camera
-from egs_warp.render.rasteriser import background_of, refusing_what_does_not_fit
+from egs_warp.render.rasteriser import background_of, drawn_tiles, refusing_what_does_not_fit
 from egs_warp.render.tiles import TileLists
 
 _ATTRIBUTES = ("means", "rotations", "log_scales", "opacity_logits", "sh")
@@ -56,6 +57,7 @@ def render_torch(
     screen: torch.Tensor | None = None,
     background: Any = (1.0, 1.0, 1.0),
     antialiased: bool = False,
+    mask: np.ndarray | None = None,
     threads: int | None = None,
 ) -> TorchImage:
     """Picture of Gaussians given as float32 tensors (n, 3), (n, 4), (n, 3), (n,), (n, K, 3), all on one device.
@@ -63,7 +65,8 @@ def render_torch(
     Gradients flow to all five, and to the camera's pose where ``rotation`` (3, 3) and ``translation`` (3,) are given
     (they then replace the camera's; the gradient by ``rotation`` is by its nine entries, taken as free). ``screen``
     (n, 2), any values, receives the gradient by the screen positions in pixels, which densification by splitting
-    watches. On CUDA the work is queued on torch's current stream. Raises ``UserError`` as ``render_gaussians`` does.
+    watches. ``mask`` is that of ``render_gaussians``; no gradient comes from tiles that it leaves out. On CUDA the work
+    is queued on torch's current stream. Raises ``UserError`` as ``render_gaussians`` does.
     """
     attributes = (means, rotations, log_scales, opacity_logits, sh)
     _refuse_misfits(*attributes)
@@ -71,7 +74,7 @@ def render_torch(
         raise UserError("render: give the pose's rotation and translation together, or neither")
     # A GPU does not ask for threads, and to count them is a call of the system.
     threads = 1 if means.is_cuda else threads or available_threads()
-    task = _Task(camera, background, antialiased, threads)
+    task = _Task(camera, background, antialiased, mask, threads)
     given = (*attributes, rotation, translation, screen)
     # What records nothing needs none of autograd's ways.
     if torch.is_grad_enabled() and any(tensor is not None and tensor.requires_grad for tensor in given):
@@ -102,6 +105,7 @@ class _Task:
     camera: Camera
     background: Any
     antialiased: bool
+    mask: np.ndarray | None
     threads: int
     slot_end: wp.array | None = None
 
@@ -197,7 +201,10 @@ def _draw(
                 *(_array_at(t.data_ptr(), d, shape, alias) for t, d in zip(picture, _PIXEL_TYPES, strict=True))
             )
             behind = background_of(task.background, camera, cloud.device)
-            lists, image = list_and_composite(projected, view, background=behind, threads=threads, onto=onto)
+            drawn = drawn_tiles(task.mask, camera, cloud.device)
+            lists, image = list_and_composite(
+                projected, view, background=behind, threads=threads, onto=onto, drawn=drawn
+            )
     # The picture's own tensors will hold this.
     owners = (*tensors, *(tensor.detach() for tensor in picture))
     return picture, _Forward(owners, cloud, view, projected, lists, image)

@@ -63,7 +63,8 @@ def backward(
     device, count = cloud.device, cloud.count
     (moments,) = empty_together(device, ((with_room(projected.slot_count), 3), wp.vec4))
     walked = [
-        *(view.width, view.height, lists.tile_start, lists.gaussian_from_intersection, lists.slot_from_intersection),
+        *(view.width, view.height, lists.tile_start, lists.drawn),
+        *(lists.gaussian_from_intersection, lists.slot_from_intersection),
         *(projected.ellipse, projected.falloff, projected.colour_depth),
     ]
     pixels = [image.colour, image.alpha, image.depth, colour_gradient, alpha_gradient, depth_gradient]

@@ -56,15 +56,16 @@ def list_and_composite(
     background: Background,
     threads: int,
     onto: RenderedImage | None = None,
+    drawn: wp.array | None = None,
 ) -> tuple[TileLists, RenderedImage]:
     """The tile lists and the picture, as ``composite`` makes it.
 
     The number of pairs is looked at when all is queued: a GPU that waited for it would stand still meanwhile.
     """
-    lists = build_tile_lists(projected, view, threads=threads, guess=True)
+    lists = replace(build_tile_lists(projected, view, threads=threads, guess=True), drawn=drawn)
     image = composite(projected, lists, view, background=background, threads=threads, onto=onto)
     if not lists_fit(lists, projected):
-        lists = build_tile_lists(projected, view, threads=threads)
+        lists = replace(build_tile_lists(projected, view, threads=threads), drawn=drawn)
         image = composite(projected, lists, view, background=background, threads=threads, onto=image)
     return lists, image
 
@@ -87,6 +88,7 @@ def composite(
         width,
         height,
         lists.tile_start,
+        lists.drawn,
         lists.gaussian_from_intersection,
         projected.ellipse,
         projected.falloff,
@@ -134,7 +136,7 @@ def add_geometry(
         composite_geometry_kernel,
         lists.tile_count * TILE_PIXELS,
         inputs=[
-            *(width, height, lists.tile_start, lists.gaussian_from_intersection),
+            *(width, height, lists.tile_start, lists.drawn, lists.gaussian_from_intersection),
             *(projected.ellipse, projected.falloff, projected.colour_depth, splat_normals),
         ],
         outputs=[median_depth, median_gaussian, normal],

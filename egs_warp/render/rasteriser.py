@@ -21,6 +21,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.launching import Device, available_threads
 from egs_warp.render.compositing import Background, RenderedImage, add_geometry, list_and_composite
 from egs_warp.render.projection import project, view_from_camera
+from egs_warp.render.tiles import TILE_SIDE
 
 
 def render_gaussians(
@@ -30,22 +31,25 @@ def render_gaussians(
     background: tuple[float, float, float] | np.ndarray | wp.array = (1.0, 1.0, 1.0),
     antialiased: bool = False,
     geometry: bool = False,
+    mask: np.ndarray | None = None,
     threads: int | None = None,
 ) -> RenderedImage:
     """Picture of ``cloud`` through ``camera``, on the device of the cloud.
 
     ``background`` is one colour, or an image (H, W, 3) of this camera's size. ``antialiased`` dims each splat by what
-    the 0.3 px low-pass adds to its area. ``geometry`` adds median depth, its splats and normals. ``threads`` (a CPU
+    the 0.3 px low-pass adds to its area. ``geometry`` adds median depth, its splats and normals. ``mask``, one bool for
+    each tile of 16 x 16 pixels from the top left, leaves tiles out: they show the background alone. ``threads`` (a CPU
     only) defaults to the available cores; the picture does not depend on it.
-    Raises ``UserError`` for non-finite Gaussians, which it names, for an impossible camera and for a background of
-    another size.
+    Raises ``UserError`` for non-finite Gaussians, which it names, for an impossible camera and for a background or mask
+    of another size.
     """
     threads = threads or available_threads()
     view = view_from_camera(camera)
     with refusing_what_does_not_fit(cloud, camera):
         behind = background_of(background, camera, cloud.device)
+        drawn = drawn_tiles(mask, camera, cloud.device)
         projected = project(cloud, view, antialiased=antialiased, threads=threads)
-        lists, image = list_and_composite(projected, view, background=behind, threads=threads)
+        lists, image = list_and_composite(projected, view, background=behind, threads=threads, drawn=drawn)
         if geometry:
             image = add_geometry(image, cloud, projected, lists, view, threads=threads)
     return image
@@ -96,6 +100,19 @@ def refusing_what_does_not_fit(cloud: GaussianCloud, camera: Camera) -> Iterator
 
 def _is_finite_number(value: Any) -> bool:
     return isinstance(value, float | int) and math.isfinite(value)
+
+
+def drawn_tiles(mask: np.ndarray | None, camera: Camera, device: Device) -> wp.array | None:
+    """``mask`` (tile rows, tile columns) bool as ``TileLists`` wants it. Raises ``UserError`` for another shape."""
+    if mask is None:
+        return None
+    values, shape = np.asarray(mask), (-(-camera.height // TILE_SIDE), -(-camera.width // TILE_SIDE))
+    if values.shape != shape or values.dtype != bool:
+        raise UserError(
+            f"mask: give {shape[0]} x {shape[1]} booleans, one for each tile of {TILE_SIDE} x {TILE_SIDE} pixels,"
+            f" not {values.dtype} of shape {values.shape}"
+        )
+    return wp.array(values.ravel().astype(np.int32), dtype=wp.int32, device=device)
 
 
 @lru_cache(maxsize=64)

@@ -35,6 +35,8 @@ class TileLists:
     """(at least tile_start[-1],) int32: place of the same pair when pairs are numbered Gaussian by Gaussian."""
     work: np.ndarray | None
     """(tiles,) number of intersections, on a CPU; to share the tiles out between threads."""
+    drawn: wp.array | None = None
+    """(tiles,) int32: 0 for tiles that show the background alone; None draws all."""
 
     @property
     def tile_count(self) -> int:

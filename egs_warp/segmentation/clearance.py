@@ -59,9 +59,13 @@ class ClearingOptions:
     reach: Reach = Reach.ELLIPSOID
     weight: float = 0.3
     """Of L_seg beside the photometric loss; 0.3 and 3 give the same to 0.4 dB."""
-    subdivisions: int = 2
-    """How often straddling Gaussians are first split in three across the plane: smaller ones come closer to it without
-    crossing. 0 is the paper's way."""
+    subdivisions: int = 4
+    """How often, at most, straddling Gaussians are first split in three across the plane: smaller ones come closer to
+    it without crossing. 0 is the paper's way."""
+    fine_reach: float = 0.01
+    """Of the object's height: those that reach no farther across the plane are not split any more."""
+    cut_rest: bool = True
+    """Those that still straddle after training are cut at the plane as ``SPLIT`` does it; the paper leaves them."""
     seed: int = 0
 
 
@@ -112,10 +116,14 @@ def clear_plane(
     if views is None:
         views = views_above(cloud, plane, cameras or foot_ring(cloud, plane))
     fine = cloud
+    fine_reach = options.fine_reach * float(np.quantile(heights, 0.998))
     for _ in range(options.subdivisions):
-        fine = _subdivided(fine, plane, options.reach)
+        fine = _subdivided(fine, plane, options.reach, fine_reach)
     tuned = _finetuned(fine, plane, views, surroundings, options, progress)
-    return tuned.subset(plane.heights(tuned.means.numpy()) > 0.0)
+    tuned = tuned.subset(plane.heights(tuned.means.numpy()) > 0.0)
+    heights, reach = reach_across(tuned, plane, options.reach)
+    rest = np.abs(heights) < reach
+    return half_space(tuned, plane, rest) if options.cut_rest and rest.any() else tuned
 
 
 def half_space(cloud: GaussianCloud, plane: Plane, chosen: np.ndarray) -> GaussianCloud:
@@ -178,11 +186,14 @@ def foot_ring(cloud: GaussianCloud, plane: Plane, *, size: int = 256) -> list[Ca
     return ring_cameras(plane, centre, 1.1 * radius, elevations=(1.0, 10.0, 25.0), size=size)
 
 
-def _subdivided(cloud: GaussianCloud, plane: Plane, reach: Reach) -> GaussianCloud:
-    """``cloud`` with straddling Gaussians split in three along the axis that reaches farthest across the plane."""
+def _subdivided(cloud: GaussianCloud, plane: Plane, reach: Reach, fine_reach: float) -> GaussianCloud:
+    """``cloud`` with straddling Gaussians that reach farther than ``fine_reach`` (scene units) split in three along
+    the axis that reaches farthest across the plane."""
     heights, extent = reach_across(cloud, plane, reach)
-    parents = np.flatnonzero(np.abs(heights) < extent)
-    kept = np.flatnonzero(np.abs(heights) >= extent)
+    chosen = (np.abs(heights) < extent) & (extent > fine_reach)
+    if not chosen.any():
+        return cloud
+    parents, kept = np.flatnonzero(chosen), np.flatnonzero(~chosen)
     turns = Rotation.from_quat(cloud.rotations.numpy()[parents][:, [1, 2, 3, 0]]).as_matrix()
     along = np.abs(np.einsum("nij,i->nj", turns, plane.normal)) * np.exp(cloud.log_scales.numpy()[parents])
     offsets, shrink = child_layout(SplitRule.MEASURED)

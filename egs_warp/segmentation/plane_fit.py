@@ -19,6 +19,10 @@ _TRIALS = 300
 _TUKEY = 2.0
 """Pixels further off than this many standard deviations count for nothing. 4.685 would be more efficient without
 outliers, but what stands on the plane is near it at its foot: with 3.0 some of 100 scenes tilt by a degree."""
+_LEAST_NOISE = 1e-3
+"""Of depth: what is nearer than this is on the plane. Where few wide splats make a floor, a plane through three of them
+leaves no error at all in half of the pixels, and the others would count for nothing.
+"""
 _MIN_SINE = 0.02
 """Of the angle between plane and line of sight: a camera this close to the plane does not see it."""
 
@@ -71,7 +75,7 @@ def fit_plane(views: Sequence[PlaneView], *, start: Plane | None = None, seed: i
     plane = _refined(pixels, plane, lambda scale: (_tukey, _TUKEY * scale), rounds=6)
     residual = np.abs(pixels.residuals(plane))
     scale = _scale(residual)
-    inside = residual < _TUKEY * scale
+    inside = residual < _TUKEY * max(scale, _LEAST_NOISE)
     if scale > 0.1 or inside.mean() < 0.4:
         raise UserError(
             f"plane: none in sight: the best one leaves depth errors of {100 * scale:.0f} % in the masks; "
@@ -202,7 +206,7 @@ def _refined(pixels: _Pixels, start: Plane, loss: Callable[[float], tuple], *, r
             normal = normal / np.linalg.norm(normal)
             return Plane(normal, float(-(middle @ normal) + base.heights(middle) + x[2] * reach))
 
-        name, scale = loss(_scale(np.abs(pixels.residuals(plane))))
+        name, scale = loss(max(_scale(np.abs(pixels.residuals(plane))), _LEAST_NOISE))
         found = least_squares(
             lambda x, of=of: pixels.residuals(of(x)), np.zeros(3), loss=name, f_scale=scale, x_scale=0.01
         )

@@ -37,8 +37,7 @@ class SeenSurface:
         image = render_gaussians(cloud, camera, geometry=True)
         assert image.median_depth is not None and image.median_gaussian is not None
         # Not the mean: of what a floor lets through of the depths below, that gets a share.
-        means = cloud.means.numpy().astype(np.float64) if cloud.count else np.zeros((1, 3))
-        middles = means[np.asarray(image.median_gaussian.numpy(), np.int64)]
+        middles = cloud.means.numpy().astype(np.float64)[np.asarray(image.median_gaussian.numpy(), np.int64)]
         depth = image.median_depth.numpy().astype(np.float64)
         return cls(camera, depth, middles, (image.alpha.numpy() > _OPAQUE) & (depth > 0.0))
 

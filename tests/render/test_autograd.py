@@ -201,6 +201,32 @@ def test_pictures_wait_for_their_gradients_while_others_are_made(device: str) ->
         assert all(torch.equal(a, b) and a.abs().sum() > 0 for a, b in zip(one, other, strict=True))
 
 
+def test_tiles_left_out_show_the_background_and_give_no_gradient(device: str) -> None:
+    """As if the loss did not look at them; gsplat's masks are of the same tiles."""
+    values, camera = many_splats()
+    mask = np.random.default_rng(5).random((5, 6)) < 0.5
+    pixels = torch.tensor(np.kron(mask, np.ones((16, 16), bool))[:70, :90], device=device)
+    weight = torch.tensor(weights(camera)["colour"], dtype=torch.float32, device=device)
+
+    def drawn(mask: np.ndarray | None, weight: Any) -> tuple[Any, list[Any]]:
+        leaves = [torch.tensor(values[n], dtype=torch.float32, device=device, requires_grad=True) for n in NAMES]
+        image = render_torch(*leaves, camera=camera, background=(0.2, 0.4, 0.6), mask=mask)
+        (image.colour * weight).sum().backward()
+        return image, [leaf.grad for leaf in leaves]
+
+    part, part_gradients = drawn(mask, weight)
+    whole, whole_gradients = drawn(None, weight * pixels[:, :, None])
+    behind = torch.tensor([0.2, 0.4, 0.6], device=device)
+    assert torch.equal(part.colour, torch.where(pixels[:, :, None], whole.colour, behind))
+    assert torch.equal(part.alpha, whole.alpha * pixels) and torch.equal(part.depth, whole.depth * pixels)
+    for one, other in zip(part_gradients, whole_gradients, strict=True):
+        assert torch.equal(one, other) and one.abs().sum() > 0
+    with pytest.raises(
+        UserError, match=r"^mask: give 5 x 6 booleans, one for each tile of 16 x 16 pixels, not bool of"
+    ):
+        drawn(mask[:4], weight)
+
+
 def test_pixels_share_memory_and_bad_tensors_are_named() -> None:
     values, camera = clear_scene()
     tensors = [torch.tensor(values[name], dtype=torch.float32) for name in NAMES]

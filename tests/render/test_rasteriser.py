@@ -151,6 +151,21 @@ def test_median_depth_and_normal(device: str) -> None:
     assert (image.median_depth.numpy() > 0).mean() > 0.2
 
 
+def test_tiles_left_out_show_the_background(device: str) -> None:
+    cloud, camera = cloud_of(random_scene(200), device), camera_of(70, 40)
+    mask = np.array([[1, 0, 1, 0, 1], [0, 1, 0, 1, 0], [1, 1, 0, 0, 1]], bool)
+    pixels = np.kron(mask, np.ones((16, 16), bool))[:40, :70]
+    whole = render_gaussians(cloud, camera, background=(0.1, 0.5, 0.2), geometry=True)
+    part = render_gaussians(cloud, camera, background=(0.1, 0.5, 0.2), geometry=True, mask=mask)
+    behind = np.array([0.1, 0.5, 0.2], np.float32)
+    assert np.array_equal(part.colour.numpy(), np.where(pixels[:, :, None], whole.colour.numpy(), behind))
+    assert whole.median_depth is not None and part.median_depth is not None
+    assert whole.normal is not None and part.normal is not None
+    assert np.array_equal(part.median_depth.numpy(), np.where(pixels, whole.median_depth.numpy(), 0.0))
+    assert np.array_equal(part.normal.numpy(), np.where(pixels[:, :, None], whole.normal.numpy(), 0.0))
+    assert (whole.alpha.numpy()[~pixels] > 0).any()
+
+
 def test_several_cameras_and_what_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud = cloud_of(random_scene(50))
     cameras = [camera_of(20, 30), camera_of(40, 10)]

@@ -134,6 +134,21 @@ def test_a_bevel_above_the_sole_is_not_the_support() -> None:
     assert abs(_support_level(few) - 0.08) < 0.004, "too few to hold their own"
 
 
+@pytest.mark.parametrize("size", [0.1, 1.0, 10.0])
+def test_the_support_is_what_ends_within_its_band(size: float) -> None:
+    """Columns that end the denser the nearer to the floor, and as many above: the plane has 15 % of those below it that
+    end within 1.5 % of the height of the densest level, whatever the unit.
+    """
+    bottoms = np.concatenate([0.04 * np.linspace(-1.0, 1.0, 401) ** 3, np.linspace(0.05, 0.14, 401)])
+    within = bottoms[np.abs(bottoms) <= 0.015]
+    columns = np.stack([np.arange(802), np.zeros(802)], axis=1).astype(int)
+    heights = size * np.array([0.0, 1.0])
+    found = _support_level(
+        _Underside(heights, np.ones(2), 0.0, size, size * bottoms, columns, 0.02 * size, np.array([200.0, 0.0]))
+    )
+    assert found == pytest.approx(size * np.quantile(within, 0.15), abs=2e-4 * size)
+
+
 def test_the_reason_for_up_is_what_was_weighed() -> None:
     """Scores of the best axis and of the next, and whether they are far apart: a pawn has one base, a cube six."""
     cube = np.random.default_rng(0).uniform(-0.5, 0.5, (4000, 3))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
+from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.clearance import (
@@ -22,6 +24,7 @@ from egs_warp.segmentation.clearance import (
     reach_across,
     views_above,
 )
+from tests.support.scenes import FLOOR, round_ones, shell
 
 PLANE = Plane.from_coefficients(0.3, -0.5, 0.8, 0.1)
 
@@ -132,7 +135,9 @@ def test_what_straddles_is_split_in_three_across_the_plane(device: str) -> None:
         np.zeros((3, 1, 3)),
         device=device,
     )
-    split = _subdivided(cloud, PLANE, Reach.ELLIPSOID)
+    # Both reach across by three tenths.
+    assert _subdivided(cloud, PLANE, Reach.ELLIPSOID, 0.31) is cloud
+    split = _subdivided(cloud, PLANE, Reach.ELLIPSOID, 0.29)
     np.testing.assert_allclose(PLANE.heights(split.means.numpy()), [0.5, 0.05, 0.15, 0.25, 0.05, 0.15], atol=1e-5)
     np.testing.assert_allclose(covariances(split)[0], covariances(cloud)[2], atol=1e-8)
     arms = split.means.numpy()[1:4].astype(np.float64) - cloud.means.numpy()[0]
@@ -163,6 +168,20 @@ def test_cameras_about_the_foot_look_at_it_from_low_down() -> None:
         seen = (foot - camera.centre) @ camera.rotation.T
         aside = camera.fx * seen[:, 0] / seen[:, 2] / (0.5 * camera.width)
         assert abs(aside.max() + aside.min()) < 0.05 and 0.6 < aside.max() < 1.0
+
+
+@pytest.mark.parametrize("above", [True, False])
+def test_a_camera_under_the_plane_says_nothing_of_what_it_sees_through_it(above: bool) -> None:
+    """Of a ball over the floor pixels count from above; from below those alone that show nothing."""
+    pytest.importorskip("torch")
+    ball = round_ones(shell() + [0.0, 0.0, 0.2], 0.04)
+    eye = np.array([2.0, 0.0, 2.0 if above else -2.0])
+    camera = Camera.look_at(eye, np.array([0.0, 0.0, 0.7]), np.array([0.0, 0.0, 1.0]), width=48, height=48)
+    (view,) = views_above(ball, FLOOR, [camera])
+    assert view.alpha is not None and view.weight is not None
+    shown = view.alpha > 0.0
+    assert 0.1 < shown.mean() < 0.9
+    assert (view.weight[shown] == float(above)).all() and (view.weight[~shown] == 1.0).all()
 
 
 def test_flat_splats_survive_the_cut() -> None:
@@ -243,6 +262,14 @@ def test_finetuning_clears_the_plane_and_keeps_the_looks() -> None:
     cameras = foot_ring(ball, floor, size=72)[::3]
     options = ClearingOptions(iterations=120, subdivisions=0, weight=3.0)
     tuned = clear_plane(ball, floor, Clearing.FINETUNE, cameras=cameras, options=options)
+    hasty = replace(options, iterations=3)
+    cut, left = (
+        clear_plane(ball, floor, Clearing.FINETUNE, cameras=cameras, options=replace(hasty, cut_rest=cut_rest))
+        for cut_rest in (True, False)
+    )
+    straddles = np.abs(before) < eta
+    assert np.array_equal(cut.means.numpy()[~straddles], left.means.numpy()[~straddles])
+    assert (floor.heights(cut.means.numpy())[straddles] > floor.heights(left.means.numpy())[straddles]).mean() > 0.9
     after, eta = reach_across(tuned, floor)
     assert float(np.maximum(eta - np.abs(after), 0.0).sum()) < 0.35 * crossing
     assert (after > 0.0).all()

@@ -10,10 +10,11 @@ import pytest
 from egs_warp.commands.object_flag import read_object
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera_ring import ring_cameras
-from egs_warp.geometry.gaussians import joined
+from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.io import read_cameras
 from egs_warp.io.cameras import write_cameras
 from egs_warp.pipelines.locate_plane import locate_plane
+from egs_warp.segmentation.above_plane import AbovePlane, hanging_parts
 from egs_warp.segmentation.clicks import click_at
 from egs_warp.segmentation.object_mask import segment
 from egs_warp.segmentation.object_spec import ObjectSpec
@@ -32,6 +33,17 @@ def test_a_click_hits_the_surface_and_not_what_shines_through() -> None:
     assert len(found.hits) and (found.hits < 400).all()
     assert (np.linalg.norm(cloud.means.numpy()[found.hits] - [0.0, -0.5, 0.5], axis=1) < 0.2).all()
     assert click_at(round_ones(skin, 0.04), front(), 3.0, 3.0) is None
+
+
+def test_haze_before_what_is_clicked_on_is_not_hit() -> None:
+    """Of a fiftieth of its opacity, just above its surface; as opaque as that it is."""
+    skin = round_ones(shell(400), 0.04)
+    for opacity, hit in ((-4.0, False), (3.0, True)):
+        logits = np.append(skin.opacity_logits.numpy(), np.float32(opacity))
+        means = np.concatenate([skin.means.numpy(), [[0.0, -0.52, 0.5]]])
+        turns, scales = np.tile([1.0, 0.0, 0.0, 0.0], (401, 1)), np.full((401, 3), np.log(0.04))
+        cloud = GaussianCloud.from_numpy(means, turns, scales, logits, np.zeros((401, 1, 3)))
+        assert (400 in click(cloud, (0.0, -0.5, 0.5)).hits) is hit
 
 
 @pytest.mark.parametrize("tones", [(-1.0, 1.0), (0.0, 0.0)])
@@ -83,6 +95,17 @@ def test_leaves_that_hang_in_the_air_go_along_and_what_stands_beside_does_not() 
     found = segment(cloud, FLOOR, ObjectSpec.of_clicks([click(cloud, (0.0, -0.5, 0.5))]))
     assert found.object_mask[1500:1560].all()
     assert not found.object_mask[1560:1620].any()
+
+
+def test_what_hangs_in_the_air_is_held_by_what_is_near() -> None:
+    """Within two of the 64 cells across the object; further off it is on its own, as is what reaches the floor."""
+    thing, leaf = shell(800), np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]])
+    size = 1.7
+    near, far = (leaf + [0.5 + gap * size, 0.0, 0.5] for gap in (1.6 / 64.0, 2.6 / 64.0))
+    low = leaf + [0.0, 0.51, 0.05]
+    scene = AbovePlane.of(round_ones(np.concatenate([thing, near, far + [0, 0, 0.3], low]), 0.01), FLOOR)
+    parts = np.repeat([0, 1, 2, 3], [800, 2, 2, 2])
+    assert hanging_parts(scene, np.arange(806), parts, np.array([0]), size).tolist() == [1]
 
 
 @pytest.mark.parametrize(

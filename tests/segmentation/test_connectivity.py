@@ -52,6 +52,10 @@ def test_a_long_gaussian_reaches_its_ends(seed: int) -> None:
         assert parts[125] != parts[0]
 
 
+def test_nothing_is_enclosed_by_no_shell() -> None:
+    assert enclosed(np.zeros((3, 2)), np.zeros((0, 2)), 0.1).tolist() == [False] * 3
+
+
 def test_close_is_within_reach_of_any() -> None:
     points = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.5]])
     assert close_to(points, np.array([[0.0, 0.4]]), 0.45).tolist() == [True, False, True]

@@ -46,8 +46,8 @@ def test_the_plane_of_folds_is_level(located: LocatedPlane) -> None:
 
 
 def test_heights_are_those_of_the_cloth(located: LocatedPlane, folds: tuple[GaussianCloud, np.ndarray]) -> None:
-    """Beside the ball, on folds of 4 % of its height either way: 0.7 % of it in the mean, all of one sign (splats
-    hide those behind them), 1.5 % at most.
+    """Beside the ball, on folds of 4 % of its height either way: 0.13 % of it in the mean, 0.6 % in 99 of 100 places,
+    of both signs: heights of splats are not changed by which hides which.
     """
     ground = located.ground
     assert ground is not None
@@ -55,7 +55,7 @@ def test_heights_are_those_of_the_cloth(located: LocatedPlane, folds: tuple[Gaus
     flat = np.stack([(radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel()], axis=1)
     true = np.column_stack([flat, wave(flat, AMPLITUDE, LENGTH)])
     off = ground.heights(true)
-    assert np.abs(off).mean() < 8e-3 and off.std() < 2e-3 and np.quantile(np.abs(off), 0.99) < 0.015
+    assert abs(off.mean()) < 1e-3 and np.abs(off).mean() < 2e-3 and np.quantile(np.abs(off), 0.99) < 8e-3
 
 
 def test_what_is_told(located: LocatedPlane) -> None:
@@ -169,6 +169,15 @@ def test_what_the_object_hid_is_not_taken_for_ground(scale: float) -> None:
     camera = Camera.look_at(eye, np.zeros(3), np.array([0.0, 1.0, 0.0]), width=64, height=64, near=0.01 * scale)
     seen = module._seen_points(joined(bare, ball()).scaled(scale), bare.scaled(scale), camera, LEVEL)
     assert len(seen) > 1000 and np.abs(seen[:, 2]).max() < 0.05 * scale
+
+
+def test_specks_of_ground_are_left_out() -> None:
+    """A patch counts from a twentieth of the widest on: one of 2 of 40 nodes, not one of 1."""
+    ground = np.zeros((12, 12), bool)
+    ground[:4, :10] = ground[6, :2] = ground[9, 9] = True
+    kept = ground.copy()
+    kept[9, 9] = False
+    assert np.array_equal(module._one_patch(ground), kept)
 
 
 @pytest.mark.parametrize("count", [5, 12])

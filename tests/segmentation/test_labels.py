@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import product
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from egs_warp.assets import scene
 from egs_warp.errors import UserError
 from egs_warp.geometry.bitmaps import depth_inside, distance_to
 from egs_warp.geometry.camera_ring import ring_cameras
+from egs_warp.segmentation import labels as module
 from egs_warp.segmentation.labels import labels_of_votes, smoothed_labels
 from egs_warp.segmentation.object_mask import segment
 from egs_warp.segmentation.object_spec import ObjectSpec
@@ -19,7 +21,7 @@ from egs_warp.segmentation.selection_masks import masks_from_selection
 from egs_warp.segmentation.votes import MaskedView, Votes, votes_of_masks
 from tests.support.clicking import balls, click
 from tests.support.grounds import level
-from tests.support.scenes import FLOOR, lying
+from tests.support.scenes import FLOOR, lying, round_ones
 
 
 def test_the_closed_form_paints_the_masks_with_the_least_error() -> None:
@@ -64,6 +66,20 @@ def test_rough_masks_of_three_views_find_a_stool_with_its_legs() -> None:
 
     assert overlap((wanted | unknown)[nodes]) < 0.9
     assert overlap(smoothed_labels(cloud, votes, nodes, views=3)) > 0.97
+    found = segment(cloud, made.plane, ObjectSpec(masks=tuple(masks)))
+    assert overlap((found.object_mask | found.floater_mask)[nodes]) > 0.95
+
+
+def test_a_vote_is_surer_by_the_root_of_its_pixels() -> None:
+    """One of two neighbours alike is out for sure, the other in by less than their link costs: both are out. Nine times
+    the pixels weigh three times as much.
+    """
+    pair = round_ones(np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0]]), 0.02)
+    pixels, share = 9.0 * module._SURE, np.array([0.5 + 0.35 * module._SMOOTHNESS / 3.0, 0.0])
+    for links, labels in ((1.0, [False, False]), (0.5, [True, False])):
+        votes = Votes(pixels * share, pixels * (1.0 - share), np.full(2, pixels))
+        with patch.object(module, "_SMOOTHNESS", links * module._SMOOTHNESS):
+            assert smoothed_labels(pair, votes, np.arange(2)).tolist() == labels
 
 
 @pytest.mark.parametrize(("pixels", "kept_out"), [(66.0, True), (4.0, False)])

@@ -278,6 +278,16 @@ def test_loose_matter_behind_a_hole_is_the_bodys() -> None:
     assert found.object_mask[len(skin) : len(skin) + 30].all()
 
 
+def test_the_floor_closes_a_bell_from_below() -> None:
+    """A dome that stands on its rim, open below: what is loose under it goes along."""
+    skin = shell(3000)
+    dome = skin[skin[:, 2] > 0.5] - [0.0, 0.0, 0.5]
+    inside = np.random.default_rng(0).normal(0.0, 0.03, (30, 3)) + [0.0, 0.0, 0.25]
+    whole = joined(round_ones(np.concatenate([dome, inside]), 0.02), lying(level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.05)))
+    found = segment(whole, FLOOR, ObjectSpec(point=np.array([0.0, 0.0, 0.5])))
+    assert found.object_mask[len(dome) : len(dome) + 30].all()
+
+
 def test_how_far_a_floor_scatters_is_judged_beside_the_object() -> None:
     """Three standard deviations of the floor that is near; not of a higher one far away, nor of what lies under the
     object.
@@ -293,6 +303,16 @@ def test_how_far_a_floor_scatters_is_judged_beside_the_object() -> None:
     scene_ = module.AbovePlane.of(whole, FLOOR)
     top = floor_shreds.floor_top(scene_, np.arange(whole.count) < len(thing), np.sqrt(2.0))
     assert top == pytest.approx(0.003, rel=0.15)
+
+
+def test_hardly_any_floor_says_nothing_of_its_roughness() -> None:
+    """Nineteen of its Gaussians beside the object; twenty do."""
+    for count, rough in ((19, False), (20, True)):
+        place = np.linspace(0.7, 1.2, count)
+        floor = np.column_stack([place, np.zeros(count), np.full(count, 0.01)])
+        whole = joined(round_ones(shell(), 0.02), lying(floor))
+        top = floor_shreds.floor_top(module.AbovePlane.of(whole, FLOOR), np.arange(whole.count) < 1500, np.sqrt(3.0))
+        assert top == pytest.approx(0.01 if rough else 0.0, abs=1e-6)
 
 
 def test_what_hovers_over_the_only_floor_is_taken_and_said() -> None:

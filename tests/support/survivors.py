@@ -235,6 +235,24 @@ SURVIVORS: list[Survivor] = [
         "hidden = (behind > 0.0) & (depth > behind) & (alpha >= 0.0)",
         "where alpha is 0 depth is 0, which lies behind nothing",
     ),
+    Survivor(
+        "segmentation/graph_cut.py",
+        "_UNIT = 1000",
+        "_UNIT = 999",
+        "costs are rounded to a 999th in place of a 1000th",
+    ),
+    Survivor(
+        "segmentation/plane_search.py",
+        "few = random.choice(left, min(_SAMPLE, len(left)), replace=False, p=area[left] / area[left].sum())",
+        "few = random.choice(left, min(_SAMPLE, len(left)), replace=True, p=area[left] / area[left].sum())",
+        "another sample, as good: some of its Gaussians come twice",
+    ),
+    Survivor(
+        "segmentation/plane_search.py",
+        "count: int = 4,",
+        "count: int = 5,",
+        "a default: one plane more that is looked for, the least wide one",
+    ),
 ]
 
 

@@ -3,7 +3,7 @@
 import warp as wp
 
 from egs_warp.kernels.render import composite_cpu, composite_cuda
-from egs_warp.kernels.render.ellipse import TILE, TILE_PIXELS
+from egs_warp.kernels.render.ellipse import TILE, TILE_PIXELS, is_drawn
 from egs_warp.kernels.render.pixel_gradients import pixel_gradient
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -93,6 +93,7 @@ def composite_tile_kernel(
     width: wp.int32,
     height: wp.int32,
     tile_start: wp.array[wp.int32],
+    drawn: wp.array[wp.int32],
     gaussian_from_intersection: wp.array[wp.int32],
     ellipse: wp.array[wp.vec4],
     falloff: wp.array[wp.vec2],
@@ -107,13 +108,17 @@ def composite_tile_kernel(
     """One thread composites one tile (CPU), or one block of ``TILE_PIXELS`` threads (CUDA)."""
     tile = (wp.tid() + first) / wp.block_dim()
     columns = (width + TILE - 1) / TILE
+    start = tile_start[tile]
+    end = start
+    if is_drawn(drawn, tile):
+        end = tile_start[tile + 1]
     composite_tile(
         width,
         height,
         (tile % columns) * TILE,
         (tile / columns) * TILE,
-        tile_start[tile],
-        tile_start[tile + 1],
+        start,
+        end,
         gaussian_from_intersection,
         ellipse,
         falloff,
@@ -133,6 +138,7 @@ def composite_backward_tile_kernel(
     width: wp.int32,
     height: wp.int32,
     tile_start: wp.array[wp.int32],
+    drawn: wp.array[wp.int32],
     gaussian_from_intersection: wp.array[wp.int32],
     slot_from_intersection: wp.array[wp.int32],
     ellipse: wp.array[wp.vec4],
@@ -150,8 +156,11 @@ def composite_backward_tile_kernel(
     """
     tile = wp.tid() + first
     columns = (width + TILE - 1) / TILE
+    right = width
+    if not is_drawn(drawn, tile):
+        right = (tile % columns) * TILE
     composite_backward_tile(
-        width,
+        right,
         height,
         (tile % columns) * TILE,
         (tile / columns) * TILE,
@@ -174,6 +183,7 @@ def composite_backward_block_kernel(
     width: wp.int32,
     height: wp.int32,
     tile_start: wp.array[wp.int32],
+    drawn: wp.array[wp.int32],
     gaussian_from_intersection: wp.array[wp.int32],
     slot_from_intersection: wp.array[wp.int32],
     ellipse: wp.array[wp.vec4],
@@ -200,7 +210,10 @@ def composite_backward_block_kernel(
     row = top + (part / 2) * 4 + (i % 32) / 8
     by_sums = wp.vec4()
     remaining = wp.float32(0.0)
-    if column < width and row < height:
+    right = width
+    if not is_drawn(drawn, tile):
+        right = left
+    if column < right and row < height:
         by_sums, remaining = pixel_gradient(
             row,
             column,
@@ -212,7 +225,7 @@ def composite_backward_block_kernel(
             depth_gradient,
         )
     composite_backward_block(
-        width,
+        right,
         height,
         left,
         top,

@@ -43,6 +43,12 @@ def pixel_of_thread(thread: wp.int32, width: wp.int32) -> wp.vec2i:
 
 
 @wp.func
+def is_drawn(drawn: wp.array[wp.int32], tile: wp.int32) -> bool:
+    """Whether a tile is to be drawn; an empty array says so of all."""
+    return drawn.shape[0] == 0 or drawn[tile] != 0
+
+
+@wp.func
 def splat_alpha(ellipse: wp.vec4, falloff: wp.vec2, pixel: wp.vec2i) -> wp.float32:
     """What one splat hides of a pixel's middle, at most ``ALPHA_LIMIT``."""
     dy = wp.float32(pixel[1]) + 0.5 - ellipse[1]

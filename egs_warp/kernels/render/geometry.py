@@ -2,7 +2,14 @@
 
 import warp as wp
 
-from egs_warp.kernels.render.ellipse import ALPHA_CUT, TILE_PIXELS, TRANSMITTANCE_STOP, pixel_of_thread, splat_alpha
+from egs_warp.kernels.render.ellipse import (
+    ALPHA_CUT,
+    TILE_PIXELS,
+    TRANSMITTANCE_STOP,
+    is_drawn,
+    pixel_of_thread,
+    splat_alpha,
+)
 from egs_warp.kernels.render.projection import View, rotation_matrix
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -39,6 +46,7 @@ def composite_geometry_kernel(
     width: wp.int32,
     height: wp.int32,
     tile_start: wp.array[wp.int32],
+    drawn: wp.array[wp.int32],
     gaussian_from_intersection: wp.array[wp.int32],
     ellipse: wp.array[wp.vec4],
     falloff: wp.array[wp.vec2],
@@ -59,7 +67,9 @@ def composite_geometry_kernel(
     normal_sum = wp.vec3()
     passing = wp.float32(1.0)
     intersection = tile_start[tile]
-    end = tile_start[tile + 1]
+    end = intersection
+    if is_drawn(drawn, tile):
+        end = tile_start[tile + 1]
     while intersection < end:
         g = gaussian_from_intersection[intersection]
         intersection += 1

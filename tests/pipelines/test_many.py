@@ -1,0 +1,175 @@
+"""Many runs of one creature: each has the bits of its run alone."""
+
+from __future__ import annotations
+
+import importlib.util
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egs_warp.assets import pawn
+from egs_warp.errors import ArgumentError, UserError
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.push import read_pushes
+from egs_warp.motions.script import motion
+from egs_warp.motions.style import read_style
+from egs_warp.pipelines.creature import Creature, make_creature
+from egs_warp.pipelines.ending import State
+from egs_warp.pipelines.many import Job, Outcome, simulate_many
+from egs_warp.pipelines.performance import simulate
+
+FRAMES, FEW = 31, 11
+"""30 steps after the first picture, and 10 where nothing new comes later."""
+
+
+@pytest.fixture(scope="module")
+def creature() -> Creature:
+    made = pawn(gaussian_count=3000)
+    return make_creature(made.cloud, plane=made.plane, nodes=50)
+
+
+@pytest.fixture(scope="module")
+def jobs(creature: Creature) -> list[Job]:
+    """Target, ground, style, push, activations; and two that cannot be done."""
+    count = creature.muscles.segment_count
+    held = 0.1 * np.sin(np.arange(10.0)[:, None] + np.arange(count)) * creature.muscles.bounds
+    return [
+        Job(motion("jump"), frames=FRAMES),
+        Job(motion("jump 0.2 0.1"), frames=FEW),
+        Job(motion("jump"), friction=0.3, frames=FRAMES),
+        Job(motion("jump"), frames=FEW, style=read_style("anticipation=1.5")),
+        Job(motion("stand 1"), frames=FEW, pushes=read_pushes("0.05 0.3 left"), get_up=False),
+        Job(motion("stand 1"), activations=held, get_up=False),
+        Job(motion("jump"), friction=-1.0),
+        Job(motion("stand 1"), activations=held[:, 1:]),
+    ]
+
+
+@pytest.fixture(scope="module")
+def told() -> list[tuple[int, int]]:
+    return []
+
+
+@pytest.fixture(scope="module")
+def outcomes(creature: Creature, jobs: list[Job], told: list[tuple[int, int]]) -> tuple[Outcome, ...]:
+    return simulate_many(creature, jobs, workers=2, progress=lambda done, expected: told.append((done, expected)))
+
+
+def same(one: Trajectory, other: Trajectory) -> bool:
+    return all(
+        np.array_equal(getattr(one, name), getattr(other, name), equal_nan=name == "planned_com")
+        for name in one.__dataclass_fields__
+    )
+
+
+def test_each_has_the_bits_of_its_run_alone(creature: Creature, jobs: list[Job], outcomes: tuple[Outcome, ...]) -> None:
+    alone = {
+        0: simulate(creature, jobs[0].motion, frames=FRAMES),
+        1: simulate(creature, jobs[1].motion, frames=FEW),
+        2: simulate(creature.with_friction(0.3), jobs[2].motion, frames=FRAMES),
+        3: simulate(creature, jobs[3].motion, frames=FEW, style=jobs[3].style),
+        4: simulate(creature, jobs[4].motion, frames=FEW, pushes=jobs[4].pushes, get_up=False),
+        5: simulate(creature, jobs[5].motion, activations=jobs[5].activations, get_up=False),
+    }
+    for number, performance in alone.items():
+        outcome = outcomes[number]
+        assert outcome.job is jobs[number] and outcome.error is None and outcome.runs == 1
+        assert len(outcome.trajectory.dt) >= (30 if number in (0, 2) else 10)
+        assert same(outcome.trajectory, performance.trajectory), number
+        assert np.array_equal(outcome.frames, performance.simulation.frames)
+    # They differ from one another.
+    ends = np.array([outcomes[number].trajectory.positions[10] for number in alone])
+    apart = np.abs(ends[:, None] - ends[None]).max(axis=(2, 3)) + np.eye(len(ends))
+    assert apart.min() > 1e-6 * creature.body.height
+    assert outcomes[2].trajectory.friction == 0.3 and outcomes[0].trajectory.friction == 0.8
+
+
+def test_the_error_of_one_does_not_end_the_others(outcomes: tuple[Outcome, ...]) -> None:
+    assert outcomes[6].error == "friction -1.0: give a Coulomb coefficient of at least 0"
+    assert outcomes[7].error is not None and outcomes[7].error.startswith("activations: of shape (10, ")
+    for outcome in outcomes[6:]:
+        assert outcome.state is None and outcome.report is None and outcome.runs == 1
+        with pytest.raises(UserError, match="job: it has no trajectory"):
+            _ = outcome.trajectory
+
+
+def test_reports_tell_how_they_ended(creature: Creature, outcomes: tuple[Outcome, ...]) -> None:
+    for outcome in outcomes[:6]:
+        assert outcome.report is not None
+        assert outcome.state is outcome.report.state is not State.DONE
+        assert outcome.report.gaussians.read == creature.cloud.count
+        assert outcome.report.cage.nodes == len(creature.body.mesh.nodes)
+        assert outcome.report.audit.momentum_residual < 1e-9
+    assert outcomes[2].report is not None and outcomes[2].report.asked["friction"] == 0.3
+
+
+def test_progress_ends_where_all_is_done(told: list[tuple[int, int]], outcomes: tuple[Outcome, ...]) -> None:
+    frames = sum(len(outcome.frames) - 1 for outcome in outcomes if outcome.report is not None)
+    done = [one for one, _ in told]
+    assert told[-1] == (frames, frames) and done == sorted(done) and all(one <= of for one, of in told)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed: egs-warp[ray]")
+def test_over_ray_it_has_the_same_bits(creature: Creature, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    job = Job(motion("jump 0.2 0.1"), friction=0.5, frames=FEW)
+    (outcome,) = simulate_many(creature, [job], workers="ray")
+    assert outcome.error is None and same(outcome.trajectory, job.perform(creature).trajectory)
+
+
+def test_trajectories_may_lie_in_a_folder(creature: Creature, tmp_path: Path) -> None:
+    """As they end they are told, by their numbers."""
+    ended: dict[int, Outcome] = {}
+    jobs = [Job(motion("stand 1"), frames=count) for count in (4, 3)]
+    made = simulate_many(
+        creature, jobs, workers=1, out=tmp_path / "runs", ended=lambda number, one: ended.update({number: one})
+    )
+    assert [one.file for one in made] == [tmp_path / "runs" / f"job-000{number}.npz" for number in (0, 1)]
+    assert [one.held for one in made] == [None, None] and [ended[0], ended[1]] == list(made)
+    assert [len(one.trajectory.dt) for one in made] == [3, 2]
+
+
+def test_a_creature_can_be_sent(creature: Creature) -> None:
+    """What is read from its pickle moves as it does, and has its splats."""
+    other: Creature = pickle.loads(pickle.dumps(creature))
+    asked = motion("jump")
+    assert same(simulate(other, asked, frames=5).trajectory, simulate(creature, asked, frames=5).trajectory)
+    for name in creature.cloud.__dataclass_fields__:
+        assert np.array_equal(getattr(other.cloud, name).numpy(), getattr(creature.cloud, name).numpy()), name
+
+
+def test_other_ground_is_that_of_a_creature_made_on_it(creature: Creature) -> None:
+    made = pawn(gaussian_count=3000)
+    again = make_creature(made.cloud, plane=made.plane, nodes=50, friction=0.4)
+    other = creature.with_friction(0.4)
+    assert other.geometry.friction == other.stepper.planner.friction == 0.4
+    assert np.array_equal(other.start.positions, again.start.positions)
+    with pytest.raises(ArgumentError, match=r"^friction nan: give a Coulomb coefficient of at least 0$"):
+        creature.with_friction(float("nan"))
+
+
+def test_activations_of_a_run_bring_it_about_again(creature: Creature) -> None:
+    """Of 10 recorded steps, nearly: a step that is held looks for its contact points from elsewhere."""
+    first = simulate(creature, motion("jump"), frames=11)
+    assert all(report.dt == first.simulation.reports[0].dt for report in first.simulation.reports)
+    again = simulate(creature, motion("jump"), activations=first.trajectory.activations)
+    assert np.array_equal(again.trajectory.activations, first.trajectory.activations)
+    off = np.abs(again.trajectory.positions - first.trajectory.positions).max()
+    assert off < 1e-3 * creature.body.height
+    still = simulate(creature, motion("jump"), activations=np.zeros_like(first.trajectory.activations))
+    moved = np.abs(still.trajectory.positions[-1] - first.trajectory.positions[-1]).max()
+    assert moved > 1e-3 * creature.body.height
+
+
+def test_activations_that_no_muscle_has_are_refused(creature: Creature) -> None:
+    count, bounds = creature.muscles.segment_count, creature.muscles.bounds
+    for given in (np.zeros((0, count)), np.zeros(count), np.zeros((5, count + 1))):
+        with pytest.raises(ArgumentError, match=rf"^activations: of shape .*; give a row of {count} metres"):
+            simulate(creature, motion("jump"), activations=given)
+    for given in (np.tile(1.01 * bounds, (5, 1)), np.full((5, count), np.nan)):
+        with pytest.raises(ArgumentError, match=r"^activations: beyond what a muscle can do; keep each within"):
+            simulate(creature, motion("jump"), activations=given)
+    assert replace(Job(motion("jump")), frames=2).perform(creature).frames.shape[0] == 2

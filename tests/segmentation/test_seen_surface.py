@@ -1,0 +1,59 @@
+"""Where a picture shows a surface: by heights a floor is where it is, by depths it seems higher."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.geometry.camera import Camera, camera_rays
+from egs_warp.geometry.plane import Plane
+from egs_warp.segmentation.seen_surface import SeenSurface
+from tests.support.grounds import level
+from tests.support.scenes import FLOOR, lying
+
+SPACING = 0.03
+
+
+@pytest.fixture(scope="module")
+def seen() -> SeenSurface:
+    """A floor, looked at from 30 degrees above it."""
+    eye = np.array([0.0, -2.2, 1.3])
+    camera = Camera.look_at(
+        eye, np.zeros(3), np.array([0.0, 0.0, 1.0]), width=120, height=120, vertical_fov_degrees=30.0
+    )
+    return SeenSurface.of(lying(level((-2.0, -2.0), (2.0, 2.0), 0.0, SPACING)), camera)
+
+
+def test_heights_are_right_where_depths_are_too_high(seen: SeenSurface) -> None:
+    rays = camera_rays(seen.camera)
+    by_depth = seen.camera.centre + seen.depth[..., None] * rays
+    assert seen.opaque.mean() > 0.9
+    assert by_depth[seen.opaque][:, 2].mean() > 0.1 * SPACING, "nearer splats hide those behind them"
+    points = seen.points(FLOOR, seen.opaque)
+    assert len(points) == seen.opaque.sum()
+    assert np.abs(points[:, 2]).max() < 1e-6
+    # Each is on its own pixel's ray.
+    along = (points - seen.camera.centre) @ seen.camera.rotation[2]
+    np.testing.assert_allclose(points, seen.camera.centre + along[:, None] * rays[seen.opaque], atol=1e-9)
+
+
+def test_a_rough_plane_will_do(seen: SeenSurface) -> None:
+    """Tilted by two degrees, a splat's width counts by their sine."""
+    tilt = np.radians(2.0)
+    rough = Plane(np.array([0.0, np.sin(tilt), np.cos(tilt)]), 0.02)
+    points = seen.points(rough, seen.opaque)
+    assert np.abs(points[:, 2]).max() < 3.0 * SPACING * np.sin(tilt)
+
+
+def test_what_shows_nothing_or_does_not_come_down_has_no_place(seen: SeenSurface) -> None:
+    """A look at the horizon and above; a plane above the camera."""
+    up = Camera.look_at(
+        np.array([0.0, -1.0, 0.5]), np.array([0.0, 1.0, 0.9]), np.array([0.0, 0.0, 1.0]), width=64, height=64
+    )
+    floor = lying(level((-2.0, -2.0), (2.0, 2.0), 0.0, SPACING))
+    look = SeenSurface.of(floor, up)
+    depth = look.depth_over(FLOOR)
+    slope = camera_rays(up) @ FLOOR.normal
+    assert (depth[slope >= 0.0] == 0.0).all() and (depth[look.opaque & (slope < 0.0)] > 0.0).all()
+    assert (depth[look.depth == 0.0] == 0.0).all()
+    assert not seen.depth_over(Plane(-FLOOR.normal, 5.0)).any()
