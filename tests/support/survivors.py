@@ -69,9 +69,9 @@ SURVIVORS: list[Survivor] = [
     ),
     Survivor(
         "kernels/contact/coulomb.py",
-        "sweep(contacts, _FEW_SWEEPS + _MORE_SWEEPS * attempt, forces)",
-        "sweep(contacts, _FEW_SWEEPS + _MORE_SWEEPS - attempt, forces)",
-        "how many sweeps lead to Newton's start changes the way, not the forces at the end",
+        "sweeps = _FEW_SWEEPS",
+        "sweeps = - _FEW_SWEEPS",
+        "whether sweeps lead to Newton's start changes the way, not the forces at the end",
     ),
     Survivor(
         "kernels/contact/gaps.py",
