@@ -1,14 +1,13 @@
 """From photos or a capture to a film, each stage timed: what a user does, with three clicks at most.
 
-``python benchmarks/room_films.py koala --out out/koala``: one scene; ``rooms.py --films FOLDER`` runs all of them.
-Clicks are those of ``clicking.py`` where outlines were drawn, else the ones below. Into ``--out`` go the film, its
-contact sheet ``sheet.png`` of twelve frames, the pictures that ``egs-warp animate`` leaves of each step, the capture
-that was trained, and ``row.json``.
+``rooms.py --films FOLDER`` runs all of them, ``rooms.py --films FOLDER --one koala`` a single scene, in this process.
+Clicks are those of ``clicking.py`` where outlines were drawn, else the ones below. Into a folder of its own go the
+film, its contact sheet ``sheet.png`` of twelve frames, the pictures that ``egs-warp animate`` leaves of each step, the
+capture that was trained, and ``row.json``.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import resource
 from collections.abc import Mapping, Sequence
@@ -27,7 +26,6 @@ from egs_warp.io import read_cameras, read_capture
 from egs_warp.io.ply import write_ply
 from egs_warp.io.run_folder import RunFolder, run_folder
 from egs_warp.io.video import write_png
-from egs_warp.launching import use_device
 from egs_warp.locomotion.ledger import ledger
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import make_creature
@@ -206,23 +204,3 @@ def _pictures(run: RunFolder, cloud: GaussianCloud, scene: PreparedScene, camera
         write_png(run.file("filled.png"), before_and_after(scene.filled))
     scene.write(run)
     return words
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """One scene."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", choices=FILMS)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--nodes", type=int, default=500, help="of the cage, about (500, as egs-warp animate)")
-    parser.add_argument("--frames", type=int, help="pictures, at most; else until the object rests")
-    parser.add_argument("--trained", type=Path, help="a capture that was trained from the photos before")
-    chosen = parser.parse_args(arguments)
-    use_device(chosen.device)
-    given = {name: getattr(chosen, name) for name in ("device", "nodes", "frames", "trained")}
-    row = film(chosen.scene, chosen.out, **given)
-    print(", ".join(f"{stage} {value:.1f} s" for stage, value in row["seconds"].items()), row["ended"], sep="; ")
-
-
-if __name__ == "__main__":
-    main()

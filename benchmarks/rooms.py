@@ -45,13 +45,12 @@ from egs_warp.pipelines.train_capture import train
 from egs_warp.segmentation.object_spec import ObjectSpec
 from egs_warp.segmentation.votes import MaskedView
 from harness import Row, Table, data_folder, flags, report, timed
-from room_films import CLICKS, FILMS, is_here
+from room_films import CLICKS, FILMS, film, is_here
 from room_ground import judged_ground, known_ground, real_ground
 from train_peers import has_gsplat
 
 IOU_MASKS, IOU_FOLIAGE, IOU_CLICKS = 0.95, 0.90, 0.88
 PEERS = ("bonsai", "mouse", "plush_dog")
-_SCRIPT = Path(__file__).with_name("room_films.py")
 
 
 def film_rows(options: argparse.Namespace) -> list[Row]:
@@ -61,10 +60,8 @@ def film_rows(options: argparse.Namespace) -> list[Row]:
 
     def one(name: str) -> Row:
         out = options.films / name
-        command = [sys.executable, str(_SCRIPT), name, "--out", str(out), "--device", options.device]
-        command += ["--nodes", str(options.nodes)]
-        if options.trained and (options.trained / f"{name}.ply").exists():
-            command += ["--trained", str(options.trained / f"{name}.ply")]
+        command = [sys.executable, __file__, "--one", name, "--films", str(options.films), "--device", options.device]
+        command += ["--nodes", str(options.nodes), *(["--trained", str(options.trained)] if options.trained else [])]
         options.films.mkdir(parents=True, exist_ok=True)
         with (options.films / f"{name}.log").open("w") as log:
             status = subprocess.run(command, stdout=log, stderr=log, env={**os.environ, **limits}).returncode
@@ -175,7 +172,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--nodes", type=int, default=500, help="of the cages of the films, about")
     parser.add_argument("--only", nargs="*", metavar="SCENE", help="these scenes")
     parser.add_argument("--peers", action="store_true", help="train with gsplat, too, for psnr_vs_gsplat")
+    parser.add_argument("--one", choices=FILMS, help="the film of this scene, and nothing else")
     options = parser.parse_args(arguments)
+    if options.one:
+        made = options.trained / f"{options.one}.ply" if options.trained else None
+        known = made if made and made.exists() else None
+        film(options.one, options.films / options.one, device=options.device, nodes=options.nodes, trained=known)
+        return
     rows: list[Row] = film_rows(options) if options.films else []
     figure: list[np.ndarray] = []
     table = Table(scene="<10", how="<9", IoU=".3f", worst=".3f", seconds="6.1f", ground="s")
