@@ -75,10 +75,10 @@ EQUATIONS: dict[int, Mutation] = {
             "contact/test_detection.py::test_gaps_kernel_equals_its_twin",
         ),
         (
-            *(9, "the radius of Coulomb's cone", "contact/coulomb.py"),
+            *(9, "the radius of Coulomb's cone", "kernels/contact/coulomb.py"),
             *(
-                "    radius = friction * np.maximum(normal, 0.0)",
-                "    radius = 1.02 * friction * np.maximum(normal, 0.0)",
+                "radius = contacts.friction * wp.max(normal, real(0.0))",
+                "radius = real(1.02) * contacts.friction * wp.max(normal, real(0.0))",
             ),
             "contact/test_detection.py::test_coulomb_forces_on_random_problems",
         ),
@@ -91,11 +91,8 @@ EQUATIONS: dict[int, Mutation] = {
             "contact/test_coupled_step.py::test_foreseen_forces_press_and_rub_no_more_than_they_may",
         ),
         (
-            *(11, "Coulomb's limit", "contact/coulomb.py"),
-            *(
-                "projected[..., 1:] *= np.where(length > radius, radius / np.where(length > 0, length, 1.0), 1.0)",
-                "projected[..., 1:] *= np.ones(length.shape)",
-            ),
+            *(11, "Coulomb's limit", "kernels/contact/coulomb.py"),
+            *("            share = radius / pull\n        newton", "            share = real(1.0)\n        newton"),
             "contact/test_coupled_step.py::test_foreseen_forces_press_and_rub_no_more_than_they_may",
         ),
         (
