@@ -150,7 +150,7 @@ def summary(records: list[Row], old: float | None, device: str) -> dict[str, Any
     whole = [rows[0] for rows in cages]
     small, usual, large = (
         next((row for row in whole if low <= row["nodes"] <= high), None)
-        for low, high in ((200, 300), (500, 620), (900, 1150))
+        for low, high in ((200, 300), (500, 620), (900, 1200))
     )
 
     def within(row: Row | None, mean: float, worst: float) -> bool | None:

@@ -26,24 +26,28 @@ class DenseFactors:
         self._lower = torch.from_numpy(columns * count + rows).to(self._device)
         self._matrix, self._other = torch.zeros((2, count, count), dtype=torch.float64, device=self._device)
         self._identity = torch.eye(count, dtype=torch.float64, device=self._device)
+        self._finite = False
         self._factor: torch.Tensor | None = None
         self._inverse: torch.Tensor | None = None
 
     def update(self, entries: np.ndarray) -> bool:
         """See ``Factors``; what is not positive definite has no factors."""
-        self._fill(self._matrix, entries)
         self._factor = self._inverse = None
-        factor, info = torch.linalg.cholesky_ex(self._matrix)
-        if int(info) != 0 or not np.isfinite(entries).all():
+        self._finite = bool(np.isfinite(entries).all())
+        if not self._finite:
             return False
-        self._factor = factor
-        return True
+        self._fill(self._matrix, entries)
+        factor, info = torch.linalg.cholesky_ex(self._matrix)
+        self._factor = factor if int(info) == 0 else None
+        return self.ready
 
     def add(self, across: np.ndarray, rates: np.ndarray) -> bool:
-        """See ``Factors``."""
+        """See ``Factors``; S keeps its own factor where the sum has none."""
+        if not self._finite or not (np.isfinite(across).all() and np.isfinite(rates).all()):
+            return False
         directions = self.take(across)
         factor, info = torch.linalg.cholesky_ex(torch.addmm(self._matrix, directions * self.take(rates), directions.T))
-        if int(info) != 0 or not bool(torch.isfinite(factor[-1, -1])):
+        if int(info) != 0:
             return False
         self._factor, self._inverse = factor, None
         return True

@@ -24,7 +24,7 @@ class Factors(Protocol):
 
     def add(self, across: np.ndarray, rates: np.ndarray) -> bool:
         """From now on solve with S + U diag(r) U^T, ``across`` U (n, k) and ``rates`` r (k,); False, and nothing is
-        added, if that is not positive definite."""
+        added, if that is not positive definite. Once after ``update`` with success."""
         ...
 
     @property

@@ -142,7 +142,7 @@ def search_pieces(
     sliding, modes = modes, ContactModes(np.where(modes.kind == SLIDE, STICK, modes.kind), modes.slip)
     while count < qp_limit:
         count += 1
-        solution = solve_piece(program, start, modes, solver, beside=count > 1)
+        solution = solve_piece(program, start, modes, solver, beside=best is not None)
         if solution is None:
             infeasible += 1
             if best is not None or infeasible > 1 or (sliding.kind != SLIDE).all():

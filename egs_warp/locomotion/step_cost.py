@@ -12,7 +12,7 @@ import numpy as np
 
 from egs_warp.contact.detection import ContactSet
 from egs_warp.fem.factors import Factors
-from egs_warp.fem.step_problem import StepProblem
+from egs_warp.fem.step_problem import StepProblem, UnsolvableStepError
 from egs_warp.locomotion.objectives import AnyObjective
 
 EFFORT = 1.0
@@ -107,6 +107,8 @@ def effort_cost(
     implicit = time**2 * entries
     implicit[assembly.diagonal_entries] += np.repeat(body.node_mass, 3)
     factors.update(implicit)
+    if not factors.ready:
+        raise UnsolvableStepError("the matrix of what is foreseen has no factors")
     speeds = factors.take(np.column_stack([linear.columns, linear.base]))
     further = factors.solve(factors.take(np.repeat(body.node_mass, 3)[:, None]) * speeds)
     moves = problem.dt * speeds + (time - problem.dt) * further

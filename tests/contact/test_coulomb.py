@@ -75,3 +75,29 @@ def test_the_answer_obeys_where_tangents_differ(friction: float) -> None:
         np.testing.assert_allclose(pull[sliding], friction * forces[sliding, 0], atol=1e-8)
         along = (forces[:, 1:] * speed[:, 1:]).sum(axis=1)
         np.testing.assert_allclose(along[sliding], -(pull * slip)[sliding], atol=1e-7)
+
+
+def test_forces_of_what_is_no_number_are_those_of_the_start() -> None:
+    """They are told apart: the residual is infinite."""
+    delassus, free, shift, start = problem(0)
+    free[4] = np.nan
+    forces, size = coulomb_forces(delassus, free, shift, 0.5, start)
+    assert size == np.inf and np.array_equal(forces[:, 0], start[:, 0])
+
+
+def test_many_points_under_a_soft_base_are_solved_from_rest() -> None:
+    """25 points that move as 12 unknowns do, made unique as a step makes them, pressed, pushed and turned: their
+    equations hold, and no force is large.
+    """
+    random = np.random.default_rng(2)
+    place = np.stack(np.meshgrid(np.linspace(-1.0, 1.0, 5), np.linspace(-1.0, 1.0, 5)), axis=-1).reshape(-1, 2)
+    corners = np.stack([(1 - place[:, 0]) * (1 - place[:, 1]), (1 + place[:, 0]) * (1 - place[:, 1])], axis=1)
+    corners = 0.25 * np.hstack([corners, np.stack([(1 - place[:, 0]), (1 + place[:, 0])], axis=1) * (1 + place[:, 1:])])
+    rows = np.kron(corners, np.eye(3))
+    half = random.normal(size=(12, 12))
+    delassus = rows @ (half @ half.T + np.eye(12)) @ rows.T
+    delassus[np.diag_indices_from(delassus)] += 1e-7 * delassus.diagonal().mean()
+    for _ in range(40):
+        free = rows @ (random.normal(size=12) + np.tile([-1.0, 0.3, 0.0], 4))
+        forces, size = coulomb_forces(delassus, free, np.zeros(25), 0.5, np.zeros((25, 3)))
+        assert size < 1e-10 and np.abs(forces).sum() < 1e3

@@ -59,6 +59,12 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
         assert dense.add(across, rates) == thin.add(across, rates) == definite
         if definite:
             assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-12
+        # What is refused changes nothing.
+        assert not dense.add(across, np.full(8, -1e3)) and not thin.add(across, np.full(8, -1e3))
+        assert dense.update(entries) == thin.update(entries) == definite
+        if definite:
+            assert not dense.add(across, np.full(8, -1e3)) and not thin.add(across, np.full(8, -1e3))
+            assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-12
         # As much along every axis as makes the sum definite.
         assert dense.add(np.eye(60), np.full(60, 40.0)) and thin.add(np.eye(60), np.full(60, 40.0)) and dense.ready
         assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-10
@@ -69,7 +75,9 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
 def test_what_is_not_finite_has_no_factors(device: str) -> None:
     upper = pattern(20)
     factors = DenseFactors(upper, device=device)
-    assert not factors.update(np.full(upper.nnz, np.nan)) and not factors.ready
+    for value in (np.nan, np.inf):
+        assert not factors.update(np.full(upper.nnz, value)) and not factors.ready
+        assert not factors.add(np.eye(20), np.ones(20)) and not factors.ready
     assert factors.update(entries_of(upper, 0, 30.0)) and factors.ready
     assert not factors.add(np.full((20, 1), np.nan), np.ones(1))
 

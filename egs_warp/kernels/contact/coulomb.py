@@ -18,12 +18,12 @@ _HALVINGS = wp.constant(10)
 _LESS = wp.constant(real(1e-4))
 """Of a step's length: share by which it has to make the residual smaller."""
 _SHORT = wp.constant(real(1e-6))
-"""Of a force's step by newtons, for a rate of 1: of the steps that redundant contacts leave, a short one is taken, and
-rounding is not made large by those that they nearly leave. Of 296 problems of jumps that 1e-9 and steps of one rate
-left at 1e-4 m/s, 1e-9 with other rates ends 165 at the tolerance, 1e-6 282."""
+"""Added to the diagonal of the equations of contacts that stick, whose entries are about 1: of the steps that redundant
+contacts leave, a short one is taken, and rounding is not made large by those that they nearly leave. Of 296 problems of
+jumps that 1e-9 and steps of one rate left at 1e-4 m/s, 1e-9 with other rates ends 165 at the tolerance, 1e-6 282."""
 _POLISHES = wp.constant(2)
 _FINEST = wp.constant(real(1e-10))
-"""In place of that in the last steps, which leave nothing of it."""
+"""The same in the last steps: too small to be seen in the answer."""
 _SINGULAR = wp.constant(real(1e-14))
 """Of the largest pivot so far: one that is smaller leaves its unknown at zero."""
 
@@ -125,6 +125,9 @@ def missed(contacts: Contacts, forces: wp.array[real], scale: real, length: real
             speed = newton.values[n + t] / rate
             most = wp.max(most, wp.abs(speed))
             square += speed * speed
+    # A maximum passes over what is no number, a sum does not.
+    if not square < real(wp.inf):
+        most = real(wp.inf)
     return wp.vec2d(most, wp.sqrt(square))
 
 
@@ -315,10 +318,13 @@ def coulomb_kernel(
     residual: wp.array[real],
 ):
     """In one thread: sweeps, then semismooth Newton on the projection equations of Alart and Curnier, the step halved
-    until it makes them smaller; where that gets stuck, more sweeps and whole steps at other rates. ``forces`` are the
-    best that were met, within the cone, and ``residual`` how far from the equations those are, m/s."""
+    until it makes them smaller; where that gets stuck, more sweeps and whole steps at other rates. ``forces`` are those
+    that obey, else the best of the first attempt, within the cone; ``residual`` is how far from the equations they are,
+    m/s, and infinite where nothing is a number."""
     count = contacts.shifts.shape[0]
     least = real(wp.inf)
+    for k in range(3 * count):
+        newton.best[k] = forces[k]
     for attempt in range(7):
         scale = _RATES[attempt]
         sweeps = _MORE_SWEEPS
@@ -359,7 +365,8 @@ def coulomb_kernel(
         one = real(1.0)
         find_velocities(contacts, forces, newton)
         for _ in range(_POLISHES):
-            missed(contacts, forces, one, real(0.0), newton)
+            now = missed(contacts, forces, one, real(0.0), newton)
+            least = now[0]
             find_step(contacts, forces, one, _FINEST, newton)
             size = missed(contacts, forces, one, one, newton)
             if not size[0] < tolerance:

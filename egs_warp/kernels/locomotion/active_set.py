@@ -197,6 +197,10 @@ def hold_those_that_pull(program: Program, search: Search):
         return hold(program, search)
     while let_go_of_wrong(program, search, count) > 0:
         count = hold(program, search)
+        if count < 0:
+            for row in range(search.side.shape[0]):
+                search.side[row] = 0
+            count = hold(program, search)
     return count
 
 
@@ -228,7 +232,7 @@ def leave(search: Search, count: int, place: int):
 @wp.func
 def join(program: Program, search: Search, active: int, row: int):
     """How many rows are active when ``row`` is held beside them, less those whose pull ends on the way; -1 where no
-    point satisfies it beside those."""
+    point satisfies it beside those, -2 where rounding leaves no way."""
     count = int(active)
     sign = int(-1)
     bound = program.upper[row]
@@ -269,6 +273,8 @@ def join(program: Program, search: Search, active: int, row: int):
         if apart > _DEPENDENT * square:
             whole = towards * (bound - place_of(search, row)) / apart
         step = wp.min(whole, part)
+        if not apart < real(wp.inf):
+            return -2
         if not step < real(wp.inf):
             return -1
         pull += step
@@ -281,7 +287,7 @@ def join(program: Program, search: Search, active: int, row: int):
             search.pulls[i] = search.pulls[i] - step * search.rates[i]
         if whole <= part:
             if count == search.active.shape[0]:
-                return -1
+                return -2
             for i in range(count):
                 search.factor[count, i] = search.across[i]
             search.factor[count, count] = wp.sqrt(apart + _REDUNDANT)
@@ -325,7 +331,11 @@ def descend(program: Program, search: Search, active: int, pivots: int):
         if row < 0:
             return FOUND
         count = join(program, search, count, row)
-        if count < 0 or cost_of(program, search, count) > program.most:
+        if count == -2:
+            return ASTRAY
+        if count < 0:
+            return INFEASIBLE
+        if cost_of(program, search, count) > program.most:
             return INFEASIBLE
     return ASTRAY
 
