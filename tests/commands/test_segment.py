@@ -160,6 +160,7 @@ def test_inpaint_fills_the_hole_that_animate_fills(folder: Path, tmp_path: Path)
     assert main(["segment", str(folder / "scene.ply"), *flags]) == 0
     options = SceneOptions(clearing=Clearing.SPLIT, inpaint=False)
     prepared = prepare_scene(cloud, spec, plane=FLOOR, options=options)
+    assert prepared.hole is not None
     expected = inpaint(
         prepared.bare, prepared.hole, inpainter=inpainter_by_name("ns"), options=InpaintOptions(steps=0)
     ).cloud.means.numpy()
