@@ -318,8 +318,8 @@ def coulomb_kernel(
     residual: wp.array[real],
 ):
     """In one thread: sweeps, then semismooth Newton on the projection equations of Alart and Curnier, the step halved
-    until it makes them smaller; where that gets stuck, more sweeps and whole steps at other rates. ``forces`` are those
-    that obey, else the best of the first attempt, within the cone; ``residual`` is how far from the equations they are,
+    until it makes them smaller; where that gets stuck, more sweeps and whole steps at other rates. ``forces`` are the
+    best that were met, within the cone; ``residual`` is how far from the equations they are,
     m/s, and infinite where nothing is a number."""
     count = contacts.shifts.shape[0]
     least = real(wp.inf)
@@ -336,8 +336,7 @@ def coulomb_kernel(
         find_velocities(contacts, forces, newton)
         for _ in range(steps):
             size = missed(contacts, forces, scale, real(0.0), newton)
-            # What whole steps pass on their way to nowhere hangs on rounding.
-            if size[0] < least and (attempt == 0 or size[0] < tolerance):
+            if size[0] < least:
                 least = size[0]
                 for k in range(3 * count):
                     newton.best[k] = forces[k]
