@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -133,7 +134,11 @@ def roll_out(
             held = None if activations is None else activations[frame * per_frame + part]
             asked = digest([*objectives, *(given for given in (kick, held) if given is not None)])
             done = replay.step(asked) if replay is not None else []
-            done = done or _advanced(stepper, state.kicked(kick), memory, objectives if held is None else held, dt)
+            begin = state.kicked(kick)
+            if held is None:
+                done = done or _advanced(partial(stepper.advance, begin, memory, objectives, dt))
+            else:
+                done = done or _advanced(partial(stepper.advance_held, begin, memory, held, dt))
             stopped = not done
             if stopped:
                 break
@@ -149,18 +154,10 @@ def roll_out(
     return Simulation(recorder.trajectory(), tuple(reports), np.array(shown), stopped)
 
 
-def _advanced(
-    stepper: LocomotionStepper,
-    state: BodyState,
-    memory: StepMemory,
-    asked: Sequence[AnyObjective] | np.ndarray,
-    dt: float,
-) -> list[StepReport]:
-    """A step in the parts it was divided into; none if it cannot be solved, nor any part of it. ``asked``: objectives,
-    or the activations themselves."""
-    advance = stepper.advance_held if isinstance(asked, np.ndarray) else stepper.advance
+def _advanced(advance: Callable[[], tuple[BodyState, StepMemory, list[StepReport]]]) -> list[StepReport]:
+    """A step in the parts it was divided into; none if it cannot be solved, nor any part of it."""
     try:
-        _, _, done = advance(state, memory, asked, dt)  # pyright: ignore[reportArgumentType]
+        _, _, done = advance()
     except (UnsolvableStepError, np.linalg.LinAlgError):
         return []
     return done if any(report.converged for report in done) else []
