@@ -19,10 +19,11 @@ import scipy.sparse as sparse
 from egs_warp.contact.detection import ContactDetector
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
+from egs_warp.io.arrays import DAMAGES
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.recorder import REPORTED
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.locomotion.trajectory import DAMAGES, FIRST_PART, part_paths, read_arrays
+from egs_warp.locomotion.trajectory import FIRST_PART, part_paths, read_arrays
 
 
 class Replay:

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import lzma
-import struct
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +11,7 @@ import numpy as np
 
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.frames import best_turn
+from egs_warp.io.arrays import read_npz
 from egs_warp.io.atomic import atomic_write
 
 SCHEMA = 2
@@ -38,11 +34,6 @@ KICKS = ("kick_step", "kick_velocity")
 """Arrays of a row for each step that something from outside pushes in."""
 FIRST_PART = "start.npz"
 """Of a recording that goes on: what never changes, and the state it began at."""
-DAMAGES = (
-    *(OSError, EOFError, RuntimeError, KeyError, IndexError, ValueError, TypeError),
-    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error),
-)
-"""What reading a damaged file of arrays, or using what it holds, ends in."""
 
 
 @dataclass(frozen=True)
@@ -194,10 +185,7 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """What ``write_arrays`` wrote. Raises ``ValueError`` for a file of another schema, and ``DAMAGES``."""
-    with zipfile.ZipFile(path) as archive:
-        # Each member is read whole, which compares its checksum, before anything of it is believed.
-        members = {name.removesuffix(".npy"): BytesIO(archive.read(name)) for name in archive.namelist()}
-    arrays = {name: np.lib.format.read_array(member, allow_pickle=False) for name, member in members.items()}
+    arrays = read_npz(path)
     schema = int(arrays.pop("schema", 1))
     if schema != SCHEMA:
         raise ValueError(f"it is of schema {schema}, this version reads schema {SCHEMA}")

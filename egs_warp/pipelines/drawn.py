@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,9 @@ import scipy.sparse as sp
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.io.arrays import DAMAGES, read_npz
 from egs_warp.io.atomic import atomic_write
+from egs_warp.io.limits import FURTHEST, check_pixels
 from egs_warp.motions.feet import Foot
 from egs_warp.muscles.muscle_set import MuscleSet
 
@@ -86,14 +87,13 @@ class DrawnCreature:
     def load(cls, path: Path, *, node_count: int, device: str | None = None) -> DrawnCreature:
         """Read what ``save`` wrote for a cage of ``node_count`` nodes. Raises ``UserError`` for any other file."""
         try:
-            with np.load(path, allow_pickle=False) as data:
-                arrays = {name: data[name] for name in data.files}
+            arrays = read_npz(path)
             camera: dict[str, Any] = {name: arrays[f"camera_{name}"] for name in _CAMERA}
             whole: dict[str, Any] = {name: int(camera[name]) for name in ("width", "height")}
             real: dict[str, Any] = {name: float(camera[name]) for name in ("fx", "fy", "cx", "cy", "near", "far")}
             starts = arrays["muscle_end_starts"]
             rows = (arrays["muscle_end_weights"], arrays["muscle_end_nodes"], starts)
-            return cls(
+            found = cls(
                 GaussianCloud.from_numpy(*(arrays[name] for name in _SPLATS), device=device),
                 Camera(**whole, **real, rotation=camera["rotation"], translation=camera["translation"]),
                 sp.csr_matrix(rows, shape=(len(starts) - 1, node_count)),
@@ -104,7 +104,39 @@ class DrawnCreature:
                 tuple(map(str, arrays["fibre_kinds"])),
                 arrays["foot_from_node"],
             )
+            found._check(node_count)
         except FileNotFoundError as error:
             raise UserError(f"{path}: is missing; run egs-warp animate again, which writes it") from error
-        except (OSError, KeyError, ValueError, TypeError, zipfile.BadZipFile) as error:
+        except DAMAGES as error:
             raise UserError(f"{path}: cannot be read ({error}); run egs-warp animate again, which writes it") from error
+        return found
+
+    def _check(self, node_count: int) -> None:
+        """Raise ``ValueError`` for what cannot be drawn."""
+        camera, ends = self.camera, self.muscle_ends
+        ends.check_format()
+        check_pixels(camera.width, camera.height, "its camera")
+        numbers = np.concatenate([camera.rotation.ravel(), camera.translation, [camera.cx, camera.cy, camera.far]])
+        if (camera.rotation.shape, camera.translation.shape) != ((3, 3), (3,)) or not (abs(numbers) <= FURTHEST).all():
+            raise ValueError("its camera stands nowhere")
+        lengths = np.array([camera.fx, camera.fy, camera.near, camera.far - camera.near])
+        if not (lengths > 0.0).all() or lengths.max() > FURTHEST or min(camera.width, camera.height) < 1:
+            raise ValueError("its camera sees nothing")
+        count = len(self.muscle_bounds)
+        _check_rows("muscle_segments", self.muscle_segments, (count, 2), 0, len(ends.indptr) - 1)
+        _check_rows("fibre_from_segment", self.fibre_from_segment, (count,), 0, len(self.fibre_names))
+        _check_rows("foot_from_node", self.foot_from_node, (node_count,), -1, node_count)
+        if len(self.fibre_names) != len(self.fibre_kinds):
+            raise ValueError("fibre_names and fibre_kinds are not alike")
+        if self.muscle_bounds.shape != (count,) or not np.isfinite(self.muscle_bounds).all():
+            raise ValueError("muscle_bounds are no bounds")
+        if not (np.abs(ends.data) <= FURTHEST).all():
+            raise ValueError("muscle_end_weights are no weights")
+
+
+def _check_rows(name: str, values: np.ndarray, shape: tuple[int, ...], least: int, below: int) -> None:
+    """Raise ``ValueError`` for what are not whole numbers of this ``shape`` from ``least`` to ``below``, left out."""
+    if values.shape != shape or values.dtype.kind not in "iu":
+        raise ValueError(f"{name} has shape {values.shape} of {values.dtype}")
+    if values.size and not least <= values.min() <= values.max() < below:
+        raise ValueError(f"{name} points at what is not there")

@@ -16,10 +16,12 @@ from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.io.arrays import DAMAGES
 from egs_warp.io.capture import read_capture
 from egs_warp.io.text import parse_json, read_text
 from egs_warp.locomotion.rollout import FRAME_RATE
-from egs_warp.locomotion.trajectory import DAMAGES, Trajectory
+from egs_warp.locomotion.soundness import check_trajectory
+from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines import drawn
 from egs_warp.pipelines.drawn import DrawnCreature
 from egs_warp.pipelines.shot import nearest_steps
@@ -34,7 +36,8 @@ def read_trajectory(path: Path) -> Trajectory:
     Raises ``UserError`` where there is none, or another kind of file.
     """
     try:
-        return Trajectory.load(path)
+        trajectory = Trajectory.load(path)
+        check_trajectory(trajectory)
     except FileNotFoundError as error:
         if not path.is_dir() and (path.parent / PARTS).is_dir():
             raise UserError(
@@ -44,6 +47,7 @@ def read_trajectory(path: Path) -> Trajectory:
         raise UserError(f"{path}: is missing; give the folder that egs-warp animate wrote") from error
     except DAMAGES as error:
         raise UserError(f"{path}: is no trajectory ({error}); run egs-warp animate again, which writes it") from error
+    return trajectory
 
 
 @dataclass(frozen=True)
@@ -67,6 +71,9 @@ class FinishedRun:
             raise UserError(f"{folder}: is no folder; give the one that egs-warp animate wrote")
         trajectory = read_trajectory(folder / "trajectory.npz")
         creature = DrawnCreature.load(folder / drawn.FILE, node_count=len(trajectory.rest_positions))
+        if len(creature.muscle_bounds) != trajectory.activations.shape[1]:
+            advice = "run egs-warp animate again, which writes both"
+            raise UserError(f"{folder / drawn.FILE}: has other muscles than trajectory.npz; {advice}")
         report = parse_json(read_text(folder / "report.json"), folder / "report.json")
         if not isinstance(report, dict):
             raise UserError(f"{folder / 'report.json'}: is no report; run egs-warp animate again, which writes it")

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-import zipfile
 from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
+from egs_warp.io.arrays import DAMAGES, read_npz
 from egs_warp.io.atomic import atomic_write
 from egs_warp.version import __version__
 
@@ -52,11 +52,10 @@ class Checkpoint:
         if not self.path.is_file():
             raise UserError(f"{self.path}: no training was cut off here; begin it")
         try:
-            with np.load(self.path, allow_pickle=False) as file:
-                state: State = {name: file[name] for name in file.files}
+            state: State = dict(read_npz(self.path))
             facts = json.loads(str(state.pop("facts")))
             state |= facts["state"]
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        except (*DAMAGES, RecursionError) as error:
             raise UserError(f"{self.path}: is damaged; begin the training again") from error
         if facts.get("digest") != digest:
             raise UserError(

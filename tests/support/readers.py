@@ -15,7 +15,7 @@ import tempfile
 import time
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn
@@ -37,13 +37,21 @@ from egs_warp.io.onnx import read_onnx
 from egs_warp.io.photos import read_photo
 from egs_warp.io.planes import read_planes
 from egs_warp.io.ply import read_point_ply
+from egs_warp.io.run_folder import MANIFEST, has_finished
 from egs_warp.locomotion.replay import Replay
+from egs_warp.motions.beats import read_beats
+from egs_warp.motions.command import read_drive
 from egs_warp.motions.keyframes import read_keyframes
+from egs_warp.motions.route import read_path
 from egs_warp.motions.script import motion
 from egs_warp.muscles.files import read_muscles
 from egs_warp.pipelines.shot import Shot
+from egs_warp.training.checkpoint import Checkpoint
+from egs_warp.version import __version__
+from egs_warp.web.messages import read_message
 from tests.support import onnx
 from tests.support.captures import ARRAYS, good_bytes, small_cloud, spz_of_streams
+from tests.support.finished_runs import arrays_as_json, draw_run, finished_run, npz_of_json
 from tests.support.meshes import block_mesh
 from tests.support.slides import slide
 
@@ -330,6 +338,66 @@ def _replayed(path: Path) -> None:
     assert len(reports) == 8 and all(np.isfinite(report.state.positions).all() for report in reports)
 
 
+def _beats(path: Path) -> None:
+    beats = read_beats(path)
+    assert beats and np.isfinite(beats).all() and (np.diff(beats) > 0.0).all()
+
+
+def _way(path: Path) -> None:
+    assert np.isfinite(read_path(path)).all()
+
+
+def _drive(path: Path) -> None:
+    plan = read_drive(path)
+    assert 0.0 <= plan.seconds < 1e5 and np.isfinite(astuple(plan.at(plan.seconds))).all()
+
+
+_MESSAGES = [
+    *({"type": "motion", "text": "hop x3, twist 90"}, {"type": "go", "x": 0.5, "y": -0.2}),
+    *({"type": "drive", "forward": 0.3, "turn": 0.5}, {"type": "pull", "node": 3, "x": 0.1, "y": 0.0, "z": 0.2}),
+    *({"type": "push", "x": 0.1, "y": 0.0, "z": 0.0, "height": 0.8}, {"type": "set", "friction": 0.5, "sag": 0.03}),
+    *({"type": "pause", "on": True}, {"type": "cancel"}, {"type": "record", "on": False}),
+]
+
+
+def _messages(path: Path) -> None:
+    """As the server of ``live`` takes them: what makes no sense goes back in one line."""
+    try:
+        tree = json.loads(path.read_bytes())
+        for message in tree if isinstance(tree, list) else [tree]:
+            if not isinstance(message, dict):
+                raise ValueError("not an object")
+            read_message(message, height=1.0, node_count=50)
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise UserError(str(error)[:200].replace("\n", " ")) from None
+
+
+_MANIFEST = {
+    **{"schema": 1, "version": __version__, "command": "animate", "finished": False},
+    "files": {"run.yaml": None, "a/b.ply": {"bytes": 3, "sha256": "0" * 64}},
+}
+
+
+def _manifest(path: Path) -> None:
+    (path.parent / "run.yaml").touch()
+    assert has_finished(path.parent) in (True, False)
+
+
+@cache
+def _training() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        kept = Checkpoint(Path(folder) / "a.training.npz")
+        kept.begin("digest")
+        kept.write({"step": 3, "losses": np.arange(3.0), "queue": [1, 2], "order": {"state": 2**100}})
+        return kept.path.read_bytes()
+
+
+def _trained(path: Path) -> None:
+    state = Checkpoint(path, resume=True).begin("digest")
+    assert state is not None and state["losses"].shape == (3,)
+
+
+_NPZ = ("trajectory.npz", "creature.npz")
 READERS: tuple[Reader, ...] = (
     Reader("ply", "a.ply", lambda: good_bytes("a.ply"), _capture),
     Reader("text ply", "a.ply", _text_ply, _capture),
@@ -370,4 +438,19 @@ READERS: tuple[Reader, ...] = (
     Reader("photo png", "a.png", lambda: _picture("PNG", "RGB"), _photo),
     Reader("photo jpeg", "a.jpg", lambda: _picture("JPEG", "RGB"), _photo),
     Reader("onnx", "a.onnx", _network, read_onnx),
+    Reader("beats", "beats.csv", lambda: b"beat\n0.5\n1.0\n1.5\n", _beats),
+    Reader("way", "way.csv", lambda: b"ahead,left\n0.2,0\n0.5,0.1\n0.9,-0.2\n", _way),
+    Reader("drive", "drive.csv", lambda: b"time,forward,sideways,turn\n0,0.3,0,0\n2,0.1,0.1,0.5\n4,0,0,0\n", _drive),
+    Reader("message of the page", "message.json", lambda: _json(_MESSAGES), _messages, json=True),
+    Reader("manifest", MANIFEST, lambda: _json(_MANIFEST), _manifest, json=True),
+    Reader("training to go on with", "a.training.npz", _training, _trained),
+    *(Reader(f"run: {name}", name, lambda name=name: finished_run()[name], draw_run, finished_run) for name in _NPZ),
+    *(
+        Reader(
+            **{"name": f"arrays of {name}", "file": name, "good": lambda name=name: arrays_as_json(name)},
+            **{"read": draw_run, "beside": finished_run, "wrap": npz_of_json, "json": True},
+        )
+        for name in _NPZ
+    ),
+    Reader("report of a run", "report.json", lambda: finished_run()["report.json"], draw_run, finished_run, json=True),
 )

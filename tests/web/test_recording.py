@@ -150,6 +150,17 @@ def test_a_scene_behind_it_travels_too(run_folder: Path, tmp_path: Path):
     np.testing.assert_allclose(arrays["scene_means"], expected, atol=1e-5)
 
 
+def _shorten(path: Path, *names: str, end: int) -> None:
+    """These arrays of a file up to row ``end``: each is whole, the file is not."""
+    with np.load(path) as file:
+        arrays = dict(file)
+    arrays |= {name: arrays[name][:end] for name in names}
+    np.savez(path, **arrays)  # pyright: ignore[reportArgumentType]
+
+
+_MUSCLES = ("muscle_segments", "muscle_bounds", "fibre_from_segment")
+
+
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
@@ -158,6 +169,9 @@ def test_a_scene_behind_it_travels_too(run_folder: Path, tmp_path: Path):
         (lambda folder: (folder / "trajectory.npz").write_bytes(b"PK\x03\x04 no zip"), "is no trajectory"),
         (lambda folder: (folder / "creature.npz").unlink(), "creature.npz: is missing; run egs-warp animate again"),
         (lambda folder: np.savez(folder / "creature.npz", means=np.zeros((2, 3))), "creature.npz: cannot be read"),
+        (lambda folder: _shorten(folder / "creature.npz", *_MUSCLES, end=-1), "has other muscles than trajectory.npz"),
+        (lambda folder: _shorten(folder / "creature.npz", "foot_from_node", end=0), "foot_from_node has shape"),
+        (lambda folder: _shorten(folder / "trajectory.npz", "tets", end=0), "is no trajectory (its arrays do not fit"),
         (lambda folder: (folder / "report.json").write_text("[]"), "report.json: is no report"),
     ],
 )

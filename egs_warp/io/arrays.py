@@ -1,0 +1,52 @@
+"""Arrays by name in one file: ``.npz`` as ``numpy.savez`` writes it.
+
+Such files may be damaged or a stranger's: what a file declares is compared with how large it is before memory is taken.
+"""
+
+from __future__ import annotations
+
+import lzma
+import math
+import struct
+import zipfile
+import zlib
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+
+DAMAGES = (
+    *(OSError, EOFError, RuntimeError, KeyError, IndexError, ValueError, TypeError, OverflowError),
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error),
+)
+"""What reading a damaged file of arrays, or using what it holds, ends in."""
+_NUMBERS = "biufU"
+"""Kinds of arrays that are read: numbers, truths and texts."""
+
+
+def read_npz(path: Path) -> dict[str, np.ndarray]:
+    """All arrays of the file. Raises ``DAMAGES``."""
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        if any(member.compress_type != zipfile.ZIP_STORED for member in members):
+            raise ValueError("its arrays are compressed")
+        # Members may overlap: each would be read whole.
+        if sum(member.file_size for member in members) > path.stat().st_size:
+            raise ValueError("its arrays are larger than the file")
+        # Each member is read whole, which compares its checksum, before anything of it is believed.
+        return {member.filename.removesuffix(".npy"): _array(archive.read(member)) for member in members}
+
+
+def _array(data: bytes) -> np.ndarray:
+    member = BytesIO(data)
+    version = np.lib.format.read_magic(member)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"an array of format {version[0]}.{version[1]}")
+    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = header(member)
+    if dtype.kind not in _NUMBERS or dtype.itemsize == 0:
+        raise ValueError(f"an array of {dtype}")
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(data) - member.tell():
+        raise ValueError(f"an array of shape {str(shape)[:80]} has other bytes")
+    member.seek(0)
+    return np.lib.format.read_array(member, allow_pickle=False)
