@@ -106,7 +106,7 @@ class StepPlanner:
         activations = (self.synergies.members @ found.x[:m]) * self.muscles.bounds
         moved = program.linear.base + program.linear.columns[:, :m] @ found.x[:m]
         asked = self.body.weight * found.x[m:].reshape(-1, 3)
-        forces = prospect.response.forces(moved, prospect.shift, self.friction, asked)
+        forces, _ = prospect.response.forces(moved, prospect.shift, self.friction, asked)
         velocities = (moved + prospect.response.columns @ forces.ravel()).reshape(prospect.velocities.shape)
         clock.lap("contact")
         if not problem.feasible(velocities):

@@ -268,7 +268,7 @@ class LocomotionStepper:
         response = ContactResponse.of(tangent, contacts)
         for _ in range(_LOOKS):
             free = velocities.ravel() - tangent.solve(problem.residual(velocities, tension).ravel())
-            forces = response.forces(free, shift, self.geometry.friction, known)
+            forces, _ = response.forces(free, shift, self.geometry.friction, known)
             ahead = (free + response.columns @ forces.ravel()).reshape(velocities.shape)
             if not problem.feasible(ahead):
                 break
