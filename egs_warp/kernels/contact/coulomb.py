@@ -11,8 +11,8 @@ _FEW_SWEEPS, _MORE_SWEEPS = wp.constant(3), wp.constant(20)
 _Rates = wp.types.vector(7, real)
 _RATES = wp.constant(_Rates(1.0, 0.3, 3.0, 0.1, 10.0, 0.03, 30.0))
 """Of the attempts. Where the kinks of the projections keep the steps of one rate from making them smaller, whole steps
-of another get on. Every second attempt takes another rate in each of its steps: what goes around in a circle at one rate
-leaves it."""
+of another get on. Every second attempt takes another rate in each of its steps: what goes around in a circle at one
+rate leaves it."""
 _BOLD = wp.constant(12)
 """Whole steps of each attempt but the first."""
 _HALVINGS = wp.constant(10)
