@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.elasticity import Damping
 from egs_warp.fem.factors import Factors
+from egs_warp.geometry.frames import turning
 from egs_warp.muscles.tension import MuscleTension
 
 _NEGLIGIBLE = 1e-3
@@ -55,7 +56,7 @@ class StepProblem:
         step.
         """
         arms = self.state.positions - self.body.centre_of_mass(self.state.positions)
-        return np.stack([np.cross(axis, arms).ravel() for axis in np.eye(3)], axis=1)
+        return turning(arms).reshape(-1, 3)
 
     @cached_property
     def momenta(self) -> np.ndarray:
