@@ -142,7 +142,7 @@ class CoupledSolver:
         self, response: ContactResponse, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray
     ) -> tuple[CoupledResult, ContactResponse]:
         problem, contacts = response.tangent.problem, response.contacts
-        frame, dt = contacts.frame, problem.dt
+        dt = problem.dt
         shift = self.shift(contacts, dt)
         friction = self.detector.geometry.friction
         answered = _ANSWERED * problem.unit / problem.body.mass
@@ -150,7 +150,7 @@ class CoupledSolver:
 
         def missing(v: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, float]:
             free = problem.residual(v, tension)
-            rest = free.ravel() - dt * (frame.T @ f.ravel())
+            rest = free.ravel() - dt * contacts.pushes(f)
             return free, float(np.linalg.norm(rest)) / problem.unit
 
         free, size = missing(velocities, forces)

@@ -94,8 +94,7 @@ class StepProblem:
     def internal_gradient(self, velocities: np.ndarray, tension: MuscleTension | None) -> np.ndarray:
         """(N, 3) newtons, minus the forces of elasticity, damping and muscles at the end of ``velocities`` (N, 3)."""
         end = self.end_positions(velocities)
-        gradient = self.body.assembly.gradient(end, self.damping)
-        return gradient if tension is None else gradient + tension.gradient(end)
+        return self.body.assembly.gradient(end, self.damping, tension)
 
     def spin(self, internal_gradient: np.ndarray) -> np.ndarray:
         """(3,) rad/s that the step gives back: the rigid turn whose momentum implicit Euler would have eaten."""

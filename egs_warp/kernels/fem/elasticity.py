@@ -175,20 +175,54 @@ def element_gradients_kernel(
 
 
 @wp.kernel
-def gather_corners_kernel(
+def segment_pulls_kernel(
+    # Model:
+    offsets: wp.array[int],
+    nodes: wp.array[int],
+    shares: wp.array[real],
+    rest_lengths: wp.array[real],
+    slack: real,
+    full: real,
+    # In:
+    tensions: wp.array[real],
+    positions: wp.array[Vec3],
+    # Out:
+    pulls_out: wp.array[Vec3],
+):
+    """T phi u of each segment (Eq. 7), with the shares of tension of ``muscles.tension``."""
+    segment = wp.tid()
+    line = Vec3(real(0.0))
+    for slot in range(offsets[segment], offsets[segment + 1]):
+        line += shares[slot] * positions[nodes[slot]]
+    length = wp.max(wp.length(line), real(1e-300))
+    along = wp.clamp((length / rest_lengths[segment] - slack) / (full - slack), real(0.0), real(1.0))
+    share = along * along * (real(3.0) - real(2.0) * along)
+    pulls_out[segment] = (tensions[segment] * share / length) * line
+
+
+@wp.kernel
+def gather_forces_kernel(
     # Model:
     corner_offsets: wp.array[int],
     corner_from_slot: wp.array[int],
+    end_offsets: wp.array[int],
+    segment_from_end: wp.array[int],
+    end_shares: wp.array[real],
     # In:
     corner_values: wp.array2d[Vec3],
+    pulls: wp.array[Vec3],
     # Out:
     node_values_out: wp.array[Vec3],
 ):
+    """Of each node's corners and, where there are ends of muscles, of those."""
     node = wp.tid()
     total = Vec3(real(0.0))
     for slot in range(corner_offsets[node], corner_offsets[node + 1]):
         corner = corner_from_slot[slot]
         total += corner_values[corner // 4, corner % 4]
+    if end_offsets.shape[0] > 0:
+        for slot in range(end_offsets[node], end_offsets[node + 1]):
+            total += end_shares[slot] * pulls[segment_from_end[slot]]
     node_values_out[node] = total
 
 
