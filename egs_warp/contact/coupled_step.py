@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -55,6 +56,12 @@ class ContactResponse:
         delassus = contacts.speeds(columns)
         return cls(tangent, contacts, columns, delassus)
 
+    @cached_property
+    def _regular(self) -> np.ndarray:
+        regular = self.delassus.copy()
+        regular[np.diag_indices_from(regular)] += _SINGULAR * regular.diagonal().mean()
+        return regular
+
     def forces(
         self, free: np.ndarray, shift: np.ndarray, friction: float, start: np.ndarray
     ) -> tuple[np.ndarray, float]:
@@ -62,9 +69,7 @@ class ContactResponse:
         by which they miss that."""
         if self.contacts.count == 0:
             return start, 0.0
-        regular = self.delassus.copy()
-        regular[np.diag_indices_from(regular)] += _SINGULAR * regular.diagonal().mean()
-        return coulomb_forces(regular, self.contacts.speeds(free), shift, friction, start)
+        return coulomb_forces(self._regular, self.contacts.speeds(free), shift, friction, start)
 
 
 @dataclass(frozen=True)
