@@ -14,10 +14,11 @@ from websockets.sync.client import ClientConnection, connect
 
 from egs_warp.cli import main
 from egs_warp.io import write_ply
+from egs_warp.launching import THREADS, available_threads
 from egs_warp.web.feed import live_camera
 from egs_warp.web.server import LARGEST_MESSAGE, PageServer
 from egs_warp.web.session import Session
-from tests.support.lives import coarse_pawn
+from tests.support.lives import coarse_pawn, session_of
 from tests.support.living import living, needs_page
 
 
@@ -152,3 +153,17 @@ def test_a_port_in_use_is_told_before_any_work(session: Session, capsys: pytest.
     with living(session) as server:
         assert main(["live", "no-such.ply", "--port", str(server.port)]) == 2
         assert capsys.readouterr().err.startswith(f"egs-warp: --port {server.port}: cannot be used")
+
+
+@needs_page
+def test_the_command_leaves_a_core_to_the_page_while_it_serves(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    used = []
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(3)), raising=False)
+    monkeypatch.delenv(THREADS, raising=False)
+    monkeypatch.setattr("egs_warp.commands.live._session", lambda _: session_of(coarse_pawn(), tmp_path))
+    monkeypatch.setattr(PageServer, "serve", lambda self: used.append(available_threads()))
+    assert main(["live", "pawn.ply", "--no-browser"]) == 0
+    assert used == [2] and available_threads() == 3
+    assert "open http://127.0.0.1:" in capsys.readouterr().out
