@@ -147,6 +147,7 @@ def test_a_key_a_button_and_a_click_push_it_away_from_the_eye(chromium: Any, ses
         page.click("[title='Style, friction, stiffness, pushes']")
         page.locator("[aria-label=Push]").focus()
         page.keyboard.press("ArrowLeft")
+        page.click("[title='Style, friction, stiffness, pushes']")
         page.mouse.click(*head)
         pushes = [message for message in page.evaluate("window.sent") if message["type"] == "push"]
         assert not [message for message in page.evaluate("window.sent") if message["type"] in ("pull", "release", "go")]
