@@ -40,6 +40,26 @@ def test_what_is_shown_goes_evenly_and_never_back(chromium: Any, session: Sessio
 
 
 @in_browser
+def test_a_picture_is_drawn_once_and_again_when_its_splats_are_sorted(chromium: Any, session: Session):
+    with watched(chromium, session) as page:
+        wait_until(page, "egs.live.state?.resting && !egs.stages[0].sorting && !egs.stages[0].dirty")
+        left = page.evaluate(
+            """() => {
+                const stage = egs.stages[0], draw = stage.draw.bind(stage);
+                window.drawn = 0;
+                stage.draw = () => { const done = draw(); window.drawn += done ? 1 : 0; return done; };
+                stage.show(stage.source.frames.length - 1);
+                stage.draw();
+                return stage.dirty;
+            }"""
+        )
+        assert left is False
+        wait_until(page, "window.drawn === 2 && !egs.stages[0].sorting")
+        page.wait_for_timeout(300)
+        assert page.evaluate("window.drawn") == 2
+
+
+@in_browser
 def test_pause_step_sliders_and_script(chromium: Any, session: Session):
     with watched(chromium, session) as page:
         page.keyboard.press("p")
