@@ -180,8 +180,6 @@ def test_each_opening_and_renaming_fails_once(
     """One after the other, until none is left: one line, no temporary file, and a last run without a fault writes
     everything. (Of ``animate``: ``tests/pipelines/test_animate.py``.)
     """
-    if "{scene}" in line and reason != errno.ENOSPC:
-        pytest.skip("of scenes and photos a full disk stands for the others")
     out = tmp_path / "out"
     for number in range(200):
         shutil.rmtree(out, ignore_errors=True)
