@@ -7,7 +7,7 @@ the body gathers itself.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.command import Drive, DrivePlan
 from egs_warp.motions.crawl import Crawl
 from egs_warp.motions.feet import Base
-from egs_warp.motions.gait import Gait
 from egs_warp.motions.roll import Roll
 from egs_warp.motions.route import Pace
 from egs_warp.motions.sequence import Place
@@ -73,14 +72,14 @@ class DrivenWalk(Walk):
         else:
             time = self._usual.swing_time + self._usual.double_time
             rate = self._quickness(time)
-            self.gait = Gait(
-                self._usual.groups, 1, self._usual.swing_time / rate, self._usual.double_time / rate, self._usual.lift
+            self.gait = replace(
+                self._usual, swing_time=self._usual.swing_time / rate, double_time=self._usual.double_time / rate
             )
             places = kept
             for _ in range(_AHEAD):
                 places.append(self._next(places[-1], time / rate))
         self.places = np.array(places)
-        self.gait = Gait(self.gait.groups, len(places) - 1, self.gait.swing_time, self.gait.double_time, self.gait.lift)
+        self.gait = replace(self.gait, paces=len(places) - 1)
 
     def _next(self, place: np.ndarray, time: float) -> np.ndarray:
         unit, height = self.body.time_unit, self.body.height

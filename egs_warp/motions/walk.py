@@ -87,8 +87,8 @@ class Walk:
         self.places = route(pace)
         """(P+1, 3) the body before the first and after each pace: see ``motions.route``."""
         check_way(place, self.places)
-        paces, lift = len(self.places) - 1, self._carriage.lift
-        self.gait = Gait.of(len(feet), paces, lift, time_unit=self._time_unit / speed)
+        paces, lift, tempo = len(self.places) - 1, self._carriage.lift, self._carriage.tempo
+        self.gait = Gait.of(len(feet), paces, lift, tempo, time_unit=self._time_unit / speed)
         self._pace = pace
         self._parts = [BodyPart.of(body, f"foot {index}", foot.sole) for index, foot in enumerate(feet)]
         self._near = [np.flatnonzero(foot_of_node(feet) == index) for index in range(len(feet))]
