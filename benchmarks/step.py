@@ -76,7 +76,7 @@ def contact_errors(creature: Creature, before: StepReport, step: StepReport) -> 
         response = ContactResponse.of(tangent, contacts)
         free = velocities.ravel() - tangent.solve(problem.residual(velocities, now).ravel())
         shift = stepper.solver.shift(contacts, step.dt)
-        forces = response.forces(free, shift, creature.geometry.friction, step.forces)
+        forces, _ = response.forces(free, shift, creature.geometry.friction, step.forces)
         expected = free + response.columns @ forces.ravel()
         errors[place] = (contacts.frame @ (expected - step.state.velocities.ravel()))[loaded]
     return errors

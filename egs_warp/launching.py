@@ -49,7 +49,23 @@ def available_threads() -> int:
     """Number of processor cores that this process may use."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
     most = os.environ.get(THREADS, "")
-    return max(1, min(cores, int(most))) if most.isdecimal() else cores
+    return max(1, min(cores, int(most)) if most.isdecimal() else cores - _left)
+
+
+_left = 0
+"""Cores that are left to others."""
+
+
+@contextmanager
+def a_core_left() -> Iterator[None]:
+    """While it lasts, all threads of this process leave a core to whoever else computes here, where there is more than
+    one and the environment does not say how many to use."""
+    global _left
+    _left += 1
+    try:
+        yield
+    finally:
+        _left -= 1
 
 
 def use_device(device: str) -> None:

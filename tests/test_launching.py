@@ -11,6 +11,7 @@ import warp as wp
 
 from egs_warp.launching import (
     THREADS,
+    a_core_left,
     available_threads,
     beside,
     empty_together,
@@ -142,6 +143,23 @@ def test_the_environment_may_ask_for_fewer_threads(
     there = available_threads()
     monkeypatch.setenv(THREADS, told)
     assert available_threads() == (most or there)
+
+
+@pytest.mark.parametrize(
+    ("cores", "told", "used"), [(4, "", 3), (2, "", 1), (1, "", 1), (4, "4", 4), (4, "2", 2), (4, "9", 4)]
+)
+def test_a_core_is_left_to_others(cores: int, told: str, used: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For a while, where there is more than one and the environment says nothing; nested blocks leave more."""
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(cores)), raising=False)
+    monkeypatch.setenv(THREADS, told)
+    before = available_threads()
+    with pytest.raises(ValueError, match=r"^over$"), a_core_left():
+        assert available_threads() == used
+        with a_core_left():
+            assert available_threads() == (used if told else max(1, cores - 2))
+        assert available_threads() == used
+        raise ValueError("over")
+    assert available_threads() == before
 
 
 @pytest.mark.parametrize("told", ["1", ""])

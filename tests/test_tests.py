@@ -14,6 +14,8 @@ ACROSS = {
     "meshing/test_body_frame.py",
     "motions/test_runs.py",
     "pipelines/test_invariance.py",
+    "web/test_live_page.py",
+    "web/test_steered.py",
 }
 """Tests of a whole room, or of a way through several: no single module is theirs."""
 

@@ -10,6 +10,7 @@ from egs_warp.commands.flags import Commands, guessed_up, named_path, parse_dire
 from egs_warp.commands.scene_flags import say, start
 
 if TYPE_CHECKING:
+    from egs_warp.web.server import PageServer
     from egs_warp.web.session import Session
 
 EXAMPLES = (
@@ -47,9 +48,8 @@ def add_parser(commands: Commands) -> None:
 
 
 def _live(chosen: argparse.Namespace) -> int:
-    import webbrowser
-
     from egs_warp.io import read_capture
+    from egs_warp.launching import a_core_left
     from egs_warp.web.feed import LiveFeed
     from egs_warp.web.page import page_text
     from egs_warp.web.server import PageServer, check_port
@@ -62,15 +62,22 @@ def _live(chosen: argparse.Namespace) -> int:
     session = _session(chosen)
     scene = session.creature.placed(behind) if behind is not None else None
     server = PageServer([], port=chosen.port, feed=LiveFeed(session, scene=scene))
+    with a_core_left():
+        _serve(session, server, opens=not chosen.no_browser)
+    return 0
+
+
+def _serve(session: Session, server: PageServer, *, opens: bool) -> None:
+    import webbrowser
+
     session.start()
     print(f"open {server.address}\nend with Ctrl-C", flush=True)
-    if not chosen.no_browser:
+    if opens:
         webbrowser.open(server.address)
     try:
         server.serve()
     finally:
         session.stop()
-    return 0
 
 
 def _session(chosen: argparse.Namespace) -> Session:

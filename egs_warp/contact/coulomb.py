@@ -20,7 +20,7 @@ def coulomb_forces(
     start: np.ndarray,
     *,
     tolerance: float = 1e-12,
-    iteration_limit: int = 60,
+    iteration_limit: int = 16,
 ) -> tuple[np.ndarray, float]:
     """Forces f (n, 3) with 0 <= f_n, 0 <= u_n + shift, complementary, and exact Coulomb friction; u = free + G f
     (Eq. 8, 9).

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -28,6 +29,10 @@ _SINKS = 0.3
 """Of the tolerance: by how much what is deep already may go deeper in a step; by next to nothing beyond the tolerance.
 """
 _CREEPS = 0.02
+_ANSWERED = 1e-6
+"""Of dt g, which a step gives what falls: by how much less the forces of its end miss Coulomb's law."""
+_UNANSWERED = 3
+"""Times that forces may miss it by more before the step is given up, to be done in halves."""
 _SINGULAR = 1e-7
 """Of the mean of the Delassus operator's diagonal: more points than the cage can resolve leave it singular."""
 
@@ -51,13 +56,20 @@ class ContactResponse:
         delassus = contacts.speeds(columns)
         return cls(tangent, contacts, columns, delassus)
 
-    def forces(self, free: np.ndarray, shift: np.ndarray, friction: float, start: np.ndarray) -> np.ndarray:
-        """(n, 3) newtons that obey contact and friction if the body moves at ``free`` (3N,) without them."""
-        if self.contacts.count == 0:
-            return start
+    @cached_property
+    def _regular(self) -> np.ndarray:
         regular = self.delassus.copy()
         regular[np.diag_indices_from(regular)] += _SINGULAR * regular.diagonal().mean()
-        return coulomb_forces(regular, self.contacts.speeds(free), shift, friction, start)[0]
+        return regular
+
+    def forces(
+        self, free: np.ndarray, shift: np.ndarray, friction: float, start: np.ndarray
+    ) -> tuple[np.ndarray, float]:
+        """(n, 3) newtons that obey contact and friction if the body moves at ``free`` (3N,) without them, and the m/s
+        by which they miss that."""
+        if self.contacts.count == 0:
+            return start, 0.0
+        return coulomb_forces(self._regular, self.contacts.speeds(free), shift, friction, start)
 
 
 @dataclass(frozen=True)
@@ -135,21 +147,23 @@ class CoupledSolver:
         self, response: ContactResponse, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray
     ) -> tuple[CoupledResult, ContactResponse]:
         problem, contacts = response.tangent.problem, response.contacts
-        frame, dt = contacts.frame, problem.dt
+        dt = problem.dt
         shift = self.shift(contacts, dt)
         friction = self.detector.geometry.friction
-        tangents, fresh = 0, False
+        answered = _ANSWERED * problem.unit / problem.body.mass
+        tangents, unanswered, fresh = 0, 0, False
 
         def missing(v: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, float]:
             free = problem.residual(v, tension)
-            rest = free.ravel() - dt * (frame.T @ f.ravel())
+            rest = free.ravel() - dt * contacts.pushes(f)
             return free, float(np.linalg.norm(rest)) / problem.unit
 
         free, size = missing(velocities, forces)
         recent: list[float] = []
         for iteration in range(1, _ITERATIONS + 1):
             loose = velocities.ravel() - response.tangent.solve(free.ravel())
-            wanted = response.forces(loose, shift, friction, forces)
+            wanted, missed = response.forces(loose, shift, friction, forces)
+            unanswered += missed > answered
             change = (loose + response.columns @ wanted.ravel()).reshape(velocities.shape) - velocities
             length, better = 1.0, False
             while length > _SHORTEST:
@@ -166,13 +180,15 @@ class CoupledSolver:
                 before, velocities, forces, free, size = size, trial, trial_forces, trial_free, trial_size
                 recent = [*recent[1 - _MEMORY :], size]
                 # After a whole step the contact velocities are those that were solved for, by linearity.
-                if length == 1.0 and size <= self.tolerance:
+                if length == 1.0 and size <= self.tolerance and missed <= answered:
                     return CoupledResult(velocities, contacts, forces, True, size, iteration, tangents), response
-                slow = size > _SLOW * before or length < 1.0
+                slow = size > _SLOW * before or length < 1.0 or missed > answered
             else:
                 slow = True
                 if fresh:
                     break
+            if unanswered > _UNANSWERED:
+                break
             fresh = False
             if slow:
                 tangent = problem.tangent(self.factors, velocities, tension)

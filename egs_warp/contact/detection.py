@@ -101,6 +101,13 @@ class ContactSet:
         at_points = (self.weights[:, None, :] @ each).reshape(self.count, 3, velocities[0].size)
         return (self.axes @ at_points).reshape(3 * self.count, *velocities.shape[1:])
 
+    def pushes(self, forces: np.ndarray) -> np.ndarray:
+        """(3N,) ``frame`` transposed times ``forces`` (n, 3), newtons on each node's axes."""
+        at_points = (forces[:, None, :] @ self.axes)[:, 0]
+        nodal = np.zeros((self.frame.shape[1] // 3, 3))
+        np.add.at(nodal, self.nodes, self.weights[:, :, None] * at_points[:, None, :])
+        return nodal.ravel()
+
     def end_gaps(self, dt: float, velocities: np.ndarray) -> np.ndarray:
         """(n,) gap after a step of ``dt`` with nodal end velocities (N, 3), to the tangent plane of the start where the
         ground is not flat.

@@ -78,7 +78,8 @@ class SoftBody:
     def angular_momentum(self, positions: np.ndarray, velocities: np.ndarray) -> np.ndarray:
         """(3,) kg m^2/s about the centre of mass."""
         arms = positions - self.centre_of_mass(positions)
-        return (self.node_mass[:, None] * np.cross(arms, velocities)).sum(axis=0)
+        moment = arms.T @ (self.node_mass[:, None] * velocities)
+        return (moment - moment.T)[[1, 2, 0], [2, 0, 1]]
 
     def inertia(self, positions: np.ndarray) -> np.ndarray:
         """(3, 3) kg m^2 about the centre of mass."""

@@ -13,6 +13,7 @@ import warp as wp
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.kernels.fem import elasticity as kernels
 from egs_warp.launching import empty, launch_again, put
+from egs_warp.muscles.tension import FULL, SLACK, MuscleTension
 from egs_warp.precision import Mat33, Vec3, real
 
 
@@ -53,6 +54,35 @@ class Damping:
     """(T,) deformation gradients at its start."""
 
 
+class _MuscleLines:
+    """Kernel, index maps and scratch memory for the segments of one set of muscles."""
+
+    def __init__(self, tension: MuscleTension, device: wp.Device) -> None:
+        self.rows, self._device = tension.rows, device
+        by_node = self.rows.T.tocsr()
+        self.ends = self._index(by_node)
+        self._lines = [*self._index(self.rows), wp.array(tension.rest_lengths, dtype=real, device=device), SLACK, FULL]
+        count = len(tension.rest_lengths)
+        self._tensions = wp.zeros(count, dtype=real, device=device)
+        self._pulls = wp.zeros(count, dtype=Vec3, device=device)
+
+    def _index(self, rows: sparse.csr_matrix) -> list[wp.array]:
+        maps = [wp.array(part.astype(np.int32), dtype=int, device=self._device) for part in (rows.indptr, rows.indices)]
+        return [*maps, wp.array(rows.data, dtype=real, device=self._device)]
+
+    def pulled(self, tension: MuscleTension, positions: wp.array) -> wp.array:
+        """(M,) newtons, by which each segment draws its ends together."""
+        put(self._tensions, tension.tensions)
+        launch_again(
+            kernels.segment_pulls_kernel,
+            len(self._tensions),
+            inputs=[*self._lines, self._tensions, positions],
+            outputs=[self._pulls],
+            device=self._device,
+        )
+        return self._pulls
+
+
 class ElasticAssembly:
     """Kernels, index maps and scratch memory for one mesh. Node arrays go in and out as (N, 3) float64 on the host."""
 
@@ -64,7 +94,9 @@ class ElasticAssembly:
         self._tets = wp.array(mesh.tets, dtype=wp.vec4i, device=device)
         self._rest_inverses = wp.array(np.linalg.inv(edges), dtype=Mat33, device=device)
         self._volumes = wp.array(mesh.volumes(), dtype=real, device=device)
-        self._no_gradients = empty(0, Mat33, device)
+        self._no_gradients, self._no_pulls = empty(0, Mat33, device), empty(0, Vec3, device)
+        self._no_ends = [empty(0, int, device), empty(0, int, device), empty(0, real, device)]
+        self._muscles: _MuscleLines | None = None
         self._positions = wp.zeros(node_count, dtype=Vec3, device=device)
         self._energies = wp.zeros(tet_count, dtype=real, device=device)
         self._determinants = wp.zeros(tet_count, dtype=real, device=device)
@@ -163,9 +195,16 @@ class ElasticAssembly:
         )
         return float(self._energies.numpy().sum())
 
-    def gradient(self, positions: np.ndarray, damping: Damping | None = None) -> np.ndarray:
-        """(N, 3) newtons: the derivative of ``energy`` by the positions, minus the internal force."""
+    def gradient(
+        self, positions: np.ndarray, damping: Damping | None = None, tension: MuscleTension | None = None
+    ) -> np.ndarray:
+        """(N, 3) newtons: the derivative of ``energy`` by the positions, minus the internal force; with that of
+        ``tension``."""
         put(self._positions, positions)
+        ends, pulls = self._no_ends, self._no_pulls
+        if tension is not None:
+            muscles = self._muscles_of(tension)
+            ends, pulls = muscles.ends, muscles.pulled(tension, self._positions)
         launch_again(
             kernels.element_gradients_kernel,
             len(self.mesh.tets),
@@ -174,13 +213,18 @@ class ElasticAssembly:
             device=self.device,
         )
         launch_again(
-            kernels.gather_corners_kernel,
+            kernels.gather_forces_kernel,
             len(self.mesh.nodes),
-            inputs=[self._corner_offsets, self._corner_from_slot, self._corner_gradients],
+            inputs=[self._corner_offsets, self._corner_from_slot, *ends, self._corner_gradients, pulls],
             outputs=[self._node_gradients],
             device=self.device,
         )
         return self._node_gradients.numpy().copy()
+
+    def _muscles_of(self, tension: MuscleTension) -> _MuscleLines:
+        if self._muscles is None or self._muscles.rows is not tension.rows:
+            self._muscles = _MuscleLines(tension, self.device)
+        return self._muscles
 
     def hessian_entries(
         self, positions: np.ndarray, damping: Damping | None = None, *, factor: float = 1.0, projected: bool = False

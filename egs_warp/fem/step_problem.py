@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.elasticity import Damping
 from egs_warp.fem.factors import Factors
+from egs_warp.geometry.frames import turning
 from egs_warp.muscles.tension import MuscleTension
 
 _NEGLIGIBLE = 1e-3
@@ -55,7 +56,7 @@ class StepProblem:
         step.
         """
         arms = self.state.positions - self.body.centre_of_mass(self.state.positions)
-        return np.stack([np.cross(axis, arms).ravel() for axis in np.eye(3)], axis=1)
+        return turning(arms).reshape(-1, 3)
 
     @cached_property
     def momenta(self) -> np.ndarray:
@@ -93,8 +94,7 @@ class StepProblem:
     def internal_gradient(self, velocities: np.ndarray, tension: MuscleTension | None) -> np.ndarray:
         """(N, 3) newtons, minus the forces of elasticity, damping and muscles at the end of ``velocities`` (N, 3)."""
         end = self.end_positions(velocities)
-        gradient = self.body.assembly.gradient(end, self.damping)
-        return gradient if tension is None else gradient + tension.gradient(end)
+        return self.body.assembly.gradient(end, self.damping, tension)
 
     def spin(self, internal_gradient: np.ndarray) -> np.ndarray:
         """(3,) rad/s that the step gives back: the rigid turn whose momentum implicit Euler would have eaten."""

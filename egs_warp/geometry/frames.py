@@ -13,6 +13,15 @@ def square_to(direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return first, np.cross(direction, first)
 
 
+def turning(arms: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) whose columns k are e_k x arm, how ``arms`` (n, 3) go as they turn about axis k."""
+    turns = np.zeros((len(arms), 3, 3))
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        turns[:, i, k], turns[:, j, k] = -arms[:, j], arms[:, i]
+    return turns
+
+
 def best_turn(masses: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """(3, 3) rotation that best carries the arms ``before`` (n, 3) to those ``after``, by ``masses`` (n,) (Kabsch)."""
     u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", masses, after, before))

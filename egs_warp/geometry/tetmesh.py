@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -48,10 +49,21 @@ class TetMesh:
         return masses
 
     def boundary_faces(self) -> np.ndarray:
-        """(B, 3) int32 node indices of the surface triangles, wound outwards."""
+        """(B, 3) int32 node indices of the surface triangles, wound outwards; not to be written to."""
+        return self._surface
+
+    # Motions ask for both each time that they begin, when somebody may be waiting.
+    @cached_property
+    def _surface(self) -> np.ndarray:
         faces = self.tets[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)
         _, first, counts = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-        return faces[np.sort(first[counts == 1])]
+        surface = faces[np.sort(first[counts == 1])]
+        surface.flags.writeable = False
+        return surface
+
+    @cached_property
+    def _mean_edge(self) -> float:
+        return float(edge_graph(self).data.mean())
 
     def min_dihedral_degrees(self) -> float:
         """Smallest dihedral angle between two faces of one tetrahedron, degrees."""
@@ -90,4 +102,4 @@ def edge_graph(mesh: TetMesh) -> sp.csr_matrix:
 
 def mean_edge_length(mesh: TetMesh) -> float:
     """Mean length in metres of the edges of ``mesh``."""
-    return float(edge_graph(mesh).data.mean())
+    return mesh._mean_edge

@@ -191,11 +191,10 @@ def solve_piece(
     """
     m = program.activations
     offset, slope = _forces_of(program, modes)
-    whole = np.vstack([np.eye(m), slope])
-    fixed = np.concatenate([np.zeros(m), offset])
-    PZ = program.P @ whole
-    P = whole.T @ PZ
-    q = whole.T @ program.q + PZ.T @ fixed
+    # x = (0, offset) + (1, slope) a; ``PZ`` is P times the second.
+    PZ = program.P[:, :m] + program.P[:, m:] @ slope
+    P = PZ[:m] + slope.T @ PZ[m:]
+    q = program.q[:m] + slope.T @ program.q[m:] + PZ[m:].T @ offset
     A, b, contact, onward = _bounds(program, modes, offset, slope)
     lower = np.minimum(-b, np.maximum(A @ start[:m], -b - _BROKEN)) if len(A) else np.zeros(0)
     qp = quadratic_program(0.5 * (P + P.T), q, np.vstack([np.eye(m), A]), solver=solver)
@@ -208,7 +207,7 @@ def solve_piece(
     if not found.usable:
         return None
     a = np.clip(found.x, program.lower, program.upper)
-    x = fixed + whole @ a
+    x = np.concatenate([a, offset + slope @ a])
     objective = program.objective(x)
     pushes = -found.multipliers[m:]
     active = np.flatnonzero(pushes > _ACTIVE * max(abs(objective), 1e-9))
@@ -251,14 +250,7 @@ def _bounds(
     free = np.flatnonzero(modes.kind == FREE)
     pressing = np.concatenate([stick, slide])
     parts = [(slope[3 * pressing], offset[3 * pressing], pressing, _LEAVES)]
-    angle = 2.0 * np.pi * np.arange(_FACES) / _FACES
-    narrow = friction * np.cos(np.pi / _FACES)
-    for c, s in zip(np.cos(angle), np.sin(angle), strict=True):
-
-        def facet(value: np.ndarray, c: float = c, s: float = s) -> np.ndarray:
-            return narrow * value[3 * stick] - c * value[3 * stick + 1] - s * value[3 * stick + 2]
-
-        parts.append((facet(slope), facet(offset), stick, _SLIPS))
+    parts.append((_faces(slope, stick, friction), _faces(offset, stick, friction), np.tile(stick, _FACES), _SLIPS))
     d = modes.slip[slide]
     # The way it slides is near the one that its friction is taken against.
     for side in (1.0, -1.0):
@@ -275,8 +267,16 @@ def _bounds(
     A = np.vstack([part[0] for part in parts])
     b = np.concatenate([part[1] for part in parts])
     contact = np.concatenate([part[2] for part in parts])
-    onward = np.concatenate([np.full(len(part[2]), part[3]) for part in parts])
+    onward = np.repeat([part[3] for part in parts], [len(part[2]) for part in parts])
     return A, b, contact, onward
+
+
+def _faces(forces: np.ndarray, contacts: np.ndarray, friction: float) -> np.ndarray:
+    """(faces k, ...) what ``forces`` (3n, ...) leave of each face of the pyramids of k ``contacts``, face by face."""
+    normal, first, second = (forces[3 * contacts + part] for part in range(3))
+    angle = (2.0 * np.pi * np.arange(_FACES) / _FACES).reshape(-1, *np.ones(forces.ndim, int))
+    room = friction * np.cos(np.pi / _FACES) * normal - np.cos(angle) * first - np.sin(angle) * second
+    return room.reshape(-1, *forces.shape[1:])
 
 
 def _beyond(
@@ -291,14 +291,16 @@ def _beyond(
     kind, slip = modes.kind.copy(), modes.slip.copy()
     forces = x[program.activations :].reshape(-1, 3)
     velocities = (program.rows @ x + program.offset).reshape(-1, 3)
+    against, along = _unit(-forces[:, 1:]), _unit(velocities[:, 1:])
+    moving = np.linalg.norm(velocities[:, 1:], axis=1) > _SLOWEST
     for index in np.argsort(pushes, kind="stable"):
         i = contacts[index]
         if onward[index] == _LEAVES:
             kind[i] = FREE
         elif onward[index] == _SLIPS:
-            kind[i], slip[i] = SLIDE, _unit(-forces[i : i + 1, 1:])[0]
-        elif np.linalg.norm(velocities[i, 1:]) > _SLOWEST:
-            kind[i], slip[i] = SLIDE, _unit(velocities[i : i + 1, 1:])[0]
+            kind[i], slip[i] = SLIDE, against[i]
+        elif moving[i]:
+            kind[i], slip[i] = SLIDE, along[i]
         else:
             kind[i] = STICK
     return ContactModes(kind, slip)

@@ -8,6 +8,7 @@ units of ``speed`` m/s, sqrt(g H).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 
 import numpy as np
 import scipy.sparse as sparse
@@ -16,7 +17,7 @@ from scipy.spatial import ConvexHull
 from egs_warp.contact.detection import ContactSet
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.geometry.frames import square_to
+from egs_warp.geometry.frames import square_to, turning
 
 
 @dataclass(frozen=True)
@@ -24,8 +25,8 @@ class Objective:
     """weight |rows v - target|^2, all in m/s so that weights compare."""
 
     name: str
-    rows: sparse.csr_matrix
-    """(k, 3N)."""
+    rows: sparse.csr_matrix | np.ndarray
+    """(k, 3N), sparse where they are many."""
     target: np.ndarray
     """(k,) m/s."""
     weight: float
@@ -45,8 +46,7 @@ class Objective:
 
 def centre_of_mass_velocity(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
     """Velocity (3,) of the centre of mass."""
-    shares = body.node_mass / body.mass
-    return Objective("com", sparse.csr_matrix(np.kron(shares, np.eye(3))), np.asarray(target, float), weight)
+    return Objective("com", _along(body.node_mass / body.mass, np.eye(3)), np.asarray(target, float), weight)
 
 
 @dataclass(frozen=True)
@@ -130,14 +130,15 @@ def straining_velocities(body: SoftBody, positions: np.ndarray, target: np.ndarr
     The six rows are orthonormal in the mean over the mass, so the weight compares with that of ``node_velocities``.
     """
     arms = positions - body.centre_of_mass(positions)
-    rigid = [np.tile(axis, (len(arms), 1)) for axis in np.eye(3)] + [np.cross(axis, arms) for axis in np.eye(3)]
-    pairs = [(i, k) for i in range(3) for k in range(i, 3)]
-    strains = [np.outer(arms[:, i], np.eye(3)[k]) + np.outer(arms[:, k], np.eye(3)[i]) for i, k in pairs]
+    modes = np.zeros((len(arms), 3, 12))
+    modes[:, :, :3], modes[:, :, 3:6] = np.eye(3), turning(arms)
+    for mode, (i, k) in enumerate(combinations_with_replacement(range(3), 2), start=6):
+        modes[:, k, mode] += arms[:, i]
+        modes[:, i, mode] += arms[:, k]
     weights = np.sqrt(np.repeat(body.node_mass / body.mass, 3))
-    modes = np.stack([mode.ravel() for mode in (*rigid, *strains)], axis=1)
-    orthonormal, triangle = np.linalg.qr(modes * weights[:, None])
+    orthonormal, triangle = np.linalg.qr(modes.reshape(-1, 12) * weights[:, None])
     kept = 6 + np.flatnonzero(np.abs(np.diag(triangle)[6:]) > 1e-6 * np.abs(triangle).max())
-    rows = sparse.csr_matrix((orthonormal[:, kept] * weights[:, None]).T)
+    rows = (orthonormal[:, kept] * weights[:, None]).T
     return Objective("pose", rows, rows @ target.ravel(), weight)
 
 
@@ -203,8 +204,7 @@ def part_velocity(
     shares[part.nodes] = part.masses / part.masses.sum()
     if coordinates.relative:
         shares -= body.node_mass / body.mass
-    rows = sparse.csr_matrix(np.kron(shares, coordinates.axes))
-    return Objective(f"{part.name} velocity", rows, np.asarray(target, float), weight)
+    return Objective(f"{part.name} velocity", _along(shares, coordinates.axes), np.asarray(target, float), weight)
 
 
 def part_position(
@@ -260,11 +260,11 @@ def part_angular_momentum(
         moving[part.nodes] = part.masses / part.masses.sum()
     arms = state.positions[part.nodes] - pivot
     crosses = np.zeros((len(body.node_mass), 3, 3))
-    crosses[part.nodes] = part.masses[:, None, None] * _cross_matrices(arms)
+    crosses[part.nodes] = -part.masses[:, None, None] * turning(arms)
     crosses -= moving[:, None, None] * crosses.sum(axis=0)
     unit = _gyration(part, state.positions) * part.masses.sum()
     rows = np.einsum("ij,njk->ink", coordinates.axes, crosses).reshape(3, -1) / unit
-    return Objective(f"{part.name} momentum", sparse.csr_matrix(rows), np.asarray(target, float) / unit, weight)
+    return Objective(f"{part.name} momentum", rows, np.asarray(target, float) / unit, weight)
 
 
 def part_turning(
@@ -282,9 +282,7 @@ def part_turning(
     unit = _gyration(part, state.positions) * part.masses.sum()
     radius = _gyration(part, state.positions)
     rows = coordinates.axes @ np.linalg.inv(part.spread(state.positions)) * unit * radius
-    return Objective(
-        f"{part.name} turning", sparse.csr_matrix(rows @ momentum.rows), radius * np.asarray(target, float), weight
-    )
+    return Objective(f"{part.name} turning", rows @ momentum.rows, radius * np.asarray(target, float), weight)
 
 
 def base_area(part: BodyPart, state: BodyState, up: np.ndarray, target: float, weight: float, rate: float) -> Objective:
@@ -303,7 +301,7 @@ def base_area(part: BodyPart, state: BodyState, up: np.ndarray, target: float, w
     rows[corners] = slopes / perimeter
     return Objective(
         f"{part.name} area",
-        sparse.csr_matrix(rows.reshape(1, -1)),
+        rows.reshape(1, -1),
         np.array([rate * (target - hull.volume) / perimeter]),
         weight,
     )
@@ -330,11 +328,9 @@ def held_contacts(contacts: ContactSet, loads: np.ndarray, weight: float) -> Obj
     return Objective("hold", rows, np.zeros(3 * contacts.count), weight)
 
 
-def _cross_matrices(arms: np.ndarray) -> np.ndarray:
-    """(n, 3, 3) matrices X with X v = arm x v, for arms (n, 3)."""
-    x, y, z = arms.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+def _along(shares: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """(k, 3N) rows of the mean by ``shares`` (N,) of velocities, along ``axes`` (k, 3)."""
+    return (axes[:, None, :] * shares[:, None]).reshape(len(axes), -1)
 
 
 def _gyration(part: BodyPart, points: np.ndarray) -> float:

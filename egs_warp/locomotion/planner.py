@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -106,7 +107,7 @@ class StepPlanner:
         activations = (self.synergies.members @ found.x[:m]) * self.muscles.bounds
         moved = program.linear.base + program.linear.columns[:, :m] @ found.x[:m]
         asked = self.body.weight * found.x[m:].reshape(-1, 3)
-        forces = prospect.response.forces(moved, prospect.shift, self.friction, asked)
+        forces, _ = prospect.response.forces(moved, prospect.shift, self.friction, asked)
         velocities = (moved + prospect.response.columns @ forces.ravel()).reshape(prospect.velocities.shape)
         clock.lap("contact")
         if not problem.feasible(velocities):
@@ -152,15 +153,22 @@ class StepPlanner:
     def _activation_cost(self, dt: float, previous: np.ndarray, count: int) -> QuadraticCost:
         """Of ``count`` unknowns that begin with the activations, how large they are and how they change from
         ``previous`` (m,)."""
-        settings, members = self.settings, self.synergies.members
+        settings = self.settings
         share = dt * STEPS_A_UNIT / self.body.time_unit
-        strength = self.muscles.max_forces / (_ORDINARY_STRENGTH * self.body.weight)
-        size = settings.activation_weight * share**2 * (members.T @ strength)
-        change = settings.activation_change_weight * share * (members.T @ strength**2)
+        strengths, squares = self._strengths
+        size = settings.activation_weight * share**2 * strengths
+        change = settings.activation_change_weight * share * squares
         diagonal, q = np.zeros(count), np.zeros(count)
         diagonal[: len(previous)] = 2.0 * (size + change) + _REGULAR
         q[: len(previous)] = -2.0 * change * previous
         return QuadraticCost(np.diag(diagonal), q, float(change @ previous**2))
+
+    @cached_property
+    def _strengths(self) -> tuple[np.ndarray, np.ndarray]:
+        """(m,) sums over each synergy's muscles of their strength, in that of ordinary ones, and of its square."""
+        strength = self.muscles.max_forces / (_ORDINARY_STRENGTH * self.body.weight)
+        members = self.synergies.members
+        return members.T @ strength, members.T @ strength**2
 
 
 @dataclass

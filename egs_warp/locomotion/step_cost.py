@@ -77,7 +77,7 @@ def objectives_missed(
 ) -> float:
     """The same weighted squares of a step that ends at ``velocities`` (N, 3) under contact ``forces`` (n, 3); loads
     are left out."""
-    gained = problem.dt * (problem.turns.T @ (contacts.frame.T @ forces.ravel()))
+    gained = problem.dt * (problem.turns.T @ contacts.pushes(forces))
     gaps = [objective.gap(problem, contacts, velocities.ravel(), gained, speed) for objective in objectives]
     return sum(objective.weight * float(gap @ gap) for objective, gap in zip(objectives, gaps, strict=True))
 

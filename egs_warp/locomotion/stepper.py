@@ -259,7 +259,7 @@ class LocomotionStepper:
         shift = self.solver.shift(contacts, problem.dt)
         # What tension adds to the stiffness is left to the solve: what is foreseen serves no better with it.
         tangent = problem.tangent(self._factors, velocities, None)
-        pushes = problem.dt * (contacts.frame.T @ known.ravel())
+        pushes = problem.dt * contacts.pushes(known)
         missing = problem.residual(velocities, tension).ravel() - pushes
         ahead = velocities - tangent.solve(missing).reshape(velocities.shape)
         if problem.feasible(ahead):
@@ -268,7 +268,7 @@ class LocomotionStepper:
         response = ContactResponse.of(tangent, contacts)
         for _ in range(_LOOKS):
             free = velocities.ravel() - tangent.solve(problem.residual(velocities, tension).ravel())
-            forces = response.forces(free, shift, self.geometry.friction, known)
+            forces, _ = response.forces(free, shift, self.geometry.friction, known)
             ahead = (free + response.columns @ forces.ravel()).reshape(velocities.shape)
             if not problem.feasible(ahead):
                 break

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
@@ -21,21 +22,24 @@ class Synergies:
     group_from_muscle: np.ndarray
     """(M,) int32."""
 
-    @property
+    @cached_property
     def count(self) -> int:
         """Number of groups."""
         return int(self.group_from_muscle.max(initial=-1)) + 1
 
-    @property
+    @cached_property
     def members(self) -> sparse.csr_matrix:
         """(M, groups) 1 where the muscle is of the group."""
         count = len(self.group_from_muscle)
         return sparse.csr_matrix((np.ones(count), (np.arange(count), self.group_from_muscle)), (count, self.count))
 
+    @cached_property
+    def _sizes(self) -> np.ndarray:
+        return np.bincount(self.group_from_muscle, minlength=self.count)
+
     def mean(self, activations: np.ndarray) -> np.ndarray:
         """(groups,) mean of ``activations`` (M,) over each."""
-        sizes = np.bincount(self.group_from_muscle, minlength=self.count)
-        return np.bincount(self.group_from_muscle, activations, minlength=self.count) / sizes
+        return np.bincount(self.group_from_muscle, activations, minlength=self.count) / self._sizes
 
 
 def find_synergies(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -18,11 +19,13 @@ from egs_warp.motions.hop import Squares
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.keyframes import Key, read_keyframes
-from egs_warp.motions.request import LARGEST_TARGET, LARGEST_TURN, MotionRequest, Value
+from egs_warp.motions.request import LARGEST_TARGET, LARGEST_TURN, MotionRequest
 from egs_warp.motions.route import Route, along, read_path, straight
 from egs_warp.motions.sequence import BodyMotion, Part, Place
 from egs_warp.motions.stand import StandFor
+from egs_warp.motions.style import Style
 from egs_warp.motions.turn import Turn
+from egs_warp.motions.values import Value
 
 _PACE = 0.1
 """Body heights."""
@@ -275,3 +278,16 @@ REPERTOIRE: Mapping[str, MotionKind] = {
         file="a file of key frames, as trajectory keys.json",
     ),
 }
+
+
+def parts_of(request: MotionRequest, height: float) -> list[Part]:
+    """What ``request``, all of its repeats, comes to for a body of ``height`` metres, in its own style where it has
+    one."""
+    parts, style = REPERTOIRE[request.name].parts(request, height), request.style
+    if style is None:
+        return parts
+    return [replace(part, begin=partial(_begun_in, style, part.begin)) for part in parts]
+
+
+def _begun_in(style: Style, begin: Callable[[Place], BodyMotion], place: Place) -> BodyMotion:
+    return begin(replace(place, style=style))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from egs_warp.errors import ArgumentError, UserError
 from egs_warp.io.text import parse_json, read_text, whole_number
 from egs_warp.motions.beats import asked_beats
 from egs_warp.motions.command import Drive, DrivePlan
-from egs_warp.motions.repertoire import REPERTOIRE, MotionKind
+from egs_warp.motions.repertoire import REPERTOIRE, MotionKind, parts_of
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.sequence import Part, Place
 from egs_warp.motions.style import Style, read_style
@@ -58,7 +58,7 @@ class Script:
 
     def parts(self, height: float) -> list[Part]:
         """The motions in their order, for a body of ``height`` metres."""
-        return [part for request in self.requests for part in REPERTOIRE[request.name].parts(request, height)]
+        return [part for request in self.requests for part in parts_of(request, height)]
 
     def check(self, place: Place) -> list[float]:
         """Seconds that each motion is expected to take, for a body that stands at ``place``.
@@ -146,6 +146,7 @@ def _from_json(path: Path, defaults: Mapping[str, Any]) -> list[MotionRequest]:
         name = values.pop("motion")
         repeat = values.pop("repeat", 1)
         file = values.pop("file", None)
+        style = _own_style(values.pop("style", None), name, where)
         if not isinstance(repeat, int) or isinstance(repeat, bool):
             raise UserError(f'{where}: "repeat" is {repeat!r}; give a whole number')
         if file is not None and not isinstance(file, str):
@@ -154,8 +155,21 @@ def _from_json(path: Path, defaults: Mapping[str, Any]) -> list[MotionRequest]:
             if isinstance(value, str):
                 raise UserError(f'{where}: "{key}" is the text {json.dumps(value)}; give a number without quotes')
         keyframes = path.parent / file if file is not None else None
-        requests.append(_request(name, values, repeat, keyframes, defaults, where))
+        requests.append(replace(_request(name, values, repeat, keyframes, defaults, where), style=style))
     return requests
+
+
+def _own_style(text: Any, name: str, where: str) -> Style | None:
+    if text is None:
+        return None
+    if not isinstance(text, str):
+        raise UserError(f'{where}: "style" is {json.dumps(text)}; give a text, as "heavy" or "squash=1.2"')
+    if not _kind(name, where).jumps:
+        raise UserError(f"{where}: {name} does not jump, and has no style; jump, hop, twist and dance do")
+    try:
+        return read_style(text)
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from None
 
 
 def _is_number(word: str) -> bool:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import scipy.sparse as sparse
 from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.body import BodyState, SoftBody
@@ -351,8 +350,8 @@ class PoseFamily:
             return [both]
         level, up = self.ground.axes[:2], self.ground.axes[2:]
         return [
-            replace(both, rows=sparse.csr_matrix(level @ both.rows), target=level @ velocity),
-            replace(both, rows=sparse.csr_matrix(up @ both.rows), target=up @ velocity, weight=weights.up),
+            replace(both, rows=level @ both.rows, target=level @ velocity),
+            replace(both, rows=up @ both.rows, target=up @ velocity, weight=weights.up),
         ]
 
     def turn_towards(self, state: BodyState, pose: np.ndarray) -> np.ndarray:

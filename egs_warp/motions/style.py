@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
 from egs_warp.errors import ArgumentError
-from egs_warp.motions.request import Value
+from egs_warp.motions.values import Value
 
 LEAST, MOST = 0.5, 2.0
 """Of each number: beyond, the stroke of a jump is none that a body could make."""
@@ -27,6 +27,12 @@ class Style:
         for name, value in vars(self).items():
             if not LEAST <= value <= MOST:
                 raise ArgumentError(name, f"give a number from {LEAST:g} to {MOST:g}", value=value)
+
+    def __str__(self) -> str:
+        """As ``read_style`` reads it: a preset's name, or all numbers."""
+        values = vars(self)
+        same = [name for name, preset in PRESETS.items() if preset == values]
+        return same[0] if same else " ".join(f"{name}={value!r}" for name, value in values.items())
 
 
 PRESETS: Mapping[str, Mapping[str, float]] = {

@@ -14,6 +14,7 @@ from egs_warp.deformation.embedding import embed_gaussians
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.locomotion.rollout import FRAME_RATE
+from egs_warp.motions.style import LEAST, MOST, PRESETS, Style
 from egs_warp.pipelines.creature import Creature, first_place
 from egs_warp.pipelines.drawn import DrawnCreature
 from egs_warp.pipelines.performance import FILMED_FROM
@@ -60,7 +61,8 @@ class LiveFeed:
             "audit": {},
             "motion": [],
             "notes": [],
-            "limits": {"friction": [0.0, MOST_FRICTION], "sag": [LEAST_SAG, MOST_SAG]},
+            "limits": {"friction": [0.0, MOST_FRICTION], "sag": [LEAST_SAG, MOST_SAG], "style": [LEAST, MOST]},
+            "styles": {"usual": vars(Style()), **{name: dict(style) for name, style in PRESETS.items()}},
         }
         planes = np.array([[*plane.normal, plane.offset] for plane in creature.geometry.planes])
         deformer = Deformer(made.splats, embed_gaussians(made.splats, mesh))

@@ -8,12 +8,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, TypeAlias
 
 from egs_warp.motions.command import FASTEST, Drive
 from egs_warp.motions.push import LARGEST
 from egs_warp.motions.script import Script, motion
+from egs_warp.motions.style import LEAST, MOST, Style
 
 LONGEST_TEXT = 200
 """Characters of motions asked for at once."""
@@ -22,6 +23,7 @@ FURTHEST = 100.0
 LEAST_SAG, MOST_SAG = 0.01, 0.1
 """rho g H / E of a column: stiff and soft."""
 MOST_FRICTION = 2.0
+STYLE_NAMES = tuple(field.name for field in fields(Style))
 _MOTIONS = re.compile(r"[A-Za-z0-9_=+\-., ]+")
 
 
@@ -82,6 +84,13 @@ class Change:
 
 
 @dataclass(frozen=True)
+class Restyle:
+    """Jump so from the next motion on."""
+
+    style: Style
+
+
+@dataclass(frozen=True)
 class Pause:
     """Hold still, or go on."""
 
@@ -116,7 +125,20 @@ class TellScript:
 
 
 Message: TypeAlias = (
-    Perform | Go | Steer | Pull | Release | Hit | Change | Pause | Step | Cancel | StandUp | Record | TellScript
+    Perform
+    | Go
+    | Steer
+    | Pull
+    | Release
+    | Hit
+    | Change
+    | Restyle
+    | Pause
+    | Step
+    | Cancel
+    | StandUp
+    | Record
+    | TellScript
 )
 
 
@@ -177,6 +199,10 @@ def _change(message: Mapping[str, Any], reach: float, node_count: int) -> Messag
     return Change(**{name: _number(message, name, *spans[name]) for name in given})
 
 
+def _restyle(message: Mapping[str, Any], reach: float, node_count: int) -> Message:
+    return Restyle(Style(**{name: _number(message, name, LEAST, MOST) for name in STYLE_NAMES if name in message}))
+
+
 def _on(message: Mapping[str, Any]) -> bool:
     on = message.get("on")
     if not isinstance(on, bool):
@@ -202,6 +228,7 @@ _READERS: dict[str, tuple[tuple[str, ...], _Reader]] = {
     "release": ((), lambda *_: Release()),
     "push": (("x", "y", "z", "height"), _hit),
     "set": (("friction", "sag"), _change),
+    "style": (STYLE_NAMES, _restyle),
     "pause": (("on",), lambda message, *_: Pause(_on(message))),
     "step": ((), lambda *_: Step()),
     "cancel": ((), lambda *_: Cancel()),

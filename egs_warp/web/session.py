@@ -34,6 +34,7 @@ from egs_warp.web.messages import (
     Pull,
     Record,
     Release,
+    Restyle,
     StandUp,
     Steer,
     Step,
@@ -262,6 +263,8 @@ class Session:
                 self._hits.append(message)
             case Change():
                 self._change(message)
+            case Restyle(style):
+                self.steering.style = style
             case Pause(on):
                 self._paused = on
                 self._due = time.perf_counter()
@@ -382,6 +385,7 @@ class Session:
             "pulled": self._spring is not None,
             "friction": self.friction,
             "sag": self.sag,
+            "style": vars(steering.style),
             "motions": len(steering.begun),
             "step": self._dt,
         }

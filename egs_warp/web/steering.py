@@ -23,12 +23,13 @@ from egs_warp.motions.command import Drive
 from egs_warp.motions.drive import Driven
 from egs_warp.motions.feet import Base
 from egs_warp.motions.get_up import GetUp
-from egs_warp.motions.repertoire import REPERTOIRE
+from egs_warp.motions.repertoire import REPERTOIRE, parts_of
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.script import Script, motion
 from egs_warp.motions.sequence import Done, Part, Place
 from egs_warp.motions.stance import sole_shares
 from egs_warp.motions.stand import Stand
+from egs_warp.motions.style import Style
 from egs_warp.web.standing import Lie, tilt_degrees
 
 ARRIVED = 0.12
@@ -91,7 +92,7 @@ def tasks_of(script: Script, height: float) -> list[Task]:
     tasks = []
     for request in script.requests:
         once = replace(request, repeat=1)
-        tasks += [Task(part, once) for part in REPERTOIRE[request.name].parts(request, height)]
+        tasks += [Task(part, once) for part in parts_of(request, height)]
     return tasks
 
 
@@ -154,6 +155,8 @@ class Steering:
         """How it is to go."""
         self.driven: list[float] = []
         """Seconds at which it began to be driven."""
+        self.style = Style()
+        """Of the next motion that begins."""
         self.stand(place)
         self.walks = _walks(place)
 
@@ -239,7 +242,7 @@ class Steering:
         self.cancel()
 
     def _begin_next(self, state: BodyState, report: StepReport | None) -> None:
-        place = self.place.after(state.positions, report)
+        place = replace(self.place.after(state.positions, report), style=self.style)
         if self._is_ball:
             self.place = place
         try:
@@ -260,7 +263,8 @@ class Steering:
         self._say_notes()
         self._act = _Act(task.part.name, begun, Posture.MOVING)
         self.begun.append(Done(task.part.name, task.part.asked, begun, state.time))
-        self.requests.append(task.request)
+        styled = REPERTOIRE[task.request.name].jumps and self.style != Style()
+        self.requests.append(replace(task.request, style=self.style) if styled else task.request)
 
     def _begin_drive(self, place: Place, time: float) -> bool:
         try:

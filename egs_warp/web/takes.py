@@ -30,7 +30,11 @@ SCRIPT = "script.json"
 
 def script_text(requests: Sequence[MotionRequest]) -> str:
     """A script of motions, one after the other, for ``egs-warp animate --motion script.json``."""
-    lines = [json.dumps({"motion": request.name, **request.asked}) for request in requests]
+    styles = [{} if request.style is None else {"style": str(request.style)} for request in requests]
+    lines = [
+        json.dumps({"motion": request.name, **request.asked, **style})
+        for request, style in zip(requests, styles, strict=True)
+    ]
     return "[\n" + ",\n".join(f"  {line}" for line in lines) + "\n]\n"
 
 

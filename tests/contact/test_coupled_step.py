@@ -4,10 +4,13 @@ that fall, rest, slide, hold on a slope, and come out of the ground.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from egs_warp.contact import coupled_step
 from egs_warp.contact.coupled_step import ContactResponse, CoupledResult
 from egs_warp.contact.detection import ContactDetector
 from egs_warp.fem.body import BodyState, SoftBody, make_body
@@ -259,10 +262,10 @@ def test_foreseen_forces_press_and_rub_no_more_than_they_may() -> None:
     for seed in range(8):
         pace = 0.6 if seed % 2 else 0.02
         free = np.random.default_rng(seed).standard_normal(x.shape) * [pace, pace, 0.1] - [0.0, 0.0, 0.05 * seed]
-        forces = response.forces(free.ravel(), solver.shift(contacts, DT), 0.5, np.zeros((contacts.count, 3)))
+        forces, missed = response.forces(free.ravel(), solver.shift(contacts, DT), 0.5, np.zeros((contacts.count, 3)))
         speed = (contacts.frame @ free.ravel() + response.delassus @ forces.ravel()).reshape(-1, 3)
         slip, pull = np.linalg.norm(speed[:, 1:], axis=1), np.linalg.norm(forces[:, 1:], axis=1)
-        assert forces[:, 0].min() >= 0.0 and speed[:, 0].min() > -1e-6
+        assert missed < 1e-11 and forces[:, 0].min() >= 0.0 and speed[:, 0].min() > -1e-6
         assert (forces[:, 0] * speed[:, 0]).max() < 1e-6 * standing.body.weight
         assert (pull <= 0.5 * forces[:, 0] + 1e-9).all()
         sliding = (slip > 1e-4) & (forces[:, 0] > 0.0)
@@ -283,3 +286,31 @@ def test_a_step_that_nothing_joins_is_solved_once(monkeypatch: pytest.MonkeyPatc
     _, result = resting.advance(DT)
     # Two more are of the choice of points and of the contact set, before the step.
     assert result.converged and result.contacts.count > 4 and len(looks) == 4
+
+
+def test_forces_that_miss_coulombs_law_end_no_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The motion may obey its equation: where the forces do not theirs, another tangent is tried, and then the step is
+    told to be done in halves.
+    """
+    resting, answered = block(sag=0.01, damping_ratio=0.5), coupled_step.coulomb_forces
+    for _ in range(5):
+        resting.advance(DT)
+    start = resting.state, resting.points, resting.forces
+
+    def advance(missed: list[float]) -> CoupledResult:
+        resting.state, resting.points, resting.forces = start
+
+        def forces(*given: Any) -> tuple[np.ndarray, float]:
+            found, size = answered(*given)
+            return found, missed.pop(0) if missed else size
+
+        monkeypatch.setattr(coupled_step, "coulomb_forces", forces)
+        return resting.advance(DT)[1]
+
+    plain = advance([])
+    late = advance([1e-4] * plain.iterations)
+    assert plain.converged and plain.tangents == 0
+    assert late.converged and late.iterations > plain.iterations and late.tangents > 0
+    np.testing.assert_allclose(late.velocities, plain.velocities, atol=1e-6)
+    never = advance([1e-4] * 100)
+    assert not never.converged and never.residual < 1e-8

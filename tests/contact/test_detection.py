@@ -194,6 +194,8 @@ def test_contact_frame_maps_nodes_to_points(device: str) -> None:
         assert np.allclose(local[i], contacts.axes[i] @ velocity, atol=1e-13)
     many = np.random.default_rng(4).standard_normal((v.size, 5))
     assert np.allclose(contacts.speeds(many), contacts.frame @ many, atol=1e-13)
+    forces = many.ravel()[: 3 * contacts.count].reshape(-1, 3)
+    assert np.allclose(contacts.pushes(forces), contacts.frame.T @ forces.ravel(), atol=1e-13)
     assert np.allclose(contacts.speeds(v.ravel()), local.ravel(), atol=1e-13)
     assert detector.contact_set(chosen[:0], mesh.nodes).speeds(many).shape == (0, 5)
     moved, _ = detector.gaps(mesh.nodes + 0.01 * v)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from egs_warp.errors import ArgumentError, UserError
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.rollout import roll_out
 from egs_warp.motions.dance import Dance
+from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpPlan, JumpTarget, plan_jump
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence, Place
@@ -118,10 +120,28 @@ def test_a_dance_knows_how_long_the_crouches_of_its_style_are(place: Place) -> N
     assert Dance(replace(place, style=Style(timing=0.5)), (0.35, 0.8)).planned().beats == 2.0
 
 
+def test_a_jump_of_a_script_may_have_a_style_of_its_own(place: Place, tmp_path: Path) -> None:
+    """It goes before the style of the run, which the others have."""
+    (tmp_path / "s.json").write_text(
+        '[{"motion": "jump", "repeat": 2, "style": "squash=2"}, {"motion": "jump"},'
+        ' {"motion": "jump", "style": "light"}]'
+    )
+    light, run = Style(**PRESETS["light"]), replace(place, style=Style(squash=0.5))
+    begun = [part.begin(run) for part in motion(str(tmp_path / "s.json")).parts(place.body.height)]
+    rates = [one.plan.landing_rate for one in begun if isinstance(one, Jump)]
+    usual = motion("jump").parts(place.body.height)[0].begin(place)
+    assert isinstance(usual, Jump) and len(rates) == 4
+    expected = [1 / 2.0, 1 / 2.0, 1 / 0.5, 1 / light.squash]
+    np.testing.assert_allclose(np.array(rates) / usual.plan.landing_rate, expected)
+
+
 def test_presets_can_be_changed() -> None:
     assert read_style("heavy, squash=1.1") == Style(**{**PRESETS["heavy"], "squash": 1.1})
     for name, values in PRESETS.items():
         assert read_style(name) == Style(**values)
+        assert str(Style(**values)) == name
+    mine = Style(anticipation=0.1 + 0.7, timing=1 / 1.5)
+    assert read_style(str(mine)) == mine and read_style(str(Style())) == Style()
 
 
 @pytest.mark.parametrize(

@@ -68,6 +68,21 @@ def test_force_and_stiffness_are_derivatives_of_the_energy(shortened: float) -> 
     np.testing.assert_allclose((across * rates) @ across.T, K, rtol=0, atol=1e-3 * np.abs(K).max())
 
 
+@pytest.mark.parametrize("shortened", [1.0, 0.55, 0.2, 0.0], ids=["long", "short", "slack", "in a point"])
+def test_the_kernel_adds_the_force_to_that_of_the_elements(rod: SoftBody, shortened: float) -> None:
+    """Eq. (7): to rounding that of ``gradient``, of one set of muscles after another."""
+    rng = np.random.default_rng(3)
+    x = ROD.nodes + rng.normal(0.0, 0.002, ROD.nodes.shape)
+    for tension in (scattered(rng), MuscleTension.of(tendon(5), rng.normal(size=5)), scattered(rng)):
+        # As if the segments were that much shorter than at rest.
+        held = MuscleTension(tension.rows, tension.tensions, tension.rest_lengths / max(shortened, 1e-9))
+        forces = rod.assembly.gradient(x, None, held) - rod.assembly.gradient(x)
+        expected = held.gradient(x)
+        assert np.abs(forces - expected).max() <= 1e-12 * max(
+            np.abs(expected).max(), np.abs(rod.assembly.gradient(x)).max()
+        )
+
+
 def test_full_tension_has_the_energy_of_its_length() -> None:
     """V = sum T L but for a constant where no segment is shorter than 0.7 of its rest length, so the force is
     Eq. (7)'s; between 0.3 and 0.7 it does half the work of a full tension, and none below.

@@ -1,13 +1,16 @@
-"""The browser that the page's tests share."""
+"""The browser that the page's tests share, and a session for each."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from egs_warp.web.session import Session
 from tests.support.chromium import started
+from tests.support.lives import coarse_pawn, session_of
 
 
 @pytest.fixture(scope="session")
@@ -15,3 +18,12 @@ def chromium() -> Iterator[Any]:
     """One browser for all of them: Playwright runs but once in a process."""
     with started() as browser:
         yield browser
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Iterator[Session]:
+    """Of a coarse pawn, in its thread."""
+    made = session_of(coarse_pawn(), tmp_path)
+    made.start()
+    yield made
+    made.stop()

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from egs_warp.motions.command import Drive
+from egs_warp.motions.style import Style
 from egs_warp.web.messages import (
     Cancel,
     Change,
@@ -18,6 +19,7 @@ from egs_warp.web.messages import (
     Pull,
     Record,
     Release,
+    Restyle,
     StandUp,
     Steer,
     Step,
@@ -40,6 +42,8 @@ def _read(**message: Any) -> Message:
         ({"type": "push", "x": 0, "y": 1, "z": 0, "height": 0.9}, Hit((0.0, 1.0, 0.0), 0.9)),
         ({"type": "set", "friction": 0.3}, Change(friction=0.3)),
         ({"type": "set", "sag": 0.02, "friction": 0}, Change(friction=0.0, sag=0.02)),
+        ({"type": "style", "squash": 1.5}, Restyle(Style(squash=1.5))),
+        ({"type": "style"}, Restyle(Style())),
         ({"type": "pause", "on": True}, Pause(True)),
         ({"type": "step"}, Step()),
         ({"type": "drive", "forward": 0.1, "turn": -0.2}, Steer(Drive(0.1, 0.0, -0.2))),
@@ -99,6 +103,9 @@ def test_motions_are_those_of_scripts():
         ({"type": "set"}, "set: give friction or sag"),
         ({"type": "set", "friction": -0.1}, "friction: give a number from 0 to 2"),
         ({"type": "set", "sag": 0.5}, "sag: give a number from 0.01 to 0.1"),
+        ({"type": "style", "squash": 2.5}, "squash: give a number from 0.5 to 2"),
+        ({"type": "style", "timing": "quick"}, "timing: give a number"),
+        ({"type": "style", "wobble": 1}, "style has no 'wobble'"),
         ({"type": "pause", "on": 1}, "on: give true or false"),
         ({"type": "record"}, "on: give true or false"),
     ],

@@ -10,8 +10,10 @@ import pytest
 from egs_warp.errors import UserError
 from egs_warp.motions.command import Drive
 from egs_warp.motions.drive import Driven
+from egs_warp.motions.jump import Jump
 from egs_warp.motions.script import motion
 from egs_warp.motions.stance import sole_shares
+from egs_warp.motions.style import PRESETS, Style
 from egs_warp.pipelines.creature import first_place
 from egs_warp.web.steering import ARRIVED, ASIDE, Journey, Steering
 from tests.support.creatures import coarse_creature
@@ -62,6 +64,29 @@ def test_what_was_driven_stands_once_it_is_told_to(tmp_path: Path):
     played.ask("drive")
     played.until_idle()
     assert played.session.steering.doing == "stand" and played.told == []
+
+
+def test_a_style_is_of_the_motions_that_begin_after_it(tmp_path: Path):
+    """A jump that goes on keeps its own; what stands up anew, or is made anew, keeps the style."""
+    played = Played(coarse_pawn(), tmp_path)
+    session = played.session
+    played.ask("motion", text="jump 0 0.1, jump 0 0.1")
+    played.step()
+    usual = session.steering._act.motion
+    assert isinstance(usual, Jump)
+    played.ask("style", **PRESETS["heavy"])
+    played.step()
+    assert session.steering._act.motion is usual and session.standing()["style"] == PRESETS["heavy"]
+    played.ask("stand")
+    played.ask("set", friction=0.5)
+    played.ask("motion", text="jump 0 0.1, walk 0.1")
+    played.step()
+    heavy = session.steering._act.motion
+    assert isinstance(heavy, Jump)
+    assert heavy.plan.crouch_depth == pytest.approx(1.3 * usual.plan.crouch_depth, rel=0.3)
+    assert heavy.plan.crouch_time > 1.4 * usual.plan.crouch_time
+    assert heavy.plan.landing_rate == pytest.approx(usual.plan.landing_rate / 1.4)
+    assert [request.style for request in session.steering.requests] == [None, Style(**PRESETS["heavy"])]
 
 
 def test_a_motion_that_the_body_cannot_do_is_told(tmp_path: Path):

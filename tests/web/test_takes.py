@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.request import MotionRequest
 from egs_warp.motions.script import motion
+from egs_warp.motions.style import PRESETS, Style
 from egs_warp.pipelines.report import AUDIT_LIMITS
 from egs_warp.web.recording import Recording
 from egs_warp.web.takes import script_text
@@ -25,6 +27,15 @@ def test_a_script_says_what_was_done(tmp_path: Path):
     assert json.loads(script_text([MotionRequest("jump", {"distance": 0.5, "height": 0.2})])) == [
         {"motion": "jump", "distance": 0.5, "height": 0.2}
     ]
+
+
+@pytest.mark.parametrize("style", [Style(), Style(**PRESETS["light"]), Style(squash=1.35)], ids=str)
+def test_a_script_keeps_the_style_of_each_jump(style: Style, tmp_path: Path):
+    jump, walk = motion("jump 0.3 0.2, walk 0.2").requests
+    styled = replace(jump, style=style)
+    path = tmp_path / "script.json"
+    path.write_text(script_text([styled, walk, jump]))
+    assert motion(str(path)).requests == (styled, walk, jump)
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,11 @@ from egs_warp.precision import Mat33, Vec3, real
 
 wp.set_module_options({"enable_backward": False})
 
+_OFF = wp.constant(real(1e-31))
+"""Of the squared trace: what is left beside the diagonal, squared, of a matrix in its principal axes."""
+_SWEEPS = wp.constant(12)
+"""In which Jacobi's rotations, whose error squares in each, are long done."""
+
 
 @wp.func
 def deformation_gradient(x: wp.array[Vec3], tet: wp.vec4i, rest_inverse: Mat33) -> Mat33:
@@ -22,6 +27,44 @@ def shape_gradient(rest_inverse: Mat33, corner: int) -> Vec3:
 
 
 @wp.func
+def principal_axes(symmetric: Mat33):
+    """The eigenvectors of a matrix, columns of a rotation, and its eigenvalues, by Jacobi's rotations."""
+    m = real(1.0) * symmetric
+    axes = wp.identity(n=3, dtype=wp.float64)
+    least = _OFF * wp.trace(m) * wp.trace(m)
+    sweep = int(0)
+    while sweep < _SWEEPS and m[0, 1] * m[0, 1] + m[0, 2] * m[0, 2] + m[1, 2] * m[1, 2] > least:
+        sweep += 1
+        for r in range(3):
+            p = (r + 1) % 3
+            q = (r + 2) % 3
+            between = m[p, q]
+            if between != real(0.0):
+                half = (m[q, q] - m[p, p]) / (real(2.0) * between)
+                tangent = real(1.0) / (wp.abs(half) + wp.sqrt(half * half + real(1.0)))
+                if half < real(0.0):
+                    tangent = -tangent
+                c = real(1.0) / wp.sqrt(tangent * tangent + real(1.0))
+                s = tangent * c
+                m[p, p] = m[p, p] - tangent * between
+                m[q, q] = m[q, q] + tangent * between
+                m[p, q] = real(0.0)
+                m[q, p] = real(0.0)
+                first = m[r, p]
+                second = m[r, q]
+                m[r, p] = c * first - s * second
+                m[r, q] = s * first + c * second
+                m[p, r] = m[r, p]
+                m[q, r] = m[r, q]
+                for i in range(3):
+                    first = axes[i, p]
+                    second = axes[i, q]
+                    axes[i, p] = c * first - s * second
+                    axes[i, q] = s * first + c * second
+    return axes, Vec3(m[0, 0], m[1, 1], m[2, 2])
+
+
+@wp.func
 def damping_stress(start_gradient: Mat33, gradient: Mat33, dt: real, mu: real, lam: real) -> Mat33:
     """Second Piola stress 2 mu E' + lambda tr(E') I of E' = (F^T F - F0^T F0) / (2 dt), F0 at the start of the step."""
     strain_rate = (wp.transpose(gradient) * gradient - wp.transpose(start_gradient) * start_gradient) / (real(2.0) * dt)
@@ -29,16 +72,29 @@ def damping_stress(start_gradient: Mat33, gradient: Mat33, dt: real, mu: real, l
 
 
 @wp.func
-def damping_block(gradient: Mat33, stress: Mat33, g_a: Vec3, g_b: Vec3, dt: real, mu: real, lam: real) -> Mat33:
-    """Block (a, b) of the derivative of F S by the corners,
-    g_a.S g_b I from the turning of F and the rest from S itself.
+def damping_block(stretch: Mat33, f_a: Vec3, f_b: Vec3, along: real, turning: real, dt: real, mu: real, lam: real):
+    """Block (a, b) of the derivative of F S by the corners: ``turning`` g_a.S g_b I from that of F, the rest from S
+    itself; ``stretch`` F F^T, ``f_a`` F g_a, ``along`` g_a.g_b.
     """
-    f_a = gradient * g_a
-    f_b = gradient * g_b
-    material = mu * (wp.dot(g_a, g_b) * (gradient * wp.transpose(gradient)) + wp.outer(f_b, f_a)) + lam * wp.outer(
-        f_a, f_b
-    )
-    return material / dt + wp.dot(g_a, stress * g_b) * wp.identity(n=3, dtype=wp.float64)
+    material = mu * (along * stretch + wp.outer(f_b, f_a)) + lam * wp.outer(f_a, f_b)
+    return material / dt + turning * wp.identity(n=3, dtype=wp.float64)
+
+
+@wp.func
+def write_first_corner(e: int, blocks: wp.array2d[Mat33]):
+    """The blocks of element ``e`` that its first corner has part in, and those below the diagonal, from the others: the
+    matrix is symmetric, and a body that goes elsewhere as a whole is not strained."""
+    last = Mat33()
+    for a in range(1, 4):
+        row = Mat33()
+        for b in range(1, 4):
+            if b < a:
+                blocks[e, 4 * a + b] = wp.transpose(blocks[e, 4 * b + a])
+            row -= blocks[e, 4 * a + b]
+        blocks[e, 4 * a] = row
+        blocks[e, a] = wp.transpose(row)
+        last -= row
+    blocks[e, 0] = last
 
 
 @wp.kernel
@@ -119,20 +175,54 @@ def element_gradients_kernel(
 
 
 @wp.kernel
-def gather_corners_kernel(
+def segment_pulls_kernel(
+    # Model:
+    offsets: wp.array[int],
+    nodes: wp.array[int],
+    shares: wp.array[real],
+    rest_lengths: wp.array[real],
+    slack: real,
+    full: real,
+    # In:
+    tensions: wp.array[real],
+    positions: wp.array[Vec3],
+    # Out:
+    pulls_out: wp.array[Vec3],
+):
+    """T phi u of each segment (Eq. 7), with the shares of tension of ``muscles.tension``."""
+    segment = wp.tid()
+    line = Vec3(real(0.0))
+    for slot in range(offsets[segment], offsets[segment + 1]):
+        line += shares[slot] * positions[nodes[slot]]
+    length = wp.max(wp.length(line), real(1e-300))
+    along = wp.clamp((length / rest_lengths[segment] - slack) / (full - slack), real(0.0), real(1.0))
+    share = along * along * (real(3.0) - real(2.0) * along)
+    pulls_out[segment] = (tensions[segment] * share / length) * line
+
+
+@wp.kernel
+def gather_forces_kernel(
     # Model:
     corner_offsets: wp.array[int],
     corner_from_slot: wp.array[int],
+    end_offsets: wp.array[int],
+    segment_from_end: wp.array[int],
+    end_shares: wp.array[real],
     # In:
     corner_values: wp.array2d[Vec3],
+    pulls: wp.array[Vec3],
     # Out:
     node_values_out: wp.array[Vec3],
 ):
+    """Of each node's corners and, where there are ends of muscles, of those."""
     node = wp.tid()
     total = Vec3(real(0.0))
     for slot in range(corner_offsets[node], corner_offsets[node + 1]):
         corner = corner_from_slot[slot]
         total += corner_values[corner // 4, corner % 4]
+    if end_offsets.shape[0] > 0:
+        for slot in range(end_offsets[node], end_offsets[node + 1]):
+            total += end_shares[slot] * pulls[segment_from_end[slot]]
     node_values_out[node] = total
 
 
@@ -165,20 +255,25 @@ def element_hessians_kernel(
     stress = Mat33()
     if dt > real(0.0):
         stress = damping_stress(start_gradients[e], f, dt, mu, lam)
-    for a in range(4):
+    stretch = f * wp.transpose(f)
+    for a in range(1, 4):
         g_a = shape_gradient(rest_inverse, a)
         h_a = inverse_transpose * g_a
-        for b in range(4):
+        f_a = f * g_a
+        for b in range(a, 4):
             g_b = shape_gradient(rest_inverse, b)
             h_b = inverse_transpose * g_b
+            along = wp.dot(g_a, g_b)
             block = (
-                mu * wp.dot(g_a, g_b) * wp.identity(n=3, dtype=wp.float64)
+                mu * along * wp.identity(n=3, dtype=wp.float64)
                 + cross_term * wp.outer(h_b, h_a)
                 + lam * wp.outer(h_a, h_b)
             )
             if dt > real(0.0):
-                block += damping_time * damping_block(f, stress, g_a, g_b, dt, mu, lam)
+                turning = wp.dot(g_a, stress * g_b)
+                block += damping_time * damping_block(stretch, f_a, f * g_b, along, turning, dt, mu, lam)
             blocks_out[e, 4 * a + b] = volumes[e] * block
+    write_first_corner(e, blocks_out)
 
 
 @wp.kernel
@@ -207,12 +302,10 @@ def element_projected_hessians_kernel(
     e = wp.tid()
     rest_inverse = rest_inverses[e]
     f = deformation_gradient(positions, tets[e], rest_inverse)
-    u = Mat33()
-    s = Vec3()
-    v = Mat33()
-    # u and v are rotations: what mirrors is in the sign of s.
-    wp.svd3(f, u, s, v)
-    pressure = lam * wp.log(s[0] * s[1] * s[2]) - mu
+    v, squares = principal_axes(wp.transpose(f) * f)
+    s = Vec3(wp.sqrt(squares[0]), wp.sqrt(squares[1]), wp.sqrt(squares[2]))
+    u = f * v * wp.diag(Vec3(real(1.0) / s[0], real(1.0) / s[1], real(1.0) / s[2]))
+    pressure = lam * wp.log(wp.determinant(f)) - mu
     scaling = Mat33()
     direct = Mat33()
     swapped = Mat33()
@@ -225,15 +318,16 @@ def element_projected_hessians_kernel(
                 flip = wp.max(mu - pressure / (s[i] * s[k]), real(0.0))
                 direct[i, k] = real(0.5) * (twist + flip)
                 swapped[i, k] = real(0.5) * (flip - twist)
-    q = Mat33()
-    d = Vec3()
-    wp.eig3(scaling, q, d)
+    q, d = principal_axes(scaling)
     clamped = wp.diag(Vec3(wp.max(d[0], real(0.0)), wp.max(d[1], real(0.0)), wp.max(d[2], real(0.0))))
     scaling = q * clamped * wp.transpose(q)
-    for a in range(4):
-        g_a = wp.transpose(v) * shape_gradient(rest_inverse, a)
-        for b in range(4):
-            g_b = wp.transpose(v) * shape_gradient(rest_inverse, b)
+    stretch = f * wp.transpose(f)
+    for a in range(1, 4):
+        rest_a = shape_gradient(rest_inverse, a)
+        g_a = wp.transpose(v) * rest_a
+        for b in range(a, 4):
+            rest_b = shape_gradient(rest_inverse, b)
+            g_b = wp.transpose(v) * rest_b
             block = Mat33()
             for i in range(3):
                 block[i, i] += scaling[i, i] * g_a[i] * g_b[i]
@@ -243,10 +337,10 @@ def element_projected_hessians_kernel(
                         block[i, k] += scaling[i, k] * g_a[i] * g_b[k] + swapped[i, k] * g_a[k] * g_b[i]
             block = u * block * wp.transpose(u)
             if dt > real(0.0):
-                rest_a = shape_gradient(rest_inverse, a)
-                rest_b = shape_gradient(rest_inverse, b)
-                block += damping_time * damping_block(f, Mat33(), rest_a, rest_b, dt, mu, lam)
+                along = wp.dot(rest_a, rest_b)
+                block += damping_time * damping_block(stretch, f * rest_a, f * rest_b, along, real(0.0), dt, mu, lam)
             blocks_out[e, 4 * a + b] = volumes[e] * block
+    write_first_corner(e, blocks_out)
 
 
 @wp.kernel

@@ -40,12 +40,12 @@ vec3 egsArm(sampler2D cage, int tet, float share, int own, vec3 mean, vec3 moved
   return reach > limit ? result * (limit / reach) : result;
 }
 
-vec3 egsBand(sampler2D bands, sampler2D scales, int at, int k) {
-  return (egsTexel(bands, at + k).rgb * 255.0 - 128.0) / 127.0 * egsTexel(scales, k).x;
+vec3 egsBand(sampler2D bands, mat4 scales, int at, int k) {
+  return (egsTexel(bands, at + k).rgb * 255.0 - 128.0) / 127.0 * scales[k / 4][k % 4];
 }
 
 /* Bands 1 to 3 towards the unit direction d, INRIA's signs. */
-vec3 egsColour(sampler2D bands, sampler2D scales, int index, int degree, vec3 d) {
+vec3 egsColour(sampler2D bands, mat4 scales, int index, int degree, vec3 d) {
   if (degree == 0) return vec3(0.0);
   int at = index * ((degree + 1) * (degree + 1) - 1);
   float x = d.x, y = d.y, z = d.z;
@@ -81,7 +81,7 @@ float egsLight(sampler2D shade, vec4 place, vec3 p) {
 }
 
 CovSplat egsCarried(
-    int index, sampler2D splats, sampler2D arms, sampler2D bands, sampler2D scales, sampler2D cage, sampler2D shade,
+    int index, sampler2D splats, sampler2D arms, sampler2D bands, mat4 scales, sampler2D cage, sampler2D shade,
     vec4 shadePlace, vec3 eye, int degree) {
   vec4 a = egsTexel(splats, 4 * index), q = egsTexel(splats, 4 * index + 1);
   vec4 s = egsTexel(splats, 4 * index + 2), colour = egsTexel(splats, 4 * index + 3);

@@ -57,6 +57,7 @@ export class Ground {
         reach: { value: reach },
         cell: { value: 0.25 * height },
         softness: { value: 0.04 },
+        box: { value: new THREE.Vector4() },
       },
       vertexShader: `varying vec3 place;
         void main() {
@@ -65,7 +66,7 @@ export class Ground {
         }`,
       fragmentShader: `
         varying vec3 place; uniform sampler2D shade; uniform vec2 centre, shadeCentre;
-        uniform float shadeHalf, reach, cell, softness;
+        uniform float shadeHalf, reach, cell, softness; uniform vec4 box;
         float line(vec2 p, float width) {
           vec2 d = abs(fract(p / cell + 0.5) - 0.5) * cell, w = fwidth(p) * width;
           vec2 l = clamp(1.0 - d / w, 0.0, 1.0) * clamp(0.35 * cell / w, 0.0, 1.0);
@@ -76,7 +77,7 @@ export class Ground {
           float fade = smoothstep(1.0, 0.25, distance(p, centre) / reach);
           vec3 colour = mix(vec3(0.105, 0.115, 0.13), vec3(0.21, 0.23, 0.26), line(p, 1.1));
           vec2 uv = 0.5 + 0.5 * (p - shadeCentre) / shadeHalf;
-          if (all(lessThan(abs(uv - 0.5), vec2(0.5)))) {
+          if (all(greaterThan(uv, box.xy)) && all(lessThan(uv, box.zw))) {
             float dark = 0.0;
             for (int i = 0; i < 12; i++) {
               float a = 2.399963 * float(i), r = sqrt((float(i) + 0.5) / 12.0) * softness;
@@ -105,6 +106,7 @@ export class Ground {
     const { uniforms } = this.mesh.material;
     (uniforms.shadeCentre!.value as THREE.Vector2).set(middle.x, middle.y);
     uniforms.softness!.value = 0.02 + 0.05 * Math.min(Math.max(middle.z / this.height - 0.2, 0), 1.5);
+    this.shadeBox(positions, middle, uniforms.softness!.value as number);
     this.camera.position.set(middle.x, middle.y, 0);
     this.shadow.place.x = middle.x;
     this.shadow.place.y = middle.y;
@@ -119,5 +121,26 @@ export class Ground {
     renderer.render(this.casters, this.camera);
     renderer.setRenderTarget(before.target);
     renderer.setClearColor(before.colour, before.alpha);
+  }
+
+  /** Where the shadow is: nowhere else need a pixel look for it. */
+  private shadeBox(positions: Float32Array, middle: THREE.Vector3, softness: number): void {
+    let [left, right, near, far] = [Infinity, -Infinity, Infinity, -Infinity];
+    for (let k = 0; k < positions.length; k += 3) {
+      left = Math.min(left, positions[k]!);
+      right = Math.max(right, positions[k]!);
+      near = Math.min(near, positions[k + 1]!);
+      far = Math.max(far, positions[k + 1]!);
+    }
+    const half = this.shadow.place.z;
+    const at = (x: number, centre: number): number => 0.5 + (0.5 * (x - centre)) / half;
+    // A pixel of the shadow's own picture beyond its softness; no further out than that picture is.
+    const edge = softness + 2 / SHADOW_SIDE;
+    (this.mesh.material.uniforms.box!.value as THREE.Vector4).set(
+      Math.max(at(left, middle.x) - edge, 0),
+      Math.max(at(near, middle.y) - edge, 0),
+      Math.min(at(right, middle.x) + edge, 1),
+      Math.min(at(far, middle.y) + edge, 1),
+    );
   }
 }

@@ -1,10 +1,12 @@
 // A creature that lives: its clock, the controls under it, and what the session says.
 
+import { Acting } from "./acting";
 import { button, element, icon, save } from "./dom";
 import { LiveClock } from "./clock";
 import { Hands, Pointer, type Action } from "./hands";
 import { Marks } from "./marks";
 import { Pushes } from "./pushes";
+import { slide, type Slide } from "./slide";
 import type { LiveSource, News } from "./source";
 import type { Stage } from "./stage";
 
@@ -47,6 +49,7 @@ export class Live {
   private readonly body: HTMLElement;
   private readonly help: HTMLElement;
   private readonly sliders: { friction: Slide; sag: Slide };
+  private readonly acting: Acting;
   private busy = false;
   private lastMoved = -Infinity;
   private facing = false;
@@ -81,8 +84,17 @@ export class Live {
     };
     const push = slide("Push", [0.05, 1], 0.05, (value) => value.toFixed(2), (value) => (this.pushes.strength = value));
     push.show(this.pushes.strength);
-    const sheet = { class: "sheet", "aria-label": "Body, ground and pushes", hidden: "" };
-    this.body = element("section", sheet, this.sliders.friction.part, this.sliders.sag.part, push.part);
+    this.acting = new Acting(source.header.facts, (style) => source.send({ type: "style", ...style }));
+    const sheet = { class: "sheet", "aria-label": "Style, body, ground and pushes", hidden: "" };
+    this.body = element(
+      "section",
+      sheet,
+      ...this.acting.parts,
+      element("hr", {}),
+      this.sliders.friction.part,
+      this.sliders.sag.part,
+      push.part,
+    );
     this.help = helpSheet();
     source.onFrame = () => this.clock.arrived(performance.now() / 1000);
     source.listen((news) => this.hear(news));
@@ -130,7 +142,7 @@ export class Live {
       "div",
       {},
       button("stand", "Stand up at the start (backspace)", () => this.source.send({ type: "stand" })),
-      button("sliders", "Friction, stiffness, pushes", open(this.body, this.help)),
+      button("sliders", "Style, friction, stiffness, pushes", open(this.body, this.help)),
       this.takeButton,
       button("script", "Save what it did as a script", () => this.source.send({ type: "script" })),
       button("help", "Keys (?)", open(this.help, this.body)),
@@ -204,6 +216,7 @@ export class Live {
     this.takeButton.setAttribute("aria-pressed", String(state.recording));
     this.sliders.friction.show(state.friction);
     this.sliders.sag.show(-Math.log(state.sag));
+    this.acting.show(state.style);
     this.marks.showGoal(state.goal);
     this.stage.invalidate();
   }
@@ -242,45 +255,6 @@ export class Live {
   private toggleTake(): void {
     this.source.send({ type: "record", on: !(this.state?.recording ?? false) });
   }
-}
-
-interface Slide {
-  part: HTMLElement;
-  show(value: number): void;
-}
-
-function slide(
-  title: string,
-  [least, most]: [number, number],
-  step: number | "any",
-  said: (value: number) => string,
-  set: (value: number) => void,
-): Slide {
-  const range = { min: String(least), max: String(most), step: String(step) };
-  const input = element("input", { type: "range", class: "line", ...range, "aria-label": title });
-  const value = element("output", { class: "value" });
-  const label = (): void => {
-    value.textContent = said(Number(input.value));
-    input.style.setProperty("--done", `${(100 * (Number(input.value) - least)) / (most - least)}%`);
-  };
-  let held = false;
-  input.addEventListener("input", () => {
-    held = true;
-    label();
-  });
-  input.addEventListener("change", () => {
-    held = false;
-    set(Number(input.value));
-    input.blur();
-  });
-  return {
-    part: element("label", { class: "slide" }, element("span", {}, title), value, input),
-    show: (now) => {
-      if (held) return;
-      input.value = String(now);
-      label();
-    },
-  };
 }
 
 function helpSheet(): HTMLElement {

@@ -22,7 +22,16 @@ export interface Facts {
   degree: { splats: number; scene: number };
   /** Of a creature that lives: which session this is, and how far its sliders go. */
   session?: string;
-  limits?: { friction: [number, number]; sag: [number, number] };
+  limits?: { friction: [number, number]; sag: [number, number]; style: [number, number] };
+  /** Ways to jump that have a name. */
+  styles?: Record<string, Style>;
+}
+
+/** How a jump is acted, times the usual (egs_warp/motions/style.py). */
+export interface Style {
+  anticipation: number;
+  squash: number;
+  timing: number;
 }
 
 export type Numbers = Float32Array | Int32Array | Uint8Array;

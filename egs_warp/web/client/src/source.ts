@@ -1,6 +1,6 @@
 // Where frames come from: a file that holds them all, or a socket that sends them as they are made.
 
-import { readFrame, readFrames, readHeader, type Frame, type Header } from "./packets";
+import { readFrame, readFrames, readHeader, type Frame, type Header, type Style } from "./packets";
 
 export interface FrameSource {
   readonly header: Header;
@@ -49,6 +49,7 @@ export type News =
       pulled: boolean;
       friction: number;
       sag: number;
+      style: Style;
       motions: number;
       step: number;
     }

@@ -45,12 +45,13 @@ export function carriedSplats(
   }
   const arms = floatTexture(4 * Math.max(1, arm));
   for (let k = 0; k < arm; k++) arms.values.set(armRows.subarray(15 * k, 15 * k + 15), 16 * k);
+  const bandScales = [...floatsOf(header, `${name}_band_scales`), ...new Array<number>(16).fill(0)];
   const eye = new THREE.Vector3();
   const uniforms = {
     splats: dyno.dynoSampler2D(splats.texture, "egsSplats"),
     arms: dyno.dynoSampler2D(arms.texture, "egsArms"),
     bands: dyno.dynoSampler2D(bandTexture(bytesOf(header, `${name}_bands`), count, degree), "egsBands"),
-    bandScales: dyno.dynoSampler2D(scaleTexture(floatsOf(header, `${name}_band_scales`)), "egsBandScales"),
+    bandScales: dyno.dynoMat4(new THREE.Matrix4().fromArray(bandScales), "egsBandScales"),
     cage: dyno.dynoSampler2D(cage, "egsCage"),
     // Without a shadow its place has no size, and any texture will do.
     shade: dyno.dynoSampler2D(shadow?.texture ?? cage, "egsShade"),
@@ -66,7 +67,7 @@ export function carriedSplats(
         splats: "sampler2D",
         arms: "sampler2D",
         bands: "sampler2D",
-        bandScales: "sampler2D",
+        bandScales: "mat4",
         cage: "sampler2D",
         shade: "sampler2D",
         shadePlace: "vec4",
@@ -105,13 +106,5 @@ function bandTexture(bands: Uint8Array, count: number, degree: number): THREE.Da
   }
   const texture = new THREE.DataTexture(values, TEXTURE_WIDTH, rows, THREE.RGBAFormat, THREE.UnsignedByteType);
   texture.needsUpdate = true;
-  return texture;
-}
-
-function scaleTexture(scales: Float32Array): THREE.DataTexture {
-  const { texture, values } = floatTexture(16);
-  scales.forEach((scale, k) => {
-    values[4 * k] = scale;
-  });
   return texture;
 }

@@ -188,8 +188,9 @@ export class Stage {
   draw(): boolean {
     this.controls.update();
     if (!this.dirty) return false;
-    this.dirty = false;
     this.renderer.render(this.scene, this.camera);
+    // Splats that were made anew for this picture are in it already; once they are sorted, Spark says so again.
+    this.dirty = false;
     return true;
   }
 

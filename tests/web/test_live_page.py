@@ -1,0 +1,165 @@
+"""The page of a live creature in a real Chromium: what it shows, its controls, its connection."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from egs_warp.motions.style import Style
+from egs_warp.web.feed import LiveFeed
+from egs_warp.web.session import Session
+from tests.support.chromium import opened, wait_until
+from tests.support.living import in_browser, living, watched
+from tests.support.pages import served
+
+
+@in_browser
+def test_what_is_shown_goes_evenly_and_never_back(chromium: Any, session: Session):
+    with watched(chromium, session) as page:
+        page.keyboard.press(" ")
+        wait_until(page, "egs.live.state?.doing === 'jump'")
+        shown = page.evaluate(
+            """() => new Promise((resolve) => {
+                const shown = [], began = performance.now();
+                const look = () => {
+                    shown.push(egs.live.clock.time);
+                    if (performance.now() - began < 3000) requestAnimationFrame(look); else resolve(shown);
+                };
+                look();
+            })"""
+        )
+        assert len(shown) > 20 and np.diff(shown).min() >= 0.0 and shown[-1] > shown[0]
+        # A frame of the solver is shown in more than one picture where the solver is slower than the screen.
+        assert np.diff(shown).max() < 0.1
+        assert "stand" in page.text_content(".pace") or "jump" in page.text_content(".pace")
+
+
+@in_browser
+def test_a_picture_is_drawn_once_and_again_when_its_splats_are_sorted(chromium: Any, session: Session):
+    with watched(chromium, session) as page:
+        wait_until(page, "egs.live.state?.resting && !egs.stages[0].sorting && !egs.stages[0].dirty")
+        left = page.evaluate(
+            """() => {
+                const stage = egs.stages[0], draw = stage.draw.bind(stage);
+                window.drawn = 0;
+                stage.draw = () => { const done = draw(); window.drawn += done ? 1 : 0; return done; };
+                stage.show(stage.source.frames.length - 1);
+                stage.draw();
+                return stage.dirty;
+            }"""
+        )
+        assert left is False
+        wait_until(page, "window.drawn >= 2 && !egs.stages[0].sorting")
+
+
+@in_browser
+def test_pause_step_sliders_and_script(chromium: Any, session: Session):
+    with watched(chromium, session) as page:
+        page.keyboard.press("p")
+        wait_until(page, "egs.live.state?.paused && document.querySelector('.pace').textContent === 'paused'")
+        time.sleep(0.2)
+        held = session.state.time
+        for _ in range(2):
+            page.keyboard.press(".")
+        wait_until(page, f"egs.stages[0].source.frames.at(-1).time > {held + 1.5 / 60.0}")
+        assert session.state.time == pytest.approx(held + 2.0 / 60.0)
+        page.click("[title='Style, friction, stiffness, pushes']")
+        slider = page.locator("[aria-label=Friction]")
+        slider.focus()
+        page.keyboard.press("Home")
+        wait_until(page, "egs.live.state?.friction === 0")
+        page.keyboard.press("p")
+        page.keyboard.press(" ")
+        wait_until(page, "egs.live.state?.motions === 1")
+        with page.expect_download() as script:
+            page.click("[title^='Save what it did']")
+        assert script.value.suggested_filename == "script.json"
+        assert json.loads(Path(script.value.path()).read_text())[0]["motion"] == "jump"
+
+
+@in_browser
+def test_a_style_is_chosen_by_name_or_by_number(chromium: Any, session: Session):
+    """The page shows what the session says, and the next jump is of that style."""
+    with watched(chromium, session) as page:
+        pressed = "[...document.querySelectorAll('.choice [aria-pressed=true]')].map((one) => one.textContent).join()"
+        wait_until(page, "egs.live.state?.style.squash === 1")
+        assert page.evaluate(pressed) == "usual"
+        page.click("[title='Style, friction, stiffness, pushes']")
+        page.click("#style-heavy")
+        wait_until(page, f"egs.live.state?.style.squash === 1.4 && {pressed} === 'heavy'")
+        assert page.text_content("label:has([aria-label=Squash]) output") == "1.40\u00d7"
+        page.locator("[aria-label=Anticipation]").focus()
+        page.keyboard.press("Home")
+        wait_until(page, f"egs.live.state?.style.anticipation === 0.5 && {pressed} === ''")
+        page.keyboard.press(" ")
+        wait_until(page, "egs.live.state?.motions === 1")
+        assert session.steering.requests[0].style == Style(anticipation=0.5, squash=1.4, timing=1.25)
+        page.click("#style-usual")
+        wait_until(page, f"egs.live.state?.style.timing === 1 && {pressed} === 'usual'")
+
+
+@in_browser
+def test_a_lost_connection_is_taken_up_and_the_session_goes_on(chromium: Any, session: Session):
+    feed = LiveFeed(session)
+    with served(feed=feed) as server:
+        page, complaints = opened(chromium, server.address)
+        page.keyboard.press(" ")
+        wait_until(page, "egs.live.state?.doing === 'jump'")
+        assert complaints == []
+        port, token = server.port, server.token
+    wait_until(page, "document.body.classList.contains('lost')")
+    assert page.evaluate("document.body.dataset.lost") == "connection lost, trying again"
+    assert page.locator("canvas.view").is_visible()
+    page.evaluate("window.stayed = true")
+    held = session.state.time
+    with served(feed=feed, port=port, token=token):
+        wait_until(page, f"egs.stages[0].source.frames.at(-1).time > {held + 0.1}")
+        assert not page.evaluate("document.body.classList.contains('lost')")
+        assert page.evaluate("window.stayed") and page.evaluate("egs.live.state?.doing") in ("jump", "stand")
+        page.close()
+
+
+@in_browser
+def test_a_second_page_is_told_in_one_line(chromium: Any, session: Session):
+    with living(session) as server:
+        first, complaints = opened(chromium, server.address)
+        second = chromium.new_page()
+        second.goto(server.address)
+        second.wait_for_selector("[role=alert]:has-text('another page watches this run already; close it first')")
+        second.close()
+        first.keyboard.press(" ")
+        wait_until(first, "egs.live.state?.doing === 'jump'")
+        assert complaints == []
+        first.close()
+
+
+@in_browser
+def test_a_phone_has_all_controls_within_reach(chromium: Any, session: Session):
+    with watched(chromium, session, 360, 740) as page:
+        assert page.evaluate("document.documentElement.scrollWidth") <= 360
+        page.click("[title^=Keys]")
+        for part in (
+            ".dock",
+            "#left",
+            "[title^='Push it']",
+            "#forward",
+            "#jump",
+            "[title^='Record a take']",
+            "[title^=Keys]",
+            ".keys",
+        ):
+            box = page.locator(part).bounding_box()
+            assert box["x"] >= 0 and box["x"] + box["width"] <= 360 and box["y"] + box["height"] <= 740, part
+        sheet = page.locator("[aria-label=Keys].sheet").bounding_box()
+        assert sheet["y"] >= 0 and sheet["y"] + sheet["height"] <= page.locator(".dock").bounding_box()["y"]
+        page.click("[title^=Style]")
+        sheet, choice = (page.locator(part).bounding_box() for part in ("[aria-label^=Style].sheet", "#style-rubbery"))
+        assert sheet["y"] >= 0 and sheet["y"] + sheet["height"] <= page.locator(".dock").bounding_box()["y"]
+        assert choice["x"] + choice["width"] <= 360
+        page.locator("#jump").tap() if page.evaluate("navigator.maxTouchPoints") else page.click("#jump")
+        wait_until(page, "egs.live.state?.doing === 'jump'")
