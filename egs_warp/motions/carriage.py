@@ -58,6 +58,8 @@ class Carriage(Protocol):
     """Metres by which a foot may come down off its place to catch the body."""
     tempo: Tempo
     """How the gait shares out its time at the usual speed."""
+    com: float
+    """Weight of the motion of the centre of mass: balance."""
     hold: float
     """Weight of contact points that stand and would slide, each by its share of the weight."""
 
@@ -82,6 +84,7 @@ class OnLegs:
         self.lift = LIFT * body.height
         self.catch = REACH * min(foot.length for foot in feet)
         self.tempo = ON_LEGS
+        self.com = 600.0
         self.hold = 1000.0
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
@@ -110,6 +113,7 @@ class OnBase:
         self.pace = Pace(0.5 * pivot * self._width, 0.5 * pivot)
         self.lift = min(ROLL * self._width, LIFT * body.height)
         self.catch = 0.0
+        self.com = 3000.0  # where friction gives too little for both, balance goes before turning
         self.hold = 50.0  # what turns about a patch slides at its edges
 
     @staticmethod

@@ -23,7 +23,7 @@ from egs_warp.motions.route import Pace
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.stand import Stand
 from egs_warp.motions.timetable import Moment
-from egs_warp.motions.walk import Walk
+from egs_warp.motions.walk import LOST, Walk
 
 _AHEAD = 4
 """Paces to come that a walk plans for, as if the command stayed."""
@@ -58,7 +58,9 @@ class DrivenWalk(Walk):
         self._usual = self.gait
         self._lay_places(0)
 
-    def _plan_swing(self, swing: int) -> None:
+    def _plan_swing(self, swing: int, local: np.ndarray) -> None:
+        if self._behind(local) > LOST:
+            self.places[swing, :2] -= self._short(local).mean(axis=0)
         self._lay_places(swing)
 
     def _lay_places(self, swing: int) -> None:
