@@ -6,13 +6,14 @@ Places of feet are (x, y, z, heading): metres in the frame of the start, radians
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from egs_warp.motions.feet import Base, Foot, halves
-from egs_warp.motions.gait import carrying_time
+from egs_warp.motions.gait import Tempo
 from egs_warp.motions.route import Pace
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.stance import SHEAR
@@ -25,9 +26,14 @@ LARGEST_TURN = float(np.radians(15.0))
 """Of one pace on legs."""
 LIFT = 0.03
 """Body heights that a foot is lifted at most."""
-PIVOT, ROLL = 0.3, 0.05
+ON_LEGS, ON_BASE = Tempo(0.94, 0.78, 0.2, 0.6), Tempo(0.94, 0.55, 0.1, 0.75)
+"""Gaits at the usual speed; what turns about its sides takes most of a swing for it, and falls to and fro between them
+with less of a lean, the less time it stands on both."""
+PIVOT, ROLL = 0.45, 0.05
 """Radians by which a body on one base turns about one side, and tips to lift the other, at most: faster, it would throw
 itself off the side on which it stands."""
+SLOWEST = 1.25
+"""Times the usual swing that it may take to turn so far, where friction under one side is not enough in the usual."""
 SPENT = 1.2
 """Peak of the torque about up that a pivot would take over what friction under the one side gives; it may lag a little
 (measured on monkey and pawn)."""
@@ -50,6 +56,10 @@ class Carriage(Protocol):
     """Metres that a foot is lifted."""
     catch: float
     """Metres by which a foot may come down off its place to catch the body."""
+    tempo: Tempo
+    """How the gait shares out its time at the usual speed."""
+    com: float
+    """Weight of the motion of the centre of mass: balance."""
     hold: float
     """Weight of contact points that stand and would slide, each by its share of the weight."""
 
@@ -73,6 +83,8 @@ class OnLegs:
         self.pace = Pace(REACH * min(foot.length for foot in feet), LARGEST_TURN, SIDEWAYS)
         self.lift = LIFT * body.height
         self.catch = REACH * min(foot.length for foot in feet)
+        self.tempo = ON_LEGS
+        self.com = 600.0
         self.hold = 1000.0
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
@@ -94,15 +106,20 @@ class OnBase:
         self._com = body.centre_of_mass(self._arms)
         self._between = soles[0] - soles[1]
         self._width = float(np.hypot(*self._between[:2]))
-        pivot = min(PIVOT, SPENT * self._pivot(place, soles))
+        usual = SPENT * self._pivot(place, soles)
+        slower = float(np.clip(np.sqrt(PIVOT / max(usual, 1e-12)), 1.0, SLOWEST))
+        self.tempo = replace(ON_BASE, swing=slower * ON_BASE.swing)
+        pivot = min(PIVOT, slower**2 * usual)
         self.pace = Pace(0.5 * pivot * self._width, 0.5 * pivot)
         self.lift = min(ROLL * self._width, LIFT * body.height)
         self.catch = 0.0
+        self.com = 3000.0  # where friction gives too little for both, balance goes before turning
         self.hold = 50.0  # what turns about a patch slides at its edges
 
     @staticmethod
     def _pivot(place: Place, soles: np.ndarray) -> float:
-        """Radians by which friction under one side turns the body while the other is carried ahead."""
+        """Radians by which friction under one side turns the body while the other is carried ahead in a usual
+        swing."""
         body = place.body
         touching = place.ground.local(place.touching)[:, :2]
         away = np.linalg.norm(touching[:, None] - soles[:, :2], axis=2)
@@ -110,7 +127,7 @@ class OnBase:
         arms = [np.linalg.norm(patch - patch.mean(axis=0), axis=1).mean() for patch in patches if len(patch)]
         gravity, up = float(np.linalg.norm(body.gravity)), place.ground.axes[2]
         torque = place.friction * body.mass * gravity * min(map(float, arms), default=0.0)
-        time = carrying_time(float(np.sqrt(body.height / gravity)))
+        time = ON_BASE.carried * ON_BASE.swing * float(np.sqrt(body.height / gravity))
         return torque * time**2 / (_PEAK * float(up @ body.inertia(place.standing) @ up))
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:

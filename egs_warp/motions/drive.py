@@ -7,7 +7,7 @@ the body gathers itself.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,13 +18,12 @@ from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.command import Drive, DrivePlan
 from egs_warp.motions.crawl import Crawl
 from egs_warp.motions.feet import Base
-from egs_warp.motions.gait import Gait
 from egs_warp.motions.roll import Roll
 from egs_warp.motions.route import Pace
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.stand import Stand
 from egs_warp.motions.timetable import Moment
-from egs_warp.motions.walk import Walk
+from egs_warp.motions.walk import LOST, Walk
 
 _AHEAD = 4
 """Paces to come that a walk plans for, as if the command stayed."""
@@ -59,7 +58,9 @@ class DrivenWalk(Walk):
         self._usual = self.gait
         self._lay_places(0)
 
-    def _plan_swing(self, swing: int) -> None:
+    def _plan_swing(self, swing: int, local: np.ndarray) -> None:
+        if self._behind(local) > LOST:
+            self.places[swing, :2] -= self._short(local).mean(axis=0)
         self._lay_places(swing)
 
     def _lay_places(self, swing: int) -> None:
@@ -73,14 +74,14 @@ class DrivenWalk(Walk):
         else:
             time = self._usual.swing_time + self._usual.double_time
             rate = self._quickness(time)
-            self.gait = Gait(
-                self._usual.groups, 1, self._usual.swing_time / rate, self._usual.double_time / rate, self._usual.lift
+            self.gait = replace(
+                self._usual, swing_time=self._usual.swing_time / rate, double_time=self._usual.double_time / rate
             )
             places = kept
             for _ in range(_AHEAD):
                 places.append(self._next(places[-1], time / rate))
         self.places = np.array(places)
-        self.gait = Gait(self.gait.groups, len(places) - 1, self.gait.swing_time, self.gait.double_time, self.gait.lift)
+        self.gait = replace(self.gait, paces=len(places) - 1)
 
     def _next(self, place: np.ndarray, time: float) -> np.ndarray:
         unit, height = self.body.time_unit, self.body.height

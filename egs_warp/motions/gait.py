@@ -4,10 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-_SWING, _DOUBLE = 0.94, 0.78
-"""Of sqrt(H / g): how long a swing takes, and how long all feet stand after it."""
-_CARRIED_FROM, _CARRIED = 0.2, 0.6
-"""Parts of a swing: when a foot begins to be carried ahead, and for how long."""
+
+@dataclass(frozen=True)
+class Tempo:
+    """How a gait shares out its time."""
+
+    swing: float
+    """Of sqrt(H / g): how long a swing takes,"""
+    double: float
+    """and how long all feet stand after it."""
+    carried_from: float
+    """Parts of a swing: when a foot begins to be carried ahead,"""
+    carried: float
+    """and for how long. It has arrived before it lands, lest an early touch of the ground drag it."""
 
 
 def feet_in_turn(count: int) -> tuple[tuple[int, ...], ...]:
@@ -34,11 +43,14 @@ class Gait:
     """Seconds that all feet stand between two swings."""
     lift: float
     """Metres a foot is lifted."""
+    window: tuple[float, float]
+    """Parts of a swing between which a foot is carried ahead."""
 
     @classmethod
-    def of(cls, feet: int, paces: int, lift: float, *, time_unit: float) -> Gait:
+    def of(cls, feet: int, paces: int, lift: float, tempo: Tempo, *, time_unit: float) -> Gait:
         """The gait on so many ``feet``; ``lift`` in metres, ``time_unit`` seconds, as sqrt(H / g)."""
-        return cls(feet_in_turn(feet), paces, _SWING * time_unit, _DOUBLE * time_unit, lift)
+        window = (tempo.carried_from, tempo.carried_from + tempo.carried)
+        return cls(feet_in_turn(feet), paces, tempo.swing * time_unit, tempo.double * time_unit, lift, window)
 
     @property
     def swings(self) -> int:
@@ -62,12 +74,12 @@ class Gait:
     @property
     def carried_from(self) -> float:
         """Seconds into a swing at which the foot goes ahead."""
-        return _CARRIED_FROM * self.swing_time
+        return self.window[0] * self.swing_time
 
     @property
     def carried_until(self) -> float:
         """Seconds into a swing at which it is over its next footprint."""
-        return (_CARRIED_FROM + _CARRIED) * self.swing_time
+        return self.window[1] * self.swing_time
 
     def lifted(self, progress: float) -> float:
         """Metres a foot is above the ground when ``progress`` (0 to 1) of its swing is over;
@@ -75,21 +87,15 @@ class Gait:
         """
         return self.lift * smooth(progress / 0.4) * (1.0 - smooth((progress - 0.65) / 0.35))
 
-    @staticmethod
-    def carried(progress: float) -> float:
-        """Part of its way that a foot has gone when ``progress`` (0 to 1) of its swing is over; it has arrived before
-        it lands, lest an early touch of the ground drag it."""
-        return smooth((progress - _CARRIED_FROM) / _CARRIED)
+    def carried(self, progress: float) -> float:
+        """Part of its way that a foot has gone when ``progress`` (0 to 1) of its swing is over."""
+        start, end = self.window
+        return smooth((progress - start) / (end - start))
 
     @staticmethod
     def eased(progress: float) -> float:
         """Part to which a foot is steered to its place when ``progress`` (0 to 1) of its swing is over."""
         return smooth(progress / 0.3)
-
-
-def carrying_time(time_unit: float) -> float:
-    """Seconds in which a foot is carried ahead in a swing at the usual speed; ``time_unit`` is sqrt(H / g)."""
-    return _CARRIED * _SWING * time_unit
 
 
 def smooth(s: float) -> float:

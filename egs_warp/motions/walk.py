@@ -6,6 +6,7 @@ See docs/concepts/motions.md.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -39,6 +40,8 @@ from egs_warp.motions.way import check_way
 
 LOADED = 0.01
 """Share of the weight that a foot must carry to count as landed."""
+LOST = 0.5
+"""Of a pace: so far behind, it is made again."""
 SHORTEST = 0.002
 """Body heights: a shorter pace is none."""
 _SHIFT, _GATHER, _REST = 1.5, 3.0, 1.0
@@ -87,8 +90,8 @@ class Walk:
         self.places = route(pace)
         """(P+1, 3) the body before the first and after each pace: see ``motions.route``."""
         check_way(place, self.places)
-        paces, lift = len(self.places) - 1, self._carriage.lift
-        self.gait = Gait.of(len(feet), paces, lift, time_unit=self._time_unit / speed)
+        paces, lift, tempo = len(self.places) - 1, self._carriage.lift, self._carriage.tempo
+        self.gait = Gait.of(len(feet), paces, lift, tempo, time_unit=self._time_unit / speed)
         self._pace = pace
         self._parts = [BodyPart.of(body, f"foot {index}", foot.sole) for index, foot in enumerate(feet)]
         self._near = [np.flatnonzero(foot_of_node(feet) == index) for index in range(len(feet))]
@@ -105,7 +108,10 @@ class Walk:
         """Metres that the feet which swing come down off their place to catch the body."""
         self._pressed: np.ndarray | None = None
         """(2,) the centre of pressure that was asked for last."""
-        self._late = 0
+        self._late = self._again = 0
+        self._asked_paces = paces
+        self._come = [0] * len(feet)
+        """The pace to whose place each foot came last."""
 
     @property
     def expected_time(self) -> float:
@@ -143,6 +149,8 @@ class Walk:
         if self._pace.length < self._asked_length:
             asked, reached = self._asked_length / self.body.height, self._pace.length / self.body.height
             found.append(f"steps of {asked:.2f} body heights were asked; the body goes by {reached:.2f} at most")
+        if self._again:
+            found.append(f"the feet slipped: {self._again} paces were made again")
         if self._late:
             found.append(f"{self._late} swings took too long: a foot found no ground")
         return found
@@ -166,7 +174,7 @@ class Walk:
         spin = control.turn_rate / self._time_unit * self._turn(local, pose) + self._turn(pose, next_pose) / dt
         follow = min(control.follow / self._time_unit, 0.7 / dt)
         return [
-            centre_of_mass_velocity(body, com_velocity @ axes, control.com),
+            centre_of_mass_velocity(body, com_velocity @ axes, self._carriage.com),
             SpinObjective(body.inertia(state.positions) @ (spin @ axes), control.spin),
             node_velocities(body, follow * (next_pose - local) @ axes, control.pose),
             *(self._foot_objective(index, local, before, after, elapsed, dt) for index in self.swinging),
@@ -176,7 +184,7 @@ class Walk:
 
     def _advance_phase(self, local: np.ndarray, report: StepReport | None, time: float) -> None:
         if self._entered is None:
-            self._enter(WalkPhase.SHIFT, time)
+            self._enter(WalkPhase.SHIFT, time, local)
         assert self._entered is not None
         elapsed, gait = time - self._entered + 1e-9, self.gait
         if self.swinging and elapsed >= gait.carried_until:
@@ -189,20 +197,42 @@ class Walk:
                 self._late += bool(self.swinging)
                 for index in self.swinging:
                     self._stands(index, local)
-                self._enter(self._after_swing(self.swing), time)
+                self._enter(self._after_swing(self.swing), time, local)
         elif self.phase in (WalkPhase.SHIFT, WalkPhase.STAND) and elapsed >= self._duration(self.phase):
-            self._plan_swing(self.swing + 1)
+            self._plan_swing(self.swing + 1, local)
             self.swing += 1
             self.swinging, self._sidestep = gait.group(self.swing), np.zeros(2)
-            self._enter(WalkPhase.SWING, time)
+            self._enter(WalkPhase.SWING, time, local)
         elif self.phase is WalkPhase.GATHER and elapsed >= self._duration(self.phase):
-            self._enter(WalkPhase.REST, time)
+            self._enter(WalkPhase.REST, time, local)
 
-    def _plan_swing(self, swing: int) -> None:
-        """``swing`` is to begin. What is driven (``motions.drive``) chooses now where it goes."""
+    def _plan_swing(self, swing: int, local: np.ndarray) -> None:
+        """``swing`` is to begin with the nodes at ``local`` (N, 3); a pace that slipping feet have lost is made again.
+        What is driven (``motions.drive``) chooses now where it goes."""
+        if self._again < self._asked_paces and self._behind(local) > LOST and swing < self.gait.paces:
+            self.places = np.insert(self.places, swing + 1, self.places[swing], axis=0)
+            self.gait = replace(self.gait, paces=self.gait.paces + 1)
+            self._again += 1
 
-    def _enter(self, phase: WalkPhase, time: float) -> None:
+    def _behind(self, local: np.ndarray) -> float:
+        """Paces by which the feet are short of where they came to, in the mean."""
+        ahead = self._homes([pace + 1 for pace in self._come]) - self._homes(self._come)
+        return float((self._short(local) * ahead).sum() / max((ahead**2).sum(), 1e-12))
+
+    def _short(self, local: np.ndarray) -> np.ndarray:
+        """(F, 2) metres from where each foot is to where it came to."""
+        return self._homes(self._come) - np.array([local[foot.sole, :2].mean(axis=0) for foot in self.feet])
+
+    def _homes(self, paces: Sequence[int]) -> np.ndarray:
+        """(F, 2) where each foot belongs after so many paces."""
+        places = [self.places[min(pace, self.gait.paces)] for pace in paces]
+        return np.array([self._footing.home(place, foot)[:2] for foot, place in enumerate(places)])
+
+    def _enter(self, phase: WalkPhase, time: float, local: np.ndarray) -> None:
         self.phase, self._entered = phase, time
+        for foot in set(range(len(self.feet))) - set(self.swinging):
+            # Where it stands now: it may have slid.
+            self._footprints[foot] = self._footing.landed(foot, local, float(self._footprints[foot, 3]))
         self._plan = self._planned_pendulum()
 
     def _after_swing(self, swing: int) -> WalkPhase:
@@ -221,7 +251,8 @@ class Walk:
     def _stands(self, index: int, local: np.ndarray) -> None:
         """Foot ``index`` has landed where it is."""
         self.swinging = tuple(foot for foot in self.swinging if foot != index)
-        planned = float(self.places[self.gait.landing(self.swing)][2])
+        self._come[index] = self.gait.landing(self.swing)
+        planned = float(self.places[self._come[index]][2])
         self._footprints[index] = self._footing.landed(index, local, planned)
 
     def _progress(self, phase: WalkPhase, swing: int, elapsed: float) -> float:

@@ -36,7 +36,6 @@ class WalkPlan:
 class WalkControl:
     """Weights of the objectives (speeds are compared in sqrt(g H)) and gains of the feedback."""
 
-    com: float = 600.0
     spin: float = 600.0
     pose: float = 1.0
     swing: float = 40.0

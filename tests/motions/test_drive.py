@@ -89,13 +89,13 @@ def test_the_way_is_made_from_the_command_of_the_moment() -> None:
     before = walk.places.copy()
     assert walk.gait.paces == len(before) - 1 > 2 and np.all(np.diff(before[:, 0]) > 0.0) and not before[:, 2].any()
     walk.command = Drive(0.1, 0.0, 0.1)
-    walk._plan_swing(2)
+    walk._lay_places(2)
     assert walk.places[:3] == pytest.approx(before[:3]) and walk.places[3, 2] > 0.0
     walk.command = Drive()
-    walk._plan_swing(3)
+    walk._lay_places(3)
     assert len(walk.places) == 4 and walk.gait.swings == 3 + len(walk.gait.groups) - 1
     walk.command = Drive(-0.1)
-    walk._plan_swing(4)
+    walk._lay_places(4)
     assert walk.places[4] == pytest.approx(walk.places[3]) and walk.places[5, 0] < walk.places[4, 0]
 
 

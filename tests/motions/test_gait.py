@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from egs_warp.motions.carriage import ON_LEGS
 from egs_warp.motions.gait import Gait, feet_in_turn
 
-GAIT = Gait.of(4, 4, 0.03, time_unit=0.32)
+GAIT = Gait.of(4, 4, 0.03, ON_LEGS, time_unit=0.32)
 
 
 @given(st.integers(2, 9))
@@ -27,7 +28,7 @@ def test_every_foot_swings_once_in_a_round_and_none_beside_its_neighbour(count: 
 @given(st.integers(2, 7), st.integers(1, 12))
 def test_footprints_follow_each_other_and_close(feet: int, paces: int) -> None:
     """Each swing comes one pace ahead of the last, and at the end all feet are at the last place."""
-    gait = Gait.of(feet, paces, 0.03, time_unit=0.3)
+    gait = Gait.of(feet, paces, 0.03, ON_LEGS, time_unit=0.3)
     at = np.zeros(feet)
     for swing in range(gait.swings):
         for foot in gait.group(swing):
@@ -40,7 +41,7 @@ def test_footprints_follow_each_other_and_close(feet: int, paces: int) -> None:
 def test_the_body_is_as_far_as_its_feet(feet: int) -> None:
     """Far from both ends: in the middle of a swing as far as the groups of feet are in the mean of before and after;
     and evenly."""
-    gait = Gait.of(feet, 40, 0.03, time_unit=0.3)
+    gait = Gait.of(feet, 40, 0.03, ON_LEGS, time_unit=0.3)
     swing, rounds = 20, len(gait.groups)
     before = np.mean([gait.landing(swing - 1 - k) for k in range(rounds)])
     after = np.mean([gait.landing(swing - k) for k in range(rounds)])
