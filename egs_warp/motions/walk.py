@@ -150,7 +150,7 @@ class Walk:
             asked, reached = self._asked_length / self.body.height, self._pace.length / self.body.height
             found.append(f"steps of {asked:.2f} body heights were asked; the body goes by {reached:.2f} at most")
         if self._again:
-            found.append(f"the feet slipped: {self._again} paces were made again")
+            found.append(f"the feet slipped: {self._again} pace{'s' * (self._again > 1)} made again")
         if self._late:
             found.append(f"{self._late} swings took too long: a foot found no ground")
         return found

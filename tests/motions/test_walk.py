@@ -125,6 +125,23 @@ def test_a_block_waddles(route: Route) -> None:
     check_audit(done)
 
 
+def test_a_pace_that_slipping_feet_have_lost_is_made_again() -> None:
+    """Feet that are where they came to go on; half a pace behind, they go to the same place once more, told in one
+    line, and the way still ends where it did."""
+    place = coarse_creature(block_mesh(), forward=AHEAD, settled=False).place
+    walk = Walk(place, straight(0.12), 0.04)
+    standing, before, paces = place.ground.local(place.standing), walk.places.copy(), walk.gait.paces
+    walk._come = [1, 1]
+    pace = before[1, 0]
+    assert walk._behind(standing + [pace, 0.0, 0.0]) == pytest.approx(0.0, abs=1e-9)
+    assert walk._behind(standing) == pytest.approx(1.0)
+    walk._plan_swing(1, standing + [0.8 * pace, 0.0, 0.0])
+    assert np.array_equal(walk.places, before) and not walk.notes()
+    walk._plan_swing(1, standing + [0.2 * pace, 0.0, 0.0])
+    assert walk.gait.paces == paces + 1 and np.array_equal(np.delete(walk.places, 2, axis=0), before)
+    assert np.array_equal(walk.places[2], before[1]) and "1 pace" in walk.notes()[-1]
+
+
 def test_the_plan_tells_what_the_legs_can_do() -> None:
     place = coarse_creature(stool(), forward=AHEAD, settled=False).place
     walk = Walk(place, straight(0.24), 0.08)

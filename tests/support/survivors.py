@@ -33,8 +33,8 @@ SURVIVORS: list[Survivor] = [
     ),
     Survivor(
         "fem/elasticity.py",
-        "self._no_gradients = empty(0, Mat33, device)",
-        "self._no_gradients = empty( 1, Mat33, device)",
+        "self._no_gradients, self._no_pulls = empty(0, Mat33, device), empty(0, Vec3, device)",
+        "self._no_gradients, self._no_pulls = empty( 1, Mat33, device), empty(0, Vec3, device)",
         "it stands in for an array that no kernel reads without damping",
     ),
     Survivor(
