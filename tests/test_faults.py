@@ -14,20 +14,15 @@ from functools import partial
 from itertools import count
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from egs_warp.assets.pawn import pawn
 from egs_warp.cli import main
-from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.io import write_ply
-from egs_warp.io.cameras import write_cameras
 from egs_warp.io.planes import read_planes
 from egs_warp.io.run_folder import MANIFEST
-from egs_warp.segmentation.selection_masks import masks_from_selection
 from tests.support.posed import posed_folder
-from tests.support.scenes import FLOOR, ball_on_floor
+from tests.support.scenes import write_scene
 
 COMMANDS = {
     "convert to ply": "convert {capture} {out}/a.ply",
@@ -72,12 +67,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A ball on a floor, its parts, and photos with poses."""
     folder = tmp_path_factory.mktemp("scene")
-    cloud, truth = ball_on_floor()
-    write_ply(folder / "scene.ply", cloud)
-    cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.9, count=4, size=64)
-    write_cameras(folder / "cameras.json", cameras, [f"photo{k}.png" for k in range(4)])
-    mask = masks_from_selection(cloud, truth, cameras[1:2])[0].mask
-    Image.fromarray(mask.astype(np.uint8) * 255).save(folder / "photo1.png")
+    write_scene(folder, views=4, size=64)
     posed_folder(folder / "posed")
     assert main(COMMANDS["segment"].format(scene=folder, out=folder / "parts").split()) == 0
     return folder

@@ -60,7 +60,8 @@ class DrivenWalk(Walk):
 
     def _plan_swing(self, swing: int, local: np.ndarray) -> None:
         if self._behind(local) > LOST:
-            self.places[swing, :2] -= self._short(local).mean(axis=0)
+            # It goes on from where slipping feet have left it.
+            self.places[min(swing, self.gait.paces), :2] -= self._short(local).mean(axis=0)
         self._lay_places(swing)
 
     def _lay_places(self, swing: int) -> None:

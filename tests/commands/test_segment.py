@@ -11,7 +11,6 @@ from PIL import Image
 
 from egs_warp.cli import main
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.inpainting.inpaint import InpaintOptions, inpaint
@@ -23,20 +22,14 @@ from egs_warp.io.run_folder import MANIFEST
 from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene
 from egs_warp.segmentation.clearance import Clearing
 from egs_warp.segmentation.object_spec import ObjectSpec
-from egs_warp.segmentation.selection_masks import masks_from_selection
-from tests.support.scenes import FLOOR, ball_on_floor
+from tests.support.scenes import FLOOR, write_scene
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """scene.ply, cameras.json, and the mask of its second view."""
     path = tmp_path_factory.mktemp("scene")
-    cloud, truth = ball_on_floor()
-    write_ply(path / "scene.ply", cloud)
-    cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.9, count=6, size=96)
-    write_cameras(path / "cameras.json", cameras, [f"photo{k}.png" for k in range(6)])
-    mask = masks_from_selection(cloud, truth, cameras[1:2])[0].mask
-    Image.fromarray(mask.astype(np.uint8) * 255).save(path / "photo1.png")
+    mask = write_scene(path, views=6, size=96)
     corner = np.zeros_like(mask)
     corner[:6, :6] = True
     wrong_masks = {"empty": mask & False, "sky": corner, "short": mask[:50], "white": mask | True, "inverted": ~mask}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -97,6 +98,26 @@ def test_the_way_is_made_from_the_command_of_the_moment() -> None:
     walk.command = Drive(-0.1)
     walk._lay_places(4)
     assert walk.places[4] == pytest.approx(walk.places[3]) and walk.places[5, 0] < walk.places[4, 0]
+
+
+def test_it_goes_on_from_where_slipping_feet_have_left_it() -> None:
+    """Feet a pace behind where they came to take the way with them; so they do in the closing swings of three groups of
+    feet, which come after the last place."""
+    place = stool().place
+    walk, standing = DrivenWalk(place, Drive(0.1)), place.ground.local(place.standing)
+    before, length = walk.places.copy(), walk.places[1, 0]
+    walk._come = [2] * len(walk.feet)
+    walk._plan_swing(2, standing + [before[2, 0], 0.0, 0.0])
+    assert walk.places[:5] == pytest.approx(before)
+    walk._plan_swing(2, standing + [before[1, 0], 0.0, 0.0])
+    assert np.array_equal(walk.places[:2], before[:2])
+    assert walk.places[2:5, 0] == pytest.approx(before[2:, 0] - length)
+    walk.command = Drive()
+    walk._lay_places(3)
+    walk.gait = replace(walk.gait, groups=((0,), (1, 2), (3,)))
+    walk._come, last = [3, 2, 2, 3], walk.places[3, 0]
+    walk._plan_swing(4, standing)
+    assert len(walk.places) == 4 and walk.places[3, 0] < last
 
 
 def test_a_quick_command_makes_the_gait_quicker() -> None:

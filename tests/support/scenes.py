@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
-import numpy as np
+from pathlib import Path
 
+import numpy as np
+from PIL import Image
+
+from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
+from egs_warp.io import write_ply
+from egs_warp.io.cameras import write_cameras
+from egs_warp.segmentation.selection_masks import masks_from_selection
 from tests.support.grounds import sheet
 
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
@@ -31,6 +38,18 @@ def ball_on_floor(lift: float = 0.0) -> tuple[GaussianCloud, np.ndarray]:
         random.uniform(-1.0, 1.0, (len(means), 1, 3)),
     )
     return cloud, np.arange(len(means)) < len(shell) + len(inner)
+
+
+def write_scene(folder: Path, *, views: int, size: int) -> np.ndarray:
+    """Write ``ball_on_floor`` as scene.ply, so many ``views`` of ``size`` pixels round it as cameras.json, and the mask
+    of the second as photo1.png; that mask (size, size)."""
+    cloud, truth = ball_on_floor()
+    write_ply(folder / "scene.ply", cloud)
+    cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.9, count=views, size=size)
+    write_cameras(folder / "cameras.json", cameras, [f"photo{k}.png" for k in range(views)])
+    mask = masks_from_selection(cloud, truth, cameras[1:2])[0].mask
+    Image.fromarray(mask.astype(np.uint8) * 255).save(folder / "photo1.png")
+    return mask
 
 
 def round_ones(means: np.ndarray, radius: float, bands: int = 1) -> GaussianCloud:
