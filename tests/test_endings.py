@@ -195,6 +195,18 @@ def test_a_machine_without_a_gpu_is_not_warned() -> None:
     assert done.stderr == "egs-warp: none.ply: no such file or folder; check the path\n"
 
 
+def test_ctrl_c_that_a_library_makes_an_error_of_its_own_of_is_still_one() -> None:
+    """scipy's HiGHS, while it is imported: "ImportError: initialization failed"."""
+    body = """
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(10)
+        except KeyboardInterrupt as error:
+            raise ImportError("initialization failed") from error
+    """
+    assert ended(body) == (130, "prog: stopped; finished files are whole, unfinished ones are gone\n")
+
+
 @pytest.mark.parametrize("after", [0.05, 0.3, 0.8, 1.5, 2.5, 4.0])
 def test_ctrl_c_in_any_phase_is_one_line(after: float, tmp_path: Path) -> None:
     """Imports, preparation, simulation and film of a short run: none leaves a traceback or a half-written file."""

@@ -49,9 +49,10 @@ def one_line_errors(program: str) -> Iterator[None]:
             print(f"{program}: {line}", file=sys.stderr)
         raise Ended(status) from None
 
-    with _signals(), _deaf_streams():
+    with _signals() as came, _deaf_streams():
         try:
-            yield
+            with _unwinding(came):
+                yield
         except UserError as error:
             end(1 if _gave_out(error.__cause__) else 2, error.told(flag_of))
         except KeyboardInterrupt as error:
@@ -81,26 +82,37 @@ def _noted(line: str, error: BaseException) -> str:
 
 
 @contextmanager
-def _signals() -> Iterator[None]:
-    """Ctrl-C and SIGTERM raise within, once."""
-    if threading.current_thread() is not threading.main_thread():
+def _unwinding(came: list[type[BaseException]]) -> Iterator[None]:
+    """What a signal has raised goes on as that: of what is raised while it is imported, a library in C makes an error
+    of its own ("initialization failed").
+    """
+    try:
         yield
+    except Exception as error:
+        if came:
+            raise came[0] from error
+        raise
+
+
+@contextmanager
+def _signals() -> Iterator[list[type[BaseException]]]:
+    """Ctrl-C and SIGTERM raise within, once; yields what they have raised."""
+    came: list[type[BaseException]] = []
+    if threading.current_thread() is not threading.main_thread():
+        yield came
         return
-    begun = False
 
     def stop(number: int, _: object) -> None:
-        nonlocal begun
-        if begun:
+        if came:
             # What is left over, the next run sweeps.
             os._exit(128 + number)
-        begun = True
-        raise KeyboardInterrupt if number == signal.SIGINT else _TerminatedError
+        came.append(KeyboardInterrupt if number == signal.SIGINT else _TerminatedError)
+        raise came[0]
 
     def unraisable(lost: Any) -> None:
-        nonlocal begun
         # Raised inside a destructor or a callback, where Python drops it: it is raised again from a better place.
         if lost.exc_type in (KeyboardInterrupt, _TerminatedError):
-            begun = False
+            came.clear()
             number = signal.SIGINT if lost.exc_type is KeyboardInterrupt else signal.SIGTERM
             threading.Timer(_AGAIN, os.kill, (os.getpid(), number)).start()
         else:
@@ -109,7 +121,7 @@ def _signals() -> Iterator[None]:
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     before_hook, sys.unraisablehook = sys.unraisablehook, unraisable
     try:
-        yield
+        yield came
     finally:
         sys.unraisablehook = before_hook
         for number, handler in before.items():
