@@ -8,6 +8,7 @@ from egs_warp.assets.object import BuiltInObject
 from egs_warp.assets.pawn import pawn
 from egs_warp.assets.rooms import SQUARE
 from egs_warp.assets.scene import BUILT_IN_SCENES, Scene, scene
+from egs_warp.assets.snake import snake
 from egs_warp.assets.stool import stool
 
-__all__ = ["BUILT_IN_SCENES", "SQUARE", "BuiltInObject", "Scene", "figurine", "pawn", "scene", "stool"]
+__all__ = ["BUILT_IN_SCENES", "SQUARE", "BuiltInObject", "Scene", "figurine", "pawn", "scene", "snake", "stool"]

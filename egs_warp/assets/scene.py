@@ -11,6 +11,7 @@ from egs_warp.assets.figurine import figurine
 from egs_warp.assets.object import BuiltInObject
 from egs_warp.assets.pawn import pawn
 from egs_warp.assets.rooms import bedroom, chess_board, cloth_table
+from egs_warp.assets.snake import snake
 from egs_warp.assets.stool import stool
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
@@ -20,7 +21,7 @@ from egs_warp.geometry.plane import Plane
 
 @dataclass(frozen=True)
 class Scene:
-    """An object standing on its plane in a room. The object is one unit tall."""
+    """An object standing on its plane in a room. The object is one unit tall, or two long if it lies."""
 
     name: str
     object: GaussianCloud
@@ -54,6 +55,7 @@ _MADE: Mapping[str, tuple[Callable[..., BuiltInObject], Callable[..., GaussianCl
     "pawn": (pawn, chess_board, (1.2, -3.6, 1.7), (0.55, 0.0, 0.42)),
     "stool": (stool, bedroom, (1.5, -2.9, 1.75), (0.0, 0.1, 0.42)),
     "figurine": (figurine, cloth_table, (0.9, -3.0, 1.55), (0.0, 0.0, 0.40)),
+    "snake": (snake, bedroom, (2.3, -2.3, 1.35), (0.0, -0.25, 0.1)),
 }
 
 BUILT_IN_SCENES: tuple[str, ...] = tuple(_MADE)

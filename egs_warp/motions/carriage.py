@@ -32,6 +32,9 @@ with less of a lean, the less time it stands on both."""
 PIVOT, ROLL = 0.45, 0.05
 """Radians by which a body on one base turns about one side, and tips to lift the other, at most: faster, it would throw
 itself off the side on which it stands."""
+COUNTER = 1.5
+"""By how much less than its base a body turns for each body height above it, over the turn of the base: the less of it
+turns with the base, the less friction it takes."""
 SLOWEST = 1.25
 """Times the usual swing that it may take to turn so far, where friction under one side is not enough in the usual."""
 SPENT = 1.2
@@ -96,7 +99,8 @@ class OnLegs:
 
 
 class OnBase:
-    """The two sides of the base turn and tip the body as a whole, as one walks a wardrobe; it leans over them."""
+    """The two sides of the base turn and tip the body, as one walks a wardrobe; it leans over them, and what is above
+    turns the other way, as shoulders do over hips."""
 
     def __init__(self, place: Place, feet: Sequence[Foot]) -> None:
         """The body stands at ``place``; the two ``feet``."""
@@ -104,9 +108,11 @@ class OnBase:
         soles = np.array([standing[foot.sole].mean(axis=0) for foot in feet])
         self._arms = standing - soles.mean(axis=0)
         self._com = body.centre_of_mass(self._arms)
+        self._turning = 1.0 - COUNTER * self._arms[:, 2] / body.height
+        """(N,) how far each node turns with the base."""
         self._between = soles[0] - soles[1]
         self._width = float(np.hypot(*self._between[:2]))
-        usual = SPENT * self._pivot(place, soles)
+        usual = SPENT * self._pivot(place, soles, self._angular_momentum(body.node_mass))
         slower = float(np.clip(np.sqrt(PIVOT / max(usual, 1e-12)), 1.0, SLOWEST))
         self.tempo = replace(ON_BASE, swing=slower * ON_BASE.swing)
         pivot = min(PIVOT, slower**2 * usual)
@@ -116,8 +122,12 @@ class OnBase:
         self.com = 3000.0  # where friction gives too little for both, balance goes before turning
         self.hold = 50.0  # what turns about a patch slides at its edges
 
+    def _angular_momentum(self, node_mass: np.ndarray) -> float:
+        """kg m^2 about up through the centre of mass, for one radian a second of its base."""
+        return float(node_mass @ (((self._arms - self._com)[:, :2] ** 2).sum(axis=1) * self._turning))
+
     @staticmethod
-    def _pivot(place: Place, soles: np.ndarray) -> float:
+    def _pivot(place: Place, soles: np.ndarray, angular_momentum: float) -> float:
         """Radians by which friction under one side turns the body while the other is carried ahead in a usual
         swing."""
         body = place.body
@@ -125,13 +135,15 @@ class OnBase:
         away = np.linalg.norm(touching[:, None] - soles[:, :2], axis=2)
         patches = [touching[away.argmin(axis=1) == side] for side in (0, 1)]
         arms = [np.linalg.norm(patch - patch.mean(axis=0), axis=1).mean() for patch in patches if len(patch)]
-        gravity, up = float(np.linalg.norm(body.gravity)), place.ground.axes[2]
+        gravity = float(np.linalg.norm(body.gravity))
         torque = place.friction * body.mass * gravity * min(map(float, arms), default=0.0)
         time = ON_BASE.carried * ON_BASE.swing * float(np.sqrt(body.height / gravity))
-        return torque * time**2 / (_PEAK * float(up @ body.inertia(place.standing) @ up))
+        # What its upper part carries the other way takes nothing off friction; it never takes all.
+        least = 0.2 * float(place.ground.axes[2] @ body.inertia(place.standing) @ place.ground.axes[2])
+        return torque * time**2 / (_PEAK * max(angular_momentum, least))
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
-        """See ``Carriage``; the places of the feet turn it, not ``heading``."""
+        """See ``Carriage``; the places of the feet turn its base, ``heading`` is that of the body as a whole."""
         middle, between, rest = feet[:, :3].mean(axis=0), feet[0, :3] - feet[1, :3], self._between
         yaw = np.arctan2(between[1], between[0]) - np.arctan2(rest[1], rest[0])
         across = np.array([between[1], -between[0], 0.0]) / np.hypot(*between[:2])
@@ -143,7 +155,13 @@ class OnBase:
         lean *= min(1.0, _FURTHEST_LEAN / max(float(np.linalg.norm(lean)), 1e-12))
         strain = np.eye(3) + np.einsum("k,kij->ij", lean, SHEAR)
         strain[:, 2] *= 1.0 + (com[2] - upright[2]) / self._com[2]
-        return middle + self._arms @ (turn @ strain).T
+        about = strain @ self._com
+        twisted = self._arms @ strain.T - about
+        # Turned less than the base by so much: about up through the centre of mass, which stays.
+        less = (self._turning - 1.0) * np.remainder(yaw - heading + np.pi, 2.0 * np.pi) - np.pi * (self._turning - 1.0)
+        cos, sin = np.cos(less)[:, None], np.sin(less)[:, None]
+        twisted[:, :2] = cos * twisted[:, :2] + sin * (twisted[:, :2] @ [[0.0, 1.0], [-1.0, 0.0]])
+        return middle + (twisted + about) @ turn.T
 
 
 def carried_on(place: Place) -> tuple[tuple[Foot, ...], type[OnLegs] | type[OnBase]]:

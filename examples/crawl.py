@@ -1,0 +1,39 @@
+"""The built-in snake crawls by a wave that runs through it: video, contact sheet, report and trajectory."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import egs_warp as egs
+
+
+def main(arguments: list[str] | None = None) -> egs.Report:
+    """Run the example; returns the report."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("out/crawl"))
+    parser.add_argument("--distance", type=float, default=3.0, help="body heights")
+    parser.add_argument("--frames", type=int, help="default: until it rests")
+    parser.add_argument("--size", type=int, default=512)
+    parser.add_argument("--device", default="cpu")
+    chosen = parser.parse_args(arguments)
+    egs.use_device(chosen.device)
+    built_in = egs.scene("snake", device=chosen.device)
+    options = egs.AnimateOptions(frames=chosen.frames, size=chosen.size)
+    report = egs.animate(
+        built_in.object,
+        chosen.out,
+        motion=f"walk {chosen.distance}",
+        plane=built_in.plane,
+        options=options,
+        overwrite=True,
+        source="snake",
+    )
+    print(report.summary())
+    print(f"wrote the video, sheet.png, plots.png, report.json, trajectory.npz into {chosen.out}")
+    return report
+
+
+if __name__ == "__main__":
+    with egs.one_line_errors("crawl.py"):
+        main()

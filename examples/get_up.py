@@ -1,0 +1,40 @@
+"""The built-in pawn is pushed over, gets up and jumps: video, contact sheet, report and trajectory."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import egs_warp as egs
+
+
+def main(arguments: list[str] | None = None) -> egs.Report:
+    """Run the example; returns the report."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("out/get_up"))
+    parser.add_argument("--push", default="0.2 1 left 0.8", help="when, how hard, where to, how high")
+    parser.add_argument("--frames", type=int, help="default: until it rests")
+    parser.add_argument("--size", type=int, default=512)
+    parser.add_argument("--device", default="cpu")
+    chosen = parser.parse_args(arguments)
+    egs.use_device(chosen.device)
+    built_in = egs.scene("pawn", device=chosen.device)
+    options = egs.AnimateOptions(frames=chosen.frames, size=chosen.size)
+    report = egs.animate(
+        built_in.object,
+        chosen.out,
+        motion="stand 1, jump",
+        push=chosen.push,
+        plane=built_in.plane,
+        options=options,
+        overwrite=True,
+        source="pawn",
+    )
+    print(report.summary())
+    print(f"wrote the video, sheet.png, plots.png, report.json, trajectory.npz into {chosen.out}")
+    return report
+
+
+if __name__ == "__main__":
+    with egs.one_line_errors("get_up.py"):
+        main()

@@ -1,0 +1,39 @@
+"""The built-in bear turns on the spot, from one foot to the other: video, contact sheet, report and trajectory."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import egs_warp as egs
+
+
+def main(arguments: list[str] | None = None) -> egs.Report:
+    """Run the example; returns the report."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("out/turn"))
+    parser.add_argument("--degrees", type=float, default=90.0, help="to the left")
+    parser.add_argument("--frames", type=int, help="default: until it rests")
+    parser.add_argument("--size", type=int, default=512)
+    parser.add_argument("--device", default="cpu")
+    chosen = parser.parse_args(arguments)
+    egs.use_device(chosen.device)
+    built_in = egs.scene("figurine", device=chosen.device)
+    options = egs.AnimateOptions(frames=chosen.frames, size=chosen.size)
+    report = egs.animate(
+        built_in.object,
+        chosen.out,
+        motion=f"turn {chosen.degrees}",
+        plane=built_in.plane,
+        options=options,
+        overwrite=True,
+        source="figurine",
+    )
+    print(report.summary())
+    print(f"wrote the video, sheet.png, plots.png, report.json, trajectory.npz into {chosen.out}")
+    return report
+
+
+if __name__ == "__main__":
+    with egs.one_line_errors("turn.py"):
+        main()
