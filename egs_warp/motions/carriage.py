@@ -87,8 +87,8 @@ class OnLegs:
         self.lift = LIFT * body.height
         self.catch = REACH * min(foot.length for foot in feet)
         self.tempo = ON_LEGS
-        self.com = 600.0
-        self.hold = 1000.0
+        self.com = 60.0
+        self.hold = 100.0
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
         """See ``Carriage``."""
@@ -108,6 +108,7 @@ class OnBase:
         soles = np.array([standing[foot.sole].mean(axis=0) for foot in feet])
         self._arms = standing - soles.mean(axis=0)
         self._com = body.centre_of_mass(self._arms)
+        self._share = body.node_mass / body.mass
         self._turning = 1.0 - COUNTER * self._arms[:, 2] / body.height
         """(N,) how far each node turns with the base."""
         self._between = soles[0] - soles[1]
@@ -119,8 +120,8 @@ class OnBase:
         self.pace = Pace(0.5 * pivot * self._width, 0.5 * pivot)
         self.lift = min(ROLL * self._width, LIFT * body.height)
         self.catch = 0.0
-        self.com = 3000.0  # where friction gives too little for both, balance goes before turning
-        self.hold = 50.0  # what turns about a patch slides at its edges
+        self.com = 300.0  # where friction gives too little for both, balance goes before turning
+        self.hold = 5.0  # what turns about a patch slides at its edges
 
     def _angular_momentum(self, node_mass: np.ndarray) -> float:
         """kg m^2 about up through the centre of mass, for one radian a second of its base."""
@@ -155,13 +156,15 @@ class OnBase:
         lean *= min(1.0, _FURTHEST_LEAN / max(float(np.linalg.norm(lean)), 1e-12))
         strain = np.eye(3) + np.einsum("k,kij->ij", lean, SHEAR)
         strain[:, 2] *= 1.0 + (com[2] - upright[2]) / self._com[2]
-        about = strain @ self._com
-        twisted = self._arms @ strain.T - about
-        # Turned less than the base by so much: about up through the centre of mass, which stays.
-        less = (self._turning - 1.0) * np.remainder(yaw - heading + np.pi, 2.0 * np.pi) - np.pi * (self._turning - 1.0)
+        leant = self._arms @ strain.T
+        centre = self._share @ leant
+        # Turned less than the base, about up through the centre of mass, which stays.
+        less = (self._turning - 1.0) * (np.remainder(yaw - heading + np.pi, 2.0 * np.pi) - np.pi)
         cos, sin = np.cos(less)[:, None], np.sin(less)[:, None]
-        twisted[:, :2] = cos * twisted[:, :2] + sin * (twisted[:, :2] @ [[0.0, 1.0], [-1.0, 0.0]])
-        return middle + (twisted + about) @ turn.T
+        level = (leant - centre)[:, :2]
+        leant[:, :2] = cos * level + sin * (level @ [[0.0, 1.0], [-1.0, 0.0]])
+        leant[:, :2] += centre[:2] - self._share @ leant[:, :2]
+        return middle + leant @ turn.T
 
 
 def carried_on(place: Place) -> tuple[tuple[Foot, ...], type[OnLegs] | type[OnBase]]:

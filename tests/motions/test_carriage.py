@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from egs_warp.motions.carriage import PIVOT, REACH, Carriage, OnBase, OnLegs, carried_on
+from egs_warp.motions.carriage import COUNTER, PIVOT, REACH, Carriage, OnBase, OnLegs, carried_on
 from egs_warp.motions.feet import Foot
 from egs_warp.motions.sequence import Place
 from tests.support.meshes import coarse_stool, figure
@@ -56,9 +57,9 @@ def test_a_base_turns_and_tips_with_its_sides() -> None:
     width = float(soles[0, 1] - soles[1, 1])
     assert width > 0.2, "the left side comes first"
     assert carriage.pace.length == pytest.approx(carriage.pace.turn * width) and carriage.catch == 0.0
-    rubber, ice = (OnBase(replace(place, friction=friction), feet).pace for friction in (9.0, 0.05))
+    rubber, wet, ice = (OnBase(replace(place, friction=friction), feet).pace for friction in (9.0, 0.02, 0.01))
     assert rubber.turn == pytest.approx(0.5 * PIVOT)
-    assert ice.turn == pytest.approx(0.05 / place.friction * carriage.pace.turn), "friction turns it"
+    assert ice.turn == pytest.approx(0.5 * wet.turn) and ice.turn < 0.1 * rubber.turn, "friction turns it"
     com = place.body.centre_of_mass(standing) + [0.01, 0.03, 0.0]
     soles[0, 0] += 0.04
     soles[1, 2] += 0.01
@@ -66,6 +67,12 @@ def test_a_base_turns_and_tips_with_its_sides() -> None:
     assert place.body.centre_of_mass(pose) == pytest.approx(com, abs=1e-3)
     for foot, sole in zip(feet, soles, strict=True):
         assert pose[foot.sole].mean(axis=0) == pytest.approx(sole[:3], abs=0.005)
+    top = standing[:, 2] > 0.95 * standing[:, 2].max()
+    back = Rotation.align_vectors(
+        *(np.c_[(x[top] - x[top].mean(axis=0))[:, :2], np.zeros(top.sum())] for x in (pose, standing))
+    )
+    yaw, over = -0.04 / width, standing[top, 2].mean() / place.body.height
+    assert back[0].as_rotvec()[2] == pytest.approx((1.0 - COUNTER * over) * yaw, rel=0.1), "what is above turns back"
     across = pose[feet[0].sole].mean(axis=0) - pose[feet[1].sole].mean(axis=0)
     assert np.arctan2(across[1], across[0]) - np.pi / 2 == pytest.approx(-0.04 / width, rel=0.1)
     assert across[2] / width == pytest.approx(-0.01 / width, rel=0.1)
