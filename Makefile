@@ -19,10 +19,15 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c const
 demo: $(VENV)/demo.stamp
 	$(BIN)/python examples/jump.py --out out/jump $(FRAMES:%=--frames %)
 
+# A capture on two feet, where the data are.
+MONKEY := $(or $(EGS_WARP_DATA),../shared/data)/objects/monkey.ply
 examples: setup
-	for motion in jump twist hop walk; do \
+	for motion in jump twist hop walk waddle crawl turn get_up dance; do \
 		$(BIN)/python examples/$$motion.py --out out/$$motion $(FRAMES:%=--frames %) || exit 1; \
 	done
+	if [ -e "$(MONKEY)" ]; then \
+		$(BIN)/egs-warp animate "$(MONKEY)" --up y --motion walk --out out/monkey --overwrite $(FRAMES:%=--frames %); \
+	fi
 	$(BIN)/python examples/finetune.py --out out/finetune $(FRAMES:%=--steps %)
 
 # Two processes, each with one thread. The tests of a file go to the same one, so that what they share is made once.

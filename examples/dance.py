@@ -1,4 +1,4 @@
-"""The built-in bear dances: its jumps leave the ground and land on the beats: video, contact sheet, report and trajectory."""
+"""The built-in bear dances, its jumps on the beats: video, contact sheet, report and trajectory."""
 
 from __future__ import annotations
 
@@ -23,8 +23,7 @@ def main(arguments: list[str] | None = None) -> egs.Report:
     report = egs.animate(
         built_in.object,
         chosen.out,
-        motion="dance",
-        beats=chosen.beats,
+        motion=f"dance {chosen.beats}",
         plane=built_in.plane,
         options=options,
         overwrite=True,

@@ -32,7 +32,8 @@ class Footfalls:
 def footfalls(
     trajectory: Trajectory, feet: Sequence[Foot], *, stride: float, first: int = 0, last: int = -1
 ) -> Footfalls:
-    """Measure between two states of the trajectory (indices into ``time``); ``stride`` in metres."""
+    """Measure between two states of the trajectory (indices into ``time``); ``stride`` in metres. What was told to go
+    nowhere has none, and no slip over it."""
     t = trajectory
     last = last % len(t.time)
     up = -t.gravity / np.linalg.norm(t.gravity)
@@ -59,7 +60,8 @@ def footfalls(
             slip = max(slip, float(lengths[begin:end].sum()))
             stood = middle[begin + 1 : end + 1]
             shift = max(shift, float(np.linalg.norm(stood - stood[0], axis=1).max()))
-    return Footfalls(slip / stride, shift / stride, landings)
+    over = 1.0 / stride if stride > 0.0 else 0.0
+    return Footfalls(over * slip, over * shift, landings)
 
 
 def _runs(flags: np.ndarray) -> list[tuple[int, int]]:

@@ -90,4 +90,6 @@ def test_slip_is_the_way_of_loaded_contacts_and_swings_do_not_count() -> None:
     assert (fell.slip, fell.sole_shift) == (pytest.approx(0.03), pytest.approx(0.02))
     assert fell.landings == 1
     later = footfalls(made_trajectory(), FEET, stride=0.1, first=3)
+    nowhere = footfalls(made_trajectory(), FEET, stride=0.0)
+    assert (nowhere.slip, nowhere.sole_shift, nowhere.landings) == (0.0, 0.0, fell.landings), "walk 0 ends in a report"
     assert (later.slip, later.sole_shift, later.landings) == (0.0, 0.0, 1)
