@@ -40,6 +40,9 @@ TWIST = "python examples/twist.py --out out/twist"
 JUMP = "python examples/jump.py --out out/jump"
 WALK = 'egs-warp animate out/captures/stool_in_room.ply --up z --object 0,0,0.97 --motion "walk 0.6" --out out/stool'
 SCENE = "egs-warp animate out/captures/figurine_in_room.ply --up z --object 0,0,0.5 --motion jump --out out/figurine"
+WADDLE, CRAWL, TURN, GET_UP, DANCE = (
+    f"python examples/{name}.py --out out/{name}" for name in ("waddle", "crawl", "turn", "get_up", "dance")
+)
 INFO = "egs-warp info out/captures/stool.ply --up z --plot out/info.png"
 PHOTOS = "python docs/photo_sheets.py --out out/photos"
 MUSCLES = "egs-warp muscles out/captures/pawn.ply --up z --plot out/muscles.png"
@@ -87,6 +90,11 @@ PICTURES = (
     Picture("walk.mp4", WALK, "stool/walk.mp4", 400),
     Picture("walk.webp", WALK, "stool/walk.mp4", 400, at=0.5),
     Picture("walk_sheet.webp", WALK, "stool/sheet.png", 1200),
+    Picture("waddle_sheet.webp", WADDLE, "waddle/sheet.png", 1200),
+    Picture("crawl_sheet.webp", CRAWL, "crawl/sheet.png", 1200),
+    Picture("turn_sheet.webp", TURN, "turn/sheet.png", 1200),
+    Picture("get_up_sheet.webp", GET_UP, "get_up/sheet.png", 1200),
+    Picture("dance_sheet.webp", DANCE, "dance/sheet.png", 1200),
     Picture("scene.mp4", SCENE, "figurine/jump.mp4", 400),
     Picture("scene.webp", SCENE, "figurine/jump.mp4", 400, at=0.45),
     Picture("segment.webp", SCENE, "figurine/segment.png", 1200),

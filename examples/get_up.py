@@ -27,6 +27,7 @@ def main(arguments: list[str] | None = None) -> egs.Report:
         push=chosen.push,
         plane=built_in.plane,
         options=options,
+        shot=egs.Shot(camera="follow"),
         overwrite=True,
         source="pawn",
     )

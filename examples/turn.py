@@ -12,7 +12,7 @@ def main(arguments: list[str] | None = None) -> egs.Report:
     """Run the example; returns the report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/turn"))
-    parser.add_argument("--degrees", type=float, default=90.0, help="to the left")
+    parser.add_argument("--degrees", type=float, default=-90.0, help="to the left")
     parser.add_argument("--frames", type=int, help="default: until it rests")
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--device", default="cpu")

@@ -34,7 +34,7 @@ def example(name: str) -> ModuleType:
         ("walk", "walk", {"distance": 0.4, "step_length": 0.1, "speed": 1.0}),
         ("waddle", "walk", {"distance": 0.6, "step_length": 0.1, "speed": 1.0}),
         ("crawl", "walk", {"distance": 3.0, "step_length": 0.1, "speed": 1.0}),
-        ("turn", "turn", {"heading_degrees": 90.0, "distance": 0.0, "speed": 1.0}),
+        ("turn", "turn", {"heading_degrees": -90.0, "distance": 0.0, "speed": 1.0}),
         ("dance", "dance", {"tempo": 120.0, "first": 0.6, "beats": 10.0}),
         ("get_up", "stand", {"seconds": 1.0}),
     ],

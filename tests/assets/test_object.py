@@ -1,4 +1,4 @@
-"""Built-in objects: pawn, stool and figurine."""
+"""Built-in objects: pawn, stool, figurine and snake."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 import warp as wp
 
-from egs_warp.assets import BuiltInObject, figurine, pawn, stool
+from egs_warp.assets import BuiltInObject, figurine, pawn, snake, stool
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.meshing.cage import Cage, build_cage
 from tests.support.captures import digest
 
-_OBJECTS = (pawn, stool, figurine)
+_OBJECTS = (pawn, stool, figurine, snake)
 
 
 def _third_axes(cloud: GaussianCloud) -> np.ndarray:
@@ -34,12 +34,14 @@ def _thing(make: Callable[..., BuiltInObject], device: str) -> BuiltInObject:
 
 @pytest.mark.parametrize("make", _OBJECTS)
 def test_object_stands_on_its_plane(make: Callable[..., BuiltInObject], device: str) -> None:
-    """One unit tall, SH with a view-dependent part, flat splats, a base that straddles the plane by a little."""
+    """One unit tall, the snake two long; SH with a view-dependent part, flat splats, a base that straddles the plane by
+    a little."""
     thing = _thing(make, device)
     cloud = thing.cloud
     heights, opacities = thing.plane.heights(cloud.means.numpy()), cloud.opacities()
     assert 15_000 <= cloud.count <= 30_000
-    assert heights.max() == pytest.approx(1.0, abs=0.02)
+    sizes = np.ptp(cloud.means.numpy(), axis=0)
+    assert (sizes[2], sizes[1])[make is snake] == pytest.approx((1.0, 2.125)[make is snake], abs=0.02)
     assert heights.min() > -0.005
     assert 0.0 < opacities[heights < 0].sum() / opacities.sum() < 0.01
     assert cloud.sh_degree == 3

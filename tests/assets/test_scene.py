@@ -43,5 +43,5 @@ def test_board_squares() -> None:
 
 def test_unknown_scene() -> None:
     """The names are given."""
-    with pytest.raises(UserError, match="scene 'castle' is unknown; built in are pawn, stool, figurine"):
+    with pytest.raises(UserError, match="scene 'castle' is unknown; built in are pawn, stool, figurine, snake"):
         scene("castle")
