@@ -32,6 +32,8 @@ _LARGEST_BUFFER = 4096
 _COUNTS: tuple[str, ...] = ("inputs", "valid", "refused", "broken")
 _PIECE = 20_000
 """Inputs of one process, where there is a number to reach."""
+_MOST_REASONS = 50
+"""Kept of one reader."""
 _SEED = 20_261_122
 
 
@@ -68,7 +70,9 @@ class Tally:
 
     def __init__(self, names: list[str], path: Path | None) -> None:
         self._path, self._lock = path, threading.Lock()
-        self.counts = {name: dict.fromkeys(_COUNTS, 0) | {"mib": 0, "by": ""} for name in names}
+        self.counts: dict[str, dict[str, Any]] = {
+            name: dict.fromkeys(_COUNTS, 0) | {"mib": 0, "by": "", "why": []} for name in names
+        }
         self.died: list[str] = []
         self._begun = dict.fromkeys(names, 0)
         if path is not None and path.is_file():
@@ -85,6 +89,7 @@ class Tally:
             known = self.counts[name]
             self.counts[name] = {key: known[key] + found[key] for key in _COUNTS}
             self.counts[name] |= {"mib": max(known["mib"], found["mib"]), "by": found["by"]}
+            self.counts[name]["why"] = [*known.get("why", []), *found["why"]][:_MOST_REASONS]
             if self._path is not None:
                 self._path.parent.mkdir(parents=True, exist_ok=True)
                 self._path.write_text(json.dumps(self.counts, indent=1) + "\n")
@@ -94,7 +99,7 @@ class Tally:
         print("| reader | inputs | valid | refused | broken | peak MiB | driven by |\n|---|---|---|---|---|---|---|")
         for name, found in self.counts.items():
             print(f"| {name} |", " | ".join(str(found[key]) for key in (*_COUNTS, "mib", "by")), "|")
-        for line in self.died:
+        for line in (*(why for found in self.counts.values() for why in found.get("why", [])), *self.died):
             print(line)
         total, broken = (sum(found[key] for found in self.counts.values()) for key in ("inputs", "broken"))
         print(f"{total} inputs, {broken + len(self.died)} broken promises")
@@ -133,6 +138,7 @@ def _fuzz(name: str, seed: int, seconds: float, inputs: int) -> None:
     wp.config.log_level = wp.LOG_ERROR
     reader = next(reader for reader in readers.READERS if reader.name == name)
     counts: dict[str, int] = dict.fromkeys(_COUNTS, 0)
+    why: list[str] = []
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         readers.prepare(reader, folder)
@@ -157,12 +163,11 @@ def _fuzz(name: str, seed: int, seconds: float, inputs: int) -> None:
                     raise readers.BrokenPromiseError(f"{name}: {peak - base} MiB")
             except readers.BrokenPromiseError as error:
                 counts["broken"] += 1
-                _keep(name, data)
-                print(error, file=sys.stderr)
+                why.append(f"{_keep(name, data)}: {error}"[:400])
 
         def end() -> None:
             by = "Atheris" if atheris is not None else "random bytes"
-            print(json.dumps({"reader": name, **counts, "mib": _peak() - base, "by": by}), flush=True)
+            print(json.dumps({"reader": name, **counts, "mib": _peak() - base, "by": by, "why": why}), flush=True)
             # libFuzzer does not come back.
             os._exit(0)
 
@@ -181,10 +186,13 @@ def _fuzz(name: str, seed: int, seconds: float, inputs: int) -> None:
             drive(generator.randbytes(generator.randint(0, _LARGEST_BUFFER)))
 
 
-def _keep(name: str, data: bytes) -> None:
+def _keep(name: str, data: bytes) -> str:
+    """Write a case where the tests find it; returns its name."""
     folder = CORPUS / name.replace(" ", "_")
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / hashlib.sha256(data).hexdigest()[:12]).write_bytes(data)
+    path = folder / hashlib.sha256(data).hexdigest()[:12]
+    path.write_bytes(data)
+    return f"{folder.name}/{path.name}"
 
 
 def _peak() -> int:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import tempfile
+import time
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.support import readers
 from tests.support.damage import damaged
-from tests.support.readers import READERS, Reader, outcome, prepare
+from tests.support.readers import READERS, BrokenPromiseError, Reader, outcome, prepare
 
 CORPUS = Path(__file__).parent / "corpus"
 NAMES = [reader.name for reader in READERS]
@@ -42,3 +44,21 @@ def test_cases_that_were_found(found: Path, tmp_path: Path) -> None:
     (reader,) = [reader for reader in READERS if reader.name.replace(" ", "_") == found.parent.name]
     prepare(reader, tmp_path)
     assert outcome(reader, tmp_path, found.read_bytes()) in ("valid", "refused")
+
+
+def test_slow_is_what_is_slow_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine that stands still for a moment breaks no promise, a reader that is slow does."""
+    monkeypatch.setattr(readers, "LONGEST", 0.1)
+    times: list[float] = []
+
+    def read(path: Path) -> None:
+        end = time.process_time() + times.pop()
+        while time.process_time() < end:
+            pass
+
+    slow = Reader("slow", "a", lambda: b"", read)
+    times[:] = [0.0, 0.3]
+    assert outcome(slow, tmp_path, b"") == "valid" and times == []
+    times[:] = [0.3, 0.3]
+    with pytest.raises(BrokenPromiseError, match=r"^slow: 0\.3 s of work in .*; 0\.3 s of work in .* the first time$"):
+        outcome(slow, tmp_path, b"")

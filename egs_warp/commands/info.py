@@ -35,6 +35,7 @@ def _info(chosen: argparse.Namespace) -> int:
     from egs_warp.io import read_capture
     from egs_warp.pipelines.animate import AnimateOptions
     from egs_warp.pipelines.info import draw_info, look_into
+    from egs_warp.pipelines.progress import info_bar
 
     if chosen.plot is not None and chosen.plot.suffix.lower() != ".png":
         raise UserError(f"--plot {chosen.plot}: give the name of a .png")
@@ -48,16 +49,18 @@ def _info(chosen: argparse.Namespace) -> int:
     if plane is None and up is None:
         up, note = guessed_up(capture)
         notes = (*notes, note)
-    info = look_into(
-        capture.cloud,
-        source=chosen.capture,
-        up=up,
-        plane=plane,
-        front=front,
-        metres_per_unit=options.metres_per_unit,
-        muscles_file=chosen.muscles,
-        notes=notes,
-    )
+    with info_bar() as begins:
+        info = look_into(
+            capture.cloud,
+            source=chosen.capture,
+            up=up,
+            plane=plane,
+            front=front,
+            metres_per_unit=options.metres_per_unit,
+            muscles_file=chosen.muscles,
+            notes=notes,
+            progress=begins,
+        )
     print("\n".join(info.lines()))
     if chosen.plot is not None:
         draw_info(chosen.plot, info)

@@ -36,6 +36,7 @@ def _muscles(chosen: argparse.Namespace) -> int:
     from egs_warp.io import read_capture
     from egs_warp.muscles.plot import check_picture_name, plot_muscles
     from egs_warp.pipelines.creature import body_muscles, stand
+    from egs_warp.pipelines.progress import info_bar
 
     start("cpu")
     check_picture_name(chosen.plot)
@@ -47,9 +48,12 @@ def _muscles(chosen: argparse.Namespace) -> int:
     if plane is None and up is None:
         up, note = guessed_up(capture)
         say(note)
-    standing = stand(capture.cloud, up=up, plane=plane)
-    body = make_body(standing.cage.mesh, GROUND)
-    muscles = body_muscles(body, chosen.muscles, standing.frame)
+    with info_bar() as begins:
+        begins("cage")
+        standing = stand(capture.cloud, up=up, plane=plane)
+        begins("muscles")
+        body = make_body(standing.cage.mesh, GROUND)
+        muscles = body_muscles(body, chosen.muscles, standing.frame)
     plot_muscles(body.mesh, muscles, chosen.plot, up=GROUND.normal)
     print(f"{muscles.fibre_count} fibres, {muscles.segment_count} segments; wrote {chosen.plot}")
     return 0

@@ -1,18 +1,20 @@
-"""Progress bars of a run, whose time left is meant to be believed: of a scene, of a creature's making, and of its
-simulation."""
+"""Progress bars whose time left is meant to be believed: of a scene, of what ``info`` finds, of a creature's making,
+and of its simulation."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from itertools import accumulate
-from typing import TextIO
+from typing import NoReturn, TextIO
 
 from tqdm import tqdm
 
 _DONE = {"cage": 0, "contact": 45, "front": 55, "body and muscles": 68, "stand": 85, "split": 95}
 """Percent of the time that are over when a stage begins, in the middle of four captures on a CPU (pawn, plush dog,
 monkey, robot: within 15 of these)."""
+_LOOKED = {"cage": 0, "front": 70, "muscles": 91}
+"""The same of what ``info`` finds (pawn, plush dog, monkey, robot: within 13)."""
 _SCENE = {"plane": 12, "ground": 15, "segment": 49, "inpaint": 24}
 """Percent of the time that each stage of a scene takes, in the middle of two built-in rooms, koala and narcissus on a
 CPU: stages begin within 16 of where this has them."""
@@ -23,20 +25,41 @@ _SMOOTHING = 0.05
 
 
 @contextmanager
-def preparation_bar(*, quiet: bool = False) -> Iterator[Callable[[str], None]]:
-    """A bar on stderr; what it gives is to be called with the name of each stage as it begins."""
+def preparation_bar(*, quiet: bool = False, file: TextIO | None = None) -> Iterator[Callable[[str], None]]:
+    """A bar on ``file`` (stderr); what it gives is to be called with the name of each stage as it begins."""
+    with _stages("prepare", _DONE, quiet=quiet, file=file) as begins:
+        yield begins
+
+
+@contextmanager
+def info_bar(*, quiet: bool = False, file: TextIO | None = None) -> Iterator[Callable[[str], None]]:
+    """The same for ``look_into``."""
+    with _stages("look", _LOOKED, quiet=quiet, file=file) as begins:
+        yield begins
+
+
+@contextmanager
+def _stages(name: str, done: Mapping[str, int], *, quiet: bool, file: TextIO | None) -> Iterator[Callable[[str], None]]:
+    """``done``: percent of the time that are over when a stage begins. The bar is there from the first one on: what is
+    refused before is one line."""
     form = "{desc}, {elapsed}<{remaining}"
-    with tqdm(desc="prepare", total=100, bar_format=form, smoothing=0, disable=quiet) as bar:
+    with ExitStack() as stack:
+        bar: tqdm[NoReturn] | None = None
 
         def begins(stage: str) -> None:
-            bar.set_description_str(f"prepare: {stage}", refresh=False)
-            bar.update(max(_DONE.get(stage, 0) - bar.n, 0))
+            nonlocal bar
+            if bar is None:
+                made = tqdm(desc=name, total=100, bar_format=form, smoothing=0, disable=quiet, file=file)
+                bar = stack.enter_context(made)
+            bar.set_description_str(f"{name}: {stage}", refresh=False)
+            bar.update(max(done.get(stage, 0) - bar.n, 0))
             bar.refresh()
 
         yield begins
-        bar.bar_format = "{desc}, {elapsed}"
-        bar.set_description_str("prepare: done", refresh=False)
-        bar.update(100 - bar.n)
+        if bar is not None:
+            bar.bar_format = "{desc}, {elapsed}"
+            bar.set_description_str(f"{name}: done", refresh=False)
+            bar.update(100 - bar.n)
 
 
 @contextmanager

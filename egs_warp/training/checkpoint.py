@@ -54,6 +54,8 @@ class Checkpoint:
         try:
             state: State = dict(read_npz(self.path))
             facts = json.loads(str(state.pop("facts")))
+            if sorted(state) != facts["arrays"]:
+                raise ValueError("other arrays than were written")
             state |= facts["state"]
         except (*DAMAGES, RecursionError) as error:
             raise UserError(f"{self.path}: is damaged; begin the training again") from error
@@ -72,7 +74,7 @@ class Checkpoint:
         began = time.monotonic()
         arrays = {name: value for name, value in state.items() if isinstance(value, np.ndarray)}
         others = {name: value for name, value in state.items() if name not in arrays}
-        facts = json.dumps({"digest": self._digest, "state": others})
+        facts = json.dumps({"digest": self._digest, "arrays": sorted(arrays), "state": others})
         with atomic_write(self.path) as temporary, open(temporary, "wb") as file:
             np.savez(file, facts=np.array(facts), **arrays)  # pyright: ignore[reportArgumentType]
         self._last = time.monotonic()

@@ -20,7 +20,7 @@ from egs_warp.io import write_ply
 from egs_warp.io.run_folder import MANIFEST
 from tests.support.coarse import coarse_main
 
-PATIENCE = 300.0
+PATIENCE = 900.0
 """Seconds that a run may take on a busy machine."""
 MOMENTS = int(os.environ.get("EGS_WARP_MOMENTS", "4"))
 """At which each command is killed once; the short form of docs/reliability.md unless told."""

@@ -7,7 +7,7 @@ import io
 import pytest
 
 from egs_warp.pipelines.prepare_scene import SceneOptions
-from egs_warp.pipelines.progress import scene_bar
+from egs_warp.pipelines.progress import info_bar, preparation_bar, scene_bar
 from egs_warp.segmentation.clearance import Clearing
 
 
@@ -41,3 +41,22 @@ def test_what_is_not_done_is_not_counted(monkeypatch: pytest.MonkeyPatch) -> Non
     options = SceneOptions(clearing=Clearing.SPLIT, flat=True, inpaint=False)
     lines = drawn(options, monkeypatch, [(0.0, "plane", 0.0), (12.0, "segment", 0.0)])
     assert lines[1] == "scene: segment, 00:12<00:02"
+
+
+def test_stages_tell_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the share of the time that is over when each begins."""
+    clock = [1000.0]
+    monkeypatch.setattr("tqdm.std.time", lambda: clock[0])
+    for bar, name, told in (
+        (info_bar, "look", {"cage": (0.0, "?"), "front": (7.0, "00:03"), "muscles": (9.1, "00:00")}),
+        (preparation_bar, "prepare", {"cage": (0.0, "?"), "contact": (45.0, "00:55"), "stand": (80.0, "00:14")}),
+    ):
+        file = io.StringIO()
+        clock[0] = 1000.0
+        with bar(file=file) as begins:
+            for stage, (seconds, left) in told.items():
+                clock[0] = 1000.0 + seconds
+                begins(stage)
+                line = file.getvalue().split("\r")[-1].strip()
+                assert line == f"{name}: {stage}, {int(seconds) // 60:02}:{int(seconds) % 60:02}<{left}"
+        assert file.getvalue().split("\r")[-1].startswith(f"{name}: done, ")

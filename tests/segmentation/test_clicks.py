@@ -190,3 +190,21 @@ def test_a_click_on_a_shadow_takes_no_leg_along() -> None:
     assert found.object_mask[outer].mean() < 0.05
     high = cloud.means.numpy()[:1500, 2] > 0.16
     assert found.object_mask[:1500][high].all()
+
+
+def test_a_click_on_a_shadow_at_the_foot_of_a_thin_leg_leaves_the_leg() -> None:
+    """The leg is much nearer to the shadow than to the click on what it bears, and of one colour with it; but it is
+    more than twice as high.
+    """
+    angle, height = np.meshgrid(np.linspace(0.0, 6.1, 14), np.linspace(0.02, 0.7, 28))
+    leg = np.column_stack([0.08 * np.cos(angle.ravel()), 0.08 * np.sin(angle.ravel()), height.ravel()])
+    across, out = np.meshgrid(np.linspace(-0.12, 0.12, 9), np.linspace(-0.5, -0.06, 16))
+    shadow = [np.column_stack([across.ravel(), out.ravel(), np.full(across.size, z)]) for z in (0.03, 0.05)]
+    head = 0.6 * shell() + [0.0, 0.0, 0.68]
+    things = round_ones(np.concatenate([head, leg, *shadow]), 0.025)
+    cloud = joined(things, lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05)))
+    top, beside = click(cloud, (0.0, -0.28, 1.05)), click(cloud, (0.0, -0.3, 0.06), inside=False)
+    found = segment(cloud, FLOOR, ObjectSpec.of_clicks([top, beside]))
+    means = things.means.numpy()
+    assert found.object_mask[: things.count][means[:, 2] > 0.15].all()
+    assert not found.object_mask[: things.count][(means[:, 1] < -0.25) & (means[:, 2] < 0.1)].any()

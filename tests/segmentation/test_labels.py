@@ -67,7 +67,8 @@ def test_rough_masks_of_three_views_find_a_stool_with_its_legs() -> None:
     assert overlap((wanted | unknown)[nodes]) < 0.9
     assert overlap(smoothed_labels(cloud, votes, nodes, views=3)) > 0.97
     found = segment(cloud, made.plane, ObjectSpec(masks=tuple(masks)))
-    assert overlap((found.object_mask | found.floater_mask)[nodes]) > 0.95
+    # 0.9999; 0.9985 where the labels are those of the votes alone, and parts that hang together make up for the rest.
+    assert overlap((found.object_mask | found.floater_mask)[nodes]) > 0.999
 
 
 def test_a_vote_is_surer_by_the_root_of_its_pixels() -> None:

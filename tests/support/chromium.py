@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,6 +18,8 @@ from egs_warp.web.page import PAGE
 BROWSER = os.environ.get("EGS_WARP_BROWSER") or next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
 )
+SHOTS = os.environ.get("EGS_WARP_SHOTS")
+"""Folder in which each page is kept as it looks when its test closes it, to be looked at."""
 NEEDED = [
     pytest.mark.browser,
     pytest.mark.skipif(not PAGE.is_file(), reason="the page is not built; make web builds it"),
@@ -38,12 +42,26 @@ def started() -> Iterator[Any]:
 def opened(chromium: Any, address: str, width: int = 480, height: int = 480) -> tuple[Any, list[str]]:
     """The page once it stands, and what the browser complains of."""
     page = chromium.new_page(viewport={"width": width, "height": height})
+    if SHOTS is not None:
+        _keep_shot(page, Path(SHOTS))
     complaints: list[str] = []
     page.on("console", lambda said: complaints.append(said.text) if said.type in ("error", "warning") else None)
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.goto(address)
     wait_until(page, "window.egs !== undefined")
     return page, complaints
+
+
+def _keep_shot(page: Any, folder: Path) -> None:
+    close = page.close
+    test = os.environ.get("PYTEST_CURRENT_TEST", "page").rpartition("::")[2].partition(" ")[0]
+
+    def shoot_and_close() -> None:
+        name = re.sub(r"[^\w-]+", "-", test).strip("-")
+        page.screenshot(path=str(folder / f"{name}.png"))
+        close()
+
+    page.close = shoot_and_close
 
 
 def wait_until(page: Any, condition: str, *, seconds: float = 60.0) -> None:

@@ -82,10 +82,43 @@ class BrokenPromiseError(AssertionError):
 
 
 def outcome(reader: Reader, folder: Path, data: bytes) -> str:
-    """``valid`` or ``refused``; anything else raises ``BrokenPromiseError``."""
+    """``valid`` or ``refused``; anything else raises ``BrokenPromiseError``.
+
+    What takes too long is read once more, and only the second time counts: a reader that is slow is so twice, a machine
+    that stood still for a moment is not.
+    """
     path = folder / reader.file
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(reader.wrap(data))
+    first = _read(reader, path)
+    if not first.slow:
+        return first.said
+    second = _read(reader, path)
+    if second.slow:
+        raise BrokenPromiseError(f"{reader.name}: {second}; {first} the first time")
+    return second.said
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """How one reading of a file ended."""
+
+    said: str
+    took: float
+    """Seconds of the clock."""
+    work: float
+    """Seconds of the processor, of all threads."""
+
+    @property
+    def slow(self) -> bool:
+        """Of the processor, since the machine may be busy; of the clock, since it may wait."""
+        return self.work > LONGEST or self.took > 10.0 * LONGEST
+
+    def __str__(self) -> str:
+        return f"{self.work:.1f} s of work in {self.took:.1f} s"
+
+
+def _read(reader: Reader, path: Path) -> _Reading:
     began, worked = time.perf_counter(), time.process_time()
     try:
         with np.errstate(all="ignore"):
@@ -99,11 +132,7 @@ def outcome(reader: Reader, folder: Path, data: bytes) -> str:
         if isinstance(error, KeyboardInterrupt | SystemExit):
             raise
         raise BrokenPromiseError(f"{reader.name}: {type(error).__name__}: {error}") from error
-    took, work = time.perf_counter() - began, time.process_time() - worked
-    # Of the processor, since the machine may be busy; of the clock, since it may wait.
-    if work > LONGEST or took > 10.0 * LONGEST:
-        raise BrokenPromiseError(f"{reader.name}: {work:.1f} s of work in {took:.1f} s")
-    return said
+    return _Reading(said, time.perf_counter() - began, time.process_time() - worked)
 
 
 def prepare(reader: Reader, folder: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -57,11 +58,33 @@ def test_page_and_run_are_served_under_the_token(server: PageServer, recording: 
         "/{token}/..%2f..%2f..%2fetc%2fpasswd",
         "/{token}/run/%2e%2e/%2e%2e/trajectory.npz",
         "/{token}//etc/passwd",
+        "/{token}/run/0/%2e%2e/%2e%2e/report.json",
+        "/{token}/%2fetc%2fpasswd",
+        "/{token}/run/%2fetc%2fpasswd",
+        "//etc/passwd",
+        "/{token}x/run/0",
+        "/run/0",
     ],
 )
 def test_nothing_else_is_served(server: PageServer, path: str):
     status, body = _get(server, path.format(token=server.token))
     assert status == 404 and len(body) < 200
+
+
+def test_what_lies_in_the_folder_of_the_run_is_not_served_nor_where_a_link_in_it_leads(
+    run_folder: Path, tmp_path: Path
+):
+    """The page gets what is made of a run: no path of it names a file."""
+    folder, secret = tmp_path / "run", tmp_path / "secret.txt"
+    shutil.copytree(run_folder, folder)
+    secret.write_text("nobody's business")
+    (folder / "link.txt").symlink_to(secret)
+    (folder / "0").symlink_to(tmp_path)
+    with served(Recording.read(folder)) as server:
+        assert _get(server, f"/{server.token}/run/0")[0] == 200
+        for name in ("link.txt", "0/secret.txt", "report.json", "run/link.txt", "run/0/secret.txt", "run/0/link.txt"):
+            status, body = _get(server, f"/{server.token}/{name}")
+            assert status == 404 and b"business" not in body, name
 
 
 def test_other_hosts_and_origins_are_refused(server: PageServer):

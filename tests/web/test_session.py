@@ -182,7 +182,7 @@ def test_a_solver_that_fails_does_not_end_the_session(
 
 
 def test_a_page_that_takes_nothing_loses_the_oldest_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("egs_warp.web.session._MOST_WAITING", 5)
+    monkeypatch.setattr("egs_warp.web.post._MOST_WAITING", 5)
     session = session_of(coarse_pawn(), tmp_path)
     session.watch(lambda: None)
     for _ in range(8):
