@@ -87,7 +87,7 @@ def test_straining_rows_see_uniform_strain_alone_and_all_of_it() -> None:
     state = shaken_state()
     target = rng.standard_normal(state.positions.shape)
     objective = straining_velocities(BODY, state.positions, target, 0.3)
-    assert objective.rows.shape[0] == 6 and objective.weight == 0.3
+    assert objective.target.shape == (6,) and objective.weight == 0.3
     arms = state.positions - BODY.centre_of_mass(state.positions)
     mass = BODY.node_mass[:, None] / BODY.mass
 
