@@ -47,6 +47,7 @@ def _convert(chosen: argparse.Namespace) -> int:
     from egs_warp.io.sequence import numbered_captures
     from egs_warp.io.writing import WRITERS, writer_of
     from egs_warp.launching import use_device
+    from egs_warp.pipelines.progress import conversion_bar
 
     if chosen.to is None or chosen.capture.is_file():
         write = writer_of(chosen.out, kind=chosen.to)
@@ -65,14 +66,19 @@ def _convert(chosen: argparse.Namespace) -> int:
         folder = writable_folder(chosen.out)
         pairs = [(source, folder / f"{source.name.split('.')[0]}{ending}") for source in sources]
     use_device("cpu")
-    told = []
+    told: list[str] = []
+    notes: list[str] = []
     for source, target in tqdm(pairs, desc="convert", unit="file", disable=len(pairs) == 1, file=sys.stderr):
         before = read_capture(source)
-        write(target, with_degree(before.cloud, chosen.degree))
-        if not told:
-            for note in before.notes:
-                say(f"{source}: {note}")
-            told = losses(before, read_capture(target))
+        with conversion_bar(target.name, quiet=len(pairs) > 1) as begins:
+            begins("write")
+            write(target, with_degree(before.cloud, chosen.degree))
+            if not told:
+                notes = [f"{source}: {note}" for note in before.notes]
+                begins("compare")
+                told = losses(before, read_capture(target))
+    for note in notes:
+        say(note)
     size, was = (sum(_size(pair[k]) for pair in pairs) for k in (1, 0))
     names = str(pairs[0][1]) if len(pairs) == 1 else f"{pairs[0][1]} to {pairs[-1][1].name}"
     print(f"wrote {names} ({size / 1e6:.2f} MB from {was / 1e6:.2f} MB)")

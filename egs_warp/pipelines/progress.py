@@ -1,5 +1,5 @@
-"""Progress bars whose time left is meant to be believed: of a scene, of what ``info`` finds, of a creature's making,
-and of its simulation."""
+"""Progress bars whose time left is meant to be believed: of a scene, of what ``info`` finds, of a capture in another
+format, of a creature's making, and of its simulation."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ _DONE = {"cage": 0, "contact": 45, "front": 55, "body and muscles": 68, "stand":
 monkey, robot: within 15 of these)."""
 _LOOKED = {"cage": 0, "front": 70, "muscles": 91}
 """The same of what ``info`` finds (pawn, plush dog, monkey, robot: within 13)."""
+_CONVERTED = {".compressed.ply": 37, ".ply": 27, ".spz": 65, ".sog": 80, ".splat": 1, ".glb": 11}
+"""The same of a capture that has been written and is compared (400,000 Gaussians of SH degree 3 on a CPU)."""
 _SCENE = {"plane": 12, "ground": 15, "segment": 49, "inpaint": 24}
 """Percent of the time that each stage of a scene takes, in the middle of two built-in rooms, koala and narcissus on a
 CPU: stages begin within 16 of where this has them."""
@@ -35,6 +37,14 @@ def preparation_bar(*, quiet: bool = False, file: TextIO | None = None) -> Itera
 def info_bar(*, quiet: bool = False, file: TextIO | None = None) -> Iterator[Callable[[str], None]]:
     """The same for ``look_into``."""
     with _stages("look", _LOOKED, quiet=quiet, file=file) as begins:
+        yield begins
+
+
+@contextmanager
+def conversion_bar(name: str, *, quiet: bool = False, file: TextIO | None = None) -> Iterator[Callable[[str], None]]:
+    """The same for a capture that is written as the ending of ``name`` says, and compared."""
+    written = next(done for ending, done in _CONVERTED.items() if name.lower().endswith(ending))
+    with _stages("convert", {"write": 0, "compare": written}, quiet=quiet, file=file) as begins:
         yield begins
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import io
+from functools import partial
 
 import pytest
 
 from egs_warp.pipelines.prepare_scene import SceneOptions
-from egs_warp.pipelines.progress import info_bar, preparation_bar, scene_bar
+from egs_warp.pipelines.progress import conversion_bar, info_bar, preparation_bar, scene_bar
 from egs_warp.segmentation.clearance import Clearing
 
 
@@ -48,6 +49,7 @@ def test_stages_tell_what_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = [1000.0]
     monkeypatch.setattr("tqdm.std.time", lambda: clock[0])
     for bar, name, told in (
+        (partial(conversion_bar, "a.SPZ"), "convert", {"write": (0.0, "?"), "compare": (6.5, "00:03")}),
         (info_bar, "look", {"cage": (0.0, "?"), "front": (7.0, "00:03"), "muscles": (9.1, "00:00")}),
         (preparation_bar, "prepare", {"cage": (0.0, "?"), "contact": (45.0, "00:55"), "stand": (80.0, "00:14")}),
     ):

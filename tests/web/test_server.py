@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 import shutil
+import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -133,6 +134,13 @@ def test_a_socket_gets_the_header_and_then_frames(server: PageServer, recording:
 def test_a_socket_of_another_site_is_refused(server: PageServer, origin: str | None):
     with pytest.raises(InvalidStatus), _socket(server, origin):
         pass
+
+
+def test_a_socket_under_another_name_is_refused(server: PageServer):
+    """One that somebody has made to lead here."""
+    own: Any = f"http://127.0.0.1:{server.port}"
+    with socket.create_connection(("127.0.0.1", server.port)) as line, pytest.raises(InvalidStatus):
+        connect(f"ws://evil.example:{server.port}/{server.token}/live", sock=line, origin=own)
 
 
 def test_a_second_page_is_told_and_the_first_goes_on(server: PageServer):
