@@ -35,6 +35,8 @@ itself off the side on which it stands."""
 COUNTER = 1.5
 """By how much less than its base a body turns for each body height above it, over the turn of the base: the less of it
 turns with the base, the less friction it takes."""
+LEAST_TURNED = 0.2
+"""Of the whole moment of inertia: what friction is taken to have to turn, whatever goes the other way."""
 SLOWEST = 1.25
 """Times the usual swing that it may take to turn so far, where friction under one side is not enough in the usual."""
 SPENT = 1.2
@@ -113,7 +115,7 @@ class OnBase:
         """(N,) how far each node turns with the base."""
         self._between = soles[0] - soles[1]
         self._width = float(np.hypot(*self._between[:2]))
-        usual = SPENT * self._pivot(place, soles, self._angular_momentum(body.node_mass))
+        usual = SPENT * self._pivot(place, soles, self._inertia(body.node_mass))
         slower = float(np.clip(np.sqrt(PIVOT / max(usual, 1e-12)), 1.0, SLOWEST))
         self.tempo = replace(ON_BASE, swing=slower * ON_BASE.swing)
         pivot = min(PIVOT, slower**2 * usual)
@@ -123,12 +125,13 @@ class OnBase:
         self.com = 300.0  # where friction gives too little for both, balance goes before turning
         self.hold = 5.0  # what turns about a patch slides at its edges
 
-    def _angular_momentum(self, node_mass: np.ndarray) -> float:
-        """kg m^2 about up through the centre of mass, for one radian a second of its base."""
-        return float(node_mass @ (((self._arms - self._com)[:, :2] ** 2).sum(axis=1) * self._turning))
+    def _inertia(self, node_mass: np.ndarray) -> float:
+        """kg m^2, angular momentum about up through the centre of mass for one radian a second of the base."""
+        moments = node_mass * ((self._arms - self._com)[:, :2] ** 2).sum(axis=1)
+        return float(max(moments @ self._turning, LEAST_TURNED * moments.sum()))
 
     @staticmethod
-    def _pivot(place: Place, soles: np.ndarray, angular_momentum: float) -> float:
+    def _pivot(place: Place, soles: np.ndarray, inertia: float) -> float:
         """Radians by which friction under one side turns the body while the other is carried ahead in a usual
         swing."""
         body = place.body
@@ -139,9 +142,7 @@ class OnBase:
         gravity = float(np.linalg.norm(body.gravity))
         torque = place.friction * body.mass * gravity * min(map(float, arms), default=0.0)
         time = ON_BASE.carried * ON_BASE.swing * float(np.sqrt(body.height / gravity))
-        # What its upper part carries the other way takes nothing off friction; it never takes all.
-        least = 0.2 * float(place.ground.axes[2] @ body.inertia(place.standing) @ place.ground.axes[2])
-        return torque * time**2 / (_PEAK * max(angular_momentum, least))
+        return torque * time**2 / (_PEAK * inertia)
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
         """See ``Carriage``; the places of the feet turn its base, ``heading`` is that of the body as a whole."""
