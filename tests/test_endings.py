@@ -207,6 +207,20 @@ def test_ctrl_c_that_a_library_makes_an_error_of_its_own_of_is_still_one() -> No
     assert ended(body) == (130, "prog: stopped; finished files are whole, unfinished ones are gone\n")
 
 
+def test_what_fails_after_a_ctrl_c_that_was_meant_keeps_its_line() -> None:
+    """A take that cannot be saved when the live page has been ended so."""
+    body = """
+        from egs_warp.errors import UserError
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(10)
+        except KeyboardInterrupt:
+            pass
+        raise UserError("take.npz: cannot be written")
+    """
+    assert ended(body) == (2, "prog: take.npz: cannot be written\n")
+
+
 @pytest.mark.parametrize("after", [0.05, 0.3, 0.8, 1.5, 2.5, 4.0])
 def test_ctrl_c_in_any_phase_is_one_line(after: float, tmp_path: Path) -> None:
     """Imports, preparation, simulation and film of a short run: none leaves a traceback or a half-written file."""

@@ -88,7 +88,8 @@ def _unwinding(came: list[type[BaseException]]) -> Iterator[None]:
     """
     try:
         yield
-    except Exception as error:
+    except (ImportError, SystemError) as error:
+        # Others keep their own line: what fails after a Ctrl-C that ended a server, say.
         if came:
             raise came[0] from error
         raise
