@@ -24,9 +24,11 @@ class Facing(Protocol):
         """Told before each step: how the body faces, from the start, whole turns apart."""
         ...
 
-    def thrust_spin(self, tilt: np.ndarray, state: BodyState, up: np.ndarray, flight_time: float) -> np.ndarray:
-        """(3,) rad/s to ask for during the thrust, where ``tilt`` (3,) is what an upright landing takes after
-        ``flight_time`` s."""
+    def thrust_momentum(
+        self, pose: PoseFamily, state: BodyState, upright: np.ndarray, *, left: float, flight_time: float
+    ) -> np.ndarray:
+        """(3,) kg m^2/s to leave the ground with, ``left`` seconds from now, so that a flight of ``flight_time``
+        seconds ends upright and turned; ``upright`` (3,) is the rotation vector to the landing without its turn."""
         ...
 
     def airborne_pose(self, pose: np.ndarray, momentum: np.ndarray, up: np.ndarray, left: float) -> np.ndarray:
@@ -49,9 +51,11 @@ class Straight:
     def see(self, heading: float) -> None:
         """Nothing depends on it."""
 
-    def thrust_spin(self, tilt: np.ndarray, state: BodyState, up: np.ndarray, flight_time: float) -> np.ndarray:
-        """``tilt`` alone."""
-        return tilt
+    def thrust_momentum(
+        self, pose: PoseFamily, state: BodyState, upright: np.ndarray, *, left: float, flight_time: float
+    ) -> np.ndarray:
+        """Upright alone."""
+        return pose.body.inertia(state.positions) @ (upright / flight_time)
 
     def airborne_pose(self, pose: np.ndarray, momentum: np.ndarray, up: np.ndarray, left: float) -> np.ndarray:
         """``pose`` as it is."""

@@ -264,15 +264,26 @@ class Jump:
         velocity = np.array([*(seen.velocity[:2] + change + short), up])
         flat = self._base_of_landing() - FLAT * np.array([self.plan.landing_lag, 0.0])
         upright = self.pose.over_base(landing, flat, self.facing.turned)
-        # From what keeps it upright to what brings it to the landing's tilt by then.
-        share = min(elapsed / plan.thrust_time, 1.0)
-        tilt = share * self.pose.turn_towards(state, upright) / plan.flight_time
         standing = self.pose.bent_over_base(position, self._start_base, self.facing.turned)
-        tilt = tilt + (1.0 - share) * self._upright(state, standing)
-        spin = self.facing.thrust_spin(tilt, state, self.ground.axes[2], plan.flight_time)
+        spin = self._thrust_spin(state, upright, standing, elapsed, left, dt)
         velocity, spin = self.pose.balanced(state, seen, velocity, spin, dt)
         self._asked = velocity[:2]
         return self._write(state, velocity, standing, spin, dt)
+
+    def _thrust_spin(
+        self, state: BodyState, landing: np.ndarray, standing: np.ndarray, elapsed: float, left: float, dt: float
+    ) -> np.ndarray:
+        """(3,) rad/s to ask for ``left`` seconds before take-off: from what keeps the body in the pose ``standing``
+        (3, 3) to what brings it to that of the ``landing`` (3, 3). The spin about up grows as the speed does, since
+        friction does with the load."""
+        up, inertia = self.ground.axes[2], self.body.inertia(state.positions)
+        upright = self.pose.turn_towards(state, landing)
+        wanted = self.facing.thrust_momentum(self.pose, state, upright, left=left, flight_time=self.plan.flight_time)
+        share = min(elapsed / self.plan.thrust_time, 1.0)
+        momentum = share * wanted + (1.0 - share) * (inertia @ self._upright(state, standing))
+        now = up @ self.body.angular_momentum(state.positions, state.velocities)
+        about_up = now + dt / max(THRUST_LEAD * left, dt) * (up @ wanted - now)
+        return np.linalg.solve(inertia, momentum + (about_up - up @ momentum) * up)
 
     def _fly(self, state: BodyState, seen: Measurement, dt: float) -> list[AnyObjective]:
         touch_down, left = self._touch_down(seen, dt)

@@ -207,7 +207,7 @@ REPERTOIRE: Mapping[str, MotionKind] = {
         (
             Value("heading_degrees", 180.0, -LARGEST_TURN, LARGEST_TURN, "degrees"),
             _length("distance", 0.0),
-            _length("height", 0.3, above=True),
+            _length("height", 0.2, above=True),
         ),
         _turns,
         lambda request: 480,

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from egs_warp.fem.body import BodyState
+from egs_warp.motions.free_turn import spin_that_turns
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.sequence import Place
@@ -34,24 +35,30 @@ class Turning:
 
     def __init__(self, place: Place, turn: float) -> None:
         self.body, self.turn, self.turned, self.lands_at = place.body, turn, 0.0, 0.0
-        up = place.ground.axes[2]
-        self._standing_inertia = float(up @ place.body.inertia(place.standing) @ up)
+        self._standing_inertia = place.body.inertia(place.standing)
 
     def see(self, heading: float) -> None:
         """Follows the turn from step to step, so that whole turns count."""
         self.turned += float(np.remainder(heading - self.turned + np.pi, 2.0 * np.pi) - np.pi)
 
-    def thrust_spin(self, tilt: np.ndarray, state: BodyState, up: np.ndarray, flight_time: float) -> np.ndarray:
-        """``tilt`` with the spin about ``up`` that makes the turn that is left while the body is in the air."""
-        # The body flies in about the shape in which it stands, so its inertia then, not the one now, says what spin it
-        # needs.
-        yaw = SPARE_SPIN * self._left_to_turn() / (AIRBORNE_SHARE * flight_time)
-        yaw = yaw * self._standing_inertia / float(up @ self.body.inertia(state.positions) @ up)
-        return tilt + (yaw - tilt @ up) * up
+    def thrust_momentum(
+        self, pose: PoseFamily, state: BodyState, upright: np.ndarray, *, left: float, flight_time: float
+    ) -> np.ndarray:
+        """(3,) kg m^2/s with which the body, once in the air, turns upright and by what is left.
+
+        It flies in about the shape in which it stands, so its inertia then, not the one now, says how.
+        """
+        up, rotation = pose.ground.axes[2], pose.rotation(state.positions)
+        inertia = rotation @ self._standing_inertia @ rotation.T
+        momentum = float(up @ self.body.angular_momentum(state.positions, state.velocities))
+        spinning = momentum / float(up @ inertia @ up)
+        airborne = AIRBORNE_SHARE * flight_time + 0.5 * left
+        turn = SPARE_SPIN * self._left_to_turn() - 0.5 * left * spinning
+        return inertia @ spin_that_turns(inertia, upright, turn * up, airborne)
 
     def airborne_pose(self, pose: np.ndarray, momentum: np.ndarray, up: np.ndarray, left: float) -> np.ndarray:
         """Arms in, arms out: as wide as makes, with the spin that there is, the turn that is left."""
-        to_turn, turning = self._left_to_turn(), float(up @ momentum) * left / self._standing_inertia
+        to_turn, turning = self._left_to_turn(), float(up @ momentum) * left / float(up @ self._standing_inertia @ up)
         self.lands_at = self.turned + turning
         ratio = turning / to_turn if turning * to_turn > 0.0 else np.inf
         width = float(np.sqrt(np.clip(ratio, 1.0 / WIDEST**2, WIDEST**2)))

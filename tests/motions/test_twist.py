@@ -9,10 +9,10 @@ import pytest
 
 from egs_warp.fem.body import BodyState
 from egs_warp.locomotion.objectives import Objective, SpinObjective
-from egs_warp.motions.jump import Jump
+from egs_warp.motions.jump import THRUST_LEAD, Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpTarget
 from egs_warp.motions.sequence import Place
-from egs_warp.motions.twist import SLIDE, twist
+from egs_warp.motions.twist import AIRBORNE_SHARE, SLIDE, SPARE_SPIN, twist
 from tests.support.meshes import box_mesh
 from tests.support.places import DT, block_place, moved
 
@@ -31,8 +31,8 @@ def inertia_about_up(place: Place, positions: np.ndarray) -> float:
 
 @pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.0 * np.pi])
 def test_a_twist_asks_friction_for_the_spin_that_is_left(turn: float) -> None:
-    """In the thrust: the spin that turns the standing body by what is left while it flies, whatever its shape now, and
-    a reserve.
+    """In the last step of the thrust: the spin that turns the standing body by what is left while it flies, whatever
+    its shape now, and a reserve.
 
     What is asked falls in proportion to the angle turned and is nothing a few degrees, which the feet slide on by,
     before the end. Its own turning is counted beyond half turns. The body's masses mirror: what is asked against its
@@ -41,21 +41,41 @@ def test_a_twist_asks_friction_for_the_spin_that_is_left(turn: float) -> None:
     place = block_place(box_mesh((2, 2, 4), (0.4, 0.4, 1.0)))
     jump = twist(place, JumpTarget(0.0, 0.2), turn)
     jump.phase = JumpPhase.THRUST
-    still, sign = np.zeros_like(place.standing), np.sign(turn)
+    rising, sign = np.zeros_like(place.standing), np.sign(turn)
+    rising[:, 2] = 0.9 * jump.plan.speed_up
     angles = np.array([0.0, 0.3, 0.6])
-    asked = [yaw_asked(jump, BodyState(moved(place, sign * angle, np.zeros(3)), still, 0.0)) for angle in angles]
-    slope, start = np.polyfit(angles, sign * np.array(asked), 1)
-    assert np.allclose(sign * np.array(asked), start + slope * angles, rtol=1e-6)
+    states = [BodyState(moved(place, sign * angle, np.zeros(3)), rising, 0.0) for angle in angles]
+    asked = sign * np.array([yaw_asked(jump, state) for state in states])
+    slope, start = np.polyfit(angles, asked, 1)
+    assert np.allclose(asked, start + slope * angles, rtol=1e-6)
     assert np.degrees(abs(turn) + start / slope) == pytest.approx(np.degrees(SLIDE), abs=1e-3)
     reserve = -slope * jump.plan.flight_time / inertia_about_up(place, place.standing)
-    assert 1.2 < reserve < 1.7
+    assert 1.1 < reserve < 1.7
     crouched = moved(place, float(sign * 0.6), np.zeros(3))
     middle = place.body.centre_of_mass(crouched)
     crouched = middle + (crouched - middle) * [1.1, 1.1, 0.8]
-    assert yaw_asked(jump, BodyState(crouched, still, 0.0)) == pytest.approx(asked[-1], rel=1e-6)
+    assert sign * yaw_asked(jump, BodyState(crouched, rising, 0.0)) == pytest.approx(asked[-1], rel=1e-6)
     for angle in np.linspace(0.6, abs(turn), 12) * sign:
-        jump.objectives(BodyState(moved(place, angle, np.zeros(3)), still, 0.0), None, DT)
+        jump.objectives(BodyState(moved(place, angle, np.zeros(3)), rising, 0.0), None, DT)
     assert jump.facing.turned == pytest.approx(turn)
+
+
+def test_a_twist_gathers_its_spin_as_the_speed_up_is_gathered(place: Place) -> None:
+    """What friction can give follows the load: a body that is still is asked for the share of the whole spin that a
+    step is of the thrust, one that rises at half the speed for twice that."""
+    shares = []
+    for risen in (0.0, 0.5):
+        jump = twist(place, JumpTarget(0.0, 0.2), 1.0)
+        jump.phase = JumpPhase.THRUST
+        velocities = np.zeros_like(place.standing)
+        velocities[:, 2] = risen * jump.plan.speed_up
+        asked = yaw_asked(jump, BodyState(place.standing, velocities, 0.0))
+        left = (1.0 - risen) * jump.plan.thrust_time
+        whole = inertia_about_up(place, place.standing) * (1.0 - SLIDE) * SPARE_SPIN
+        whole /= AIRBORNE_SHARE * jump.plan.flight_time + 0.5 * left
+        shares.append(asked / whole)
+        assert shares[-1] == pytest.approx(DT / (THRUST_LEAD * left), rel=5e-3)
+    assert shares[1] == pytest.approx(2.0 * shares[0], rel=5e-3)
 
 
 def test_in_the_air_the_body_takes_the_width_with_which_its_spin_makes_the_turn(place: Place) -> None:
