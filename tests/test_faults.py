@@ -5,12 +5,10 @@ from __future__ import annotations
 import errno
 import json
 import os
-import resource
+import re
 import shutil
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from functools import partial
+from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 
@@ -21,7 +19,9 @@ from egs_warp.cli import main
 from egs_warp.io import write_ply
 from egs_warp.io.planes import read_planes
 from egs_warp.io.run_folder import MANIFEST
+from tests.support.faults import assert_one_line, fail_once, largest_file
 from tests.support.posed import posed_folder
+from tests.support.reconstruction import model, photos_of_noise, reconstruct_by
 from tests.support.scenes import write_scene
 
 COMMANDS = {
@@ -47,6 +47,7 @@ COMMANDS = {
     "plane": "plane {scene}/scene.ply --object {scene}/photo1.png --cameras {scene}/cameras.json --out {out}",
     "segment": "segment {scene}/scene.ply --object {scene}/photo1.png --cameras {scene}/cameras.json"
     " --straddling split --out {out}",
+    "pose": "pose {photos} --out {out}",
     "inpaint": "inpaint {scene}/parts/background.ply --plane {scene}/parts/plane.json --out {out}/filled.ply",
     "train": "train {scene}/posed --out {out}/a.ply --iterations 40 --gaussians 300 --device cpu",
 }
@@ -74,6 +75,13 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
+def photos(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Of which a stand-in for pycolmap finds the poses."""
+    reconstruct_by(monkeypatch, model)
+    return photos_of_noise(tmp_path_factory.mktemp("photos") / "photos")
+
+
+@pytest.fixture
 def command(capture: Path, run_folder: Path, request: pytest.FixtureRequest) -> Command:
     """Runs a line of ``COMMANDS`` into a folder, and returns its status."""
 
@@ -83,6 +91,8 @@ def command(capture: Path, run_folder: Path, request: pytest.FixtureRequest) -> 
             if "train " in line:
                 pytest.importorskip("torch")
             places["scene"] = request.getfixturevalue("scene")
+        if "{photos}" in line:
+            places["photos"] = request.getfixturevalue("photos")
         words = [word.format(**places) for word in line.split()]
         try:
             return main(words)
@@ -93,25 +103,8 @@ def command(capture: Path, run_folder: Path, request: pytest.FixtureRequest) -> 
     return run
 
 
-@contextmanager
-def largest_file(size: int) -> Iterator[None]:
-    """As on a full disk, no file grows beyond ``size`` bytes; programs that are started inherit it."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
 def files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.rglob("*") if path.is_file())
-
-
-def assert_one_line(said: str, reason: str) -> None:
-    """The last line tells it; those before are of what was being done."""
-    assert "Traceback" not in said
-    assert said.splitlines()[-1].startswith("egs-warp: ") and reason in said.splitlines()[-1], said
 
 
 @pytest.mark.parametrize("size", [pytest.param(0, marks=pytest.mark.slow), 700])
@@ -131,8 +124,8 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_written(
     request: pytest.FixtureRequest,
 ) -> None:
     """The write itself fails, at its first byte or in its midst: status 1; files that are there are whole."""
-    if "{scene}" in line:
-        request.getfixturevalue("scene")
+    for made in {"scene", "photos"} & set(re.findall(r"{(\w+)}", line)):
+        request.getfixturevalue(made)
     with largest_file(size):
         status = command(line, tmp_path / "out") if line.endswith("{out}") else command(line, tmp_path)
     assert status == 1
@@ -184,31 +177,6 @@ def test_each_opening_and_renaming_fails_once(
         assert ended == status
         assert_one_line(said, os.strerror(reason))
     assert ended == 0 and number >= 2 and files(out)
-
-
-def fail_once(patch: pytest.MonkeyPatch, number: int, reason: int) -> list[Path]:
-    """Of the openings of new files and the renamings in ``egs_warp.io.atomic`` the one with this number fails, which
-    then is in the list.
-    """
-    failed: list[Path] = []
-    calls = count()
-
-    def failing(usual: Callable[..., object], path: Path, *given: int) -> object:
-        # Locks are opened as well; they are not exclusive.
-        if (usual is os.replace or (given and given[0] & os.O_EXCL)) and next(calls) == number:
-            failed.append(path)
-            raise OSError(reason, os.strerror(reason))
-        return usual(path, *given)
-
-    class System:
-        """The ``os`` that the module sees."""
-
-        def __getattr__(self, name: str) -> object:
-            usual = getattr(os, name)
-            return partial(failing, usual) if name in ("open", "replace") else usual
-
-    patch.setattr("egs_warp.io.atomic.os", System())
-    return failed
 
 
 def test_a_clock_that_jumps_changes_nothing(

@@ -10,7 +10,6 @@ import re
 import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from egs_warp import kernels
 from egs_warp.errors import UserError
 from egs_warp.io.video import ffmpeg_program
 from egs_warp.launching import available_threads
-from egs_warp.pipelines.report import MECHANICS, versions
+from egs_warp.pipelines.report import MECHANICS, installed_version, versions
 
 OPTIONAL = {
     "torch": ("training, fine-tuning where it straddles the ground", "egs-warp[torch]"),
@@ -98,7 +97,7 @@ def inspect_machine() -> Machine:
     driver, toolkit = wp.get_cuda_driver_version(), wp.get_cuda_toolkit_version()
     devices = tuple(_device_facts(device) for device in wp.get_devices())
     cache = Path(wp.config.kernel_cache_dir or ".")
-    optional = {name: _version(name) for name in OPTIONAL}
+    optional = {name: installed_version(name) for name in OPTIONAL}
     problems, advice = [], []
     if not os.access(cache, os.W_OK):
         problems.append(f"kernel cache {cache}: cannot be written; set WARP_CACHE_PATH to a folder that can be")
@@ -189,13 +188,6 @@ def _processor() -> str:
     except OSError:
         found = None
     return found[1].strip() if found else platform.processor() or platform.machine()
-
-
-def _version(name: str) -> str | None:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
 
 
 def _encoders(program: str) -> tuple[str, ...]:

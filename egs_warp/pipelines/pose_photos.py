@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import sqlite3
@@ -17,6 +18,7 @@ import cv2
 import numpy as np
 
 from egs_warp.errors import UserError
+from egs_warp.io.cameras import read_cameras, read_points
 from egs_warp.io.frames import VIDEO_SUFFIXES, sharp_frames
 from egs_warp.io.photos import decoded, orientation, turned
 from egs_warp.io.run_folder import check_run_folder, run_folder
@@ -66,7 +68,7 @@ def pose_photos(
     Features are found at no more than ``max_side`` pixels. The folder belongs to one run (``egs_warp.io.run_folder``);
     an earlier one is moved aside with ``overwrite``. ``stage`` is called with what begins, ``progress`` with a
     stage's name, how much of it is done, and of how much. Raises ``UserError`` where pycolmap is not installed, where
-    ``out`` has an earlier run or photos already, and where fewer than three photos can be posed.
+    ``out`` has an earlier run or photos already or cannot be written, and where fewer than three photos can be posed.
     """
     try:
         import pycolmap  # type: ignore[import-not-found]
@@ -91,13 +93,20 @@ def pose_photos(
         names = sorted(path.relative_to(images).as_posix() for path in images.rglob("*") if path.is_file())
         if len(names) < _LEAST_PHOTOS:
             raise UserError(f"{source}: {len(names)} photos that can be read; give at least {_LEAST_PHOTOS}")
-        model = _reconstructed(
-            pycolmap, work, names, in_order=is_video, max_side=max_side, seed=seed, say=say, tell=tell
-        )
-        (work / "sparse" / "0").mkdir(parents=True)
-        model.write_binary(str(work / "sparse" / "0"))
-        for part in _WRITES:
-            os.replace(work / part, run.folder(part))
+        try:
+            model = _reconstructed(
+                pycolmap, work, names, in_order=is_video, max_side=max_side, seed=seed, say=say, tell=tell
+            )
+        except RuntimeError as error:
+            # Of its database, where the disk is full.
+            reason = next(iter(str(error).splitlines()), "no reason told")
+            raise UserError(f"pose: COLMAP cannot go on ({reason}); is there room in {out}?") from error
+        _write_model(model, work / "sparse" / "0", out)
+        try:
+            for part in _WRITES:
+                os.replace(work / part, run.folder(part))
+        except OSError as error:
+            raise UserError(f"{out}: cannot be written ({error.strerror}); choose another place") from error
         run.finish()
     posed = {image.name for image in model.images.values() if image.has_pose}
     return PoseResult(
@@ -108,6 +117,19 @@ def pose_photos(
         points=model.num_points3D(),
         error=float(model.compute_mean_reprojection_error()),
     )
+
+
+def _write_model(model: Any, folder: Path, out: Path | str) -> None:
+    """Write it and read it again: on a full disk COLMAP leaves a part of it and keeps silent."""
+    folder.mkdir(parents=True)
+    model.write_binary(str(folder))
+    try:
+        read_cameras(folder)
+        read_points(folder)
+    except UserError as error:
+        raise UserError(
+            f"{out}: COLMAP's model is not whole, most likely the disk is full; free space, or choose another place"
+        ) from OSError(errno.ENOSPC, str(error))
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import json
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,15 +28,28 @@ if TYPE_CHECKING:
 SCHEMA_VERSION = 1
 MECHANICS = ("warp-lang", "numpy", "scipy", "osqp", "rslab", "pytetwild")
 """Packages that decide how a body moves."""
+NO_METADATA = "no metadata"
+"""In place of the version of a package that is missing, or was copied without its ``dist-info``."""
 
 
 def versions(names: Sequence[str] = MECHANICS) -> dict[str, str]:
-    """Of the package, Python and the packages ``names``, which the numbers depend on."""
+    """Of the package, Python and the packages ``names``, which the numbers depend on.
+
+    One whose version is not known is told as ``NO_METADATA``: whoever asks has finished work, which must not be lost.
+    """
     return {
         "egs-warp": __version__,
         "python": platform.python_version(),
-        **{name: version(name) for name in names},
+        **{name: installed_version(name) or NO_METADATA for name in names},
     }
+
+
+def installed_version(name: str) -> str | None:
+    """None where nothing tells it."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
 
 
 @dataclass(frozen=True)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,6 +21,7 @@ from egs_warp.assets import pawn, scene, stool
 from egs_warp.io import write_ply
 from egs_warp.io.run_folder import MANIFEST
 from tests.support.coarse import coarse_main
+from tests.support.faults import assert_one_line, fail_once
 
 PATIENCE = 900.0
 """Seconds that a run may take on a busy machine."""
@@ -137,6 +140,37 @@ def test_random_moments(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPat
         begun = (out / MANIFEST).exists()
         assert finishes(["resume", str(out)] if begun else animate(name, folder, out)) == status
         assert bits(out) == bits(whole), number
+
+
+@pytest.mark.slow
+def test_each_opening_and_renaming_of_what_goes_on_fails_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a run that was cut off at its film: one line, nothing half-written, not finished, and ``resume`` goes on."""
+    folder, whole, cut, out = made(tmp_path), tmp_path / "whole", tmp_path / "cut", tmp_path / "out"
+    assert coarse_main(animate("jump", folder, whole)) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr("egs_warp.pipelines.animate.draw_film", interrupted)
+        assert coarse_main(animate("jump", folder, cut)) == 130
+    for number in range(100):
+        shutil.rmtree(out, ignore_errors=True)
+        shutil.copytree(cut, out)
+        capsys.readouterr()
+        with monkeypatch.context() as patch:
+            failed = fail_once(patch, number, errno.ENOSPC)
+            status = coarse_main(["resume", str(out)])
+        if not failed:
+            break
+        assert status == 1
+        assert_one_line(capsys.readouterr().err, os.strerror(errno.ENOSPC))
+        assert not [name for name in os.listdir(out) if name.startswith(".egs-")]
+        assert not json.loads((out / MANIFEST).read_text())["finished"]
+    assert number > 8 and status == 0 and bits(out).keys() == bits(whole).keys()
+    assert all(its == bits(whole)[name] for name, its in bits(out).items() if name != "run.yaml")
+
+
+def interrupted(*_: object, **__: object) -> None:
+    raise KeyboardInterrupt
 
 
 def test_what_cannot_go_on_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import errno
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace as replaced
 from functools import cache
-from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +24,7 @@ from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.finished_run import PARTS, read_trajectory
 from egs_warp.pipelines.performance import Performance, simulate
 from egs_warp.pipelines.report import Report, verdict
+from tests.support.faults import fail_once
 from tests.support.slides import slide
 
 FILES = ["cage.vtu", "creature.npz", "jump.mp4", MANIFEST, "plots.png", "report.json", "sheet.png", "trajectory.npz"]
@@ -132,35 +132,30 @@ def test_no_ffmpeg_is_told_before_anything_is_done(
 def test_a_disk_that_is_full_at_any_file(
     run: Callable[..., Report], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each renaming fails once in turn: one line, no temporary file, and what is there is not called finished.
-
-    The next run moves it aside. Thirty plots would take half a minute to draw.
+    """Each opening and each renaming fails once in turn: one line, no temporary file, and what is there is not called
+    finished. The next run, of every fourth, moves it aside. Forty plots would take most of a minute to draw.
     """
     monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"plots"))
-    replace, failures = os.replace, 0
+    failures = 0
     for number in range(100):
-        folder, calls = tmp_path / str(number), count()
-
-        def failing(source: Path, target: Path, *, number: int = number, calls: Iterator[int] = calls) -> None:
-            if next(calls) == number:
-                raise OSError(errno.ENOSPC, "No space left on device")
-            replace(source, target)
-
-        monkeypatch.setattr(os, "replace", failing)
-        try:
-            run(folder)
+        folder = tmp_path / str(number)
+        with monkeypatch.context() as patch:
+            failed = fail_once(patch, number, errno.ENOSPC)
+            try:
+                run(folder)
+            except UserError as error:
+                assert "cannot be written (No space left on device)" in str(error)
+                failures += 1
+        if not failed:
             break
-        except UserError as error:
-            assert "cannot be written (No space left on device)" in str(error)
-            failures += 1
-        monkeypatch.setattr(os, "replace", replace)
         names = os.listdir(folder)
         assert not [name for name in names if name.startswith(".egs-")]
         assert MANIFEST not in names or not finished(folder)
-        run(folder, overwrite=True)
-        assert finished(folder) and set(FILES) <= set(os.listdir(folder))
-    # Seven files, the manifest before each of them and at the end.
-    assert failures == 15
+        if number % 4 == 0:
+            run(folder, overwrite=True)
+            assert finished(folder) and set(FILES) <= set(os.listdir(folder))
+    # Seven files, the manifest before each of them and at the end, each opened and renamed.
+    assert failures == number == 30
 
 
 def test_a_verdict_names_what_is_beyond(run: Callable[..., Report], tmp_path: Path) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from functools import partial
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +17,7 @@ from egs_warp.errors import UserError
 from egs_warp.io import read_cameras
 from egs_warp.io.cameras import read_points
 from egs_warp.io.run_folder import MANIFEST
+from tests.support.reconstruction import COLMAP_BIN, model, photos_of_noise, reconstruct_by
 
 
 def fails(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -53,25 +54,11 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path: Path, capsys: pytest
     )
 
 
-def model() -> SimpleNamespace:
-    """Stands for COLMAP's reconstruction."""
-    return SimpleNamespace(
-        images={},
-        write_binary=lambda folder: (Path(folder) / "cameras.bin").write_bytes(b"model"),
-        num_points3D=lambda: 5,
-        compute_mean_reprojection_error=lambda: 0.5,
-    )
-
-
 def test_a_folder_belongs_to_one_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What a killed one left goes; an earlier one is refused or moved aside; what is not finished has no final name."""
-    monkeypatch.setitem(sys.modules, "pycolmap", ModuleType("pycolmap"))
-    photos, out = tmp_path / "photos", tmp_path / "out"
-    photos.mkdir()
-    for number in range(3):
-        Image.new("RGB", (64, 48), (0, 0, 90 * number)).save(photos / f"{number}.png")
+    photos, out = photos_of_noise(tmp_path / "photos"), tmp_path / "out"
     left = out / ".egs-pose-left"
     left.mkdir(parents=True)
     (left / "0.png").write_bytes(b"half")
@@ -80,18 +67,49 @@ def test_a_folder_belongs_to_one_run(
         assert not left.exists()
         raise UserError("pose: no photo could be posed")
 
-    monkeypatch.setattr("egs_warp.pipelines.pose_photos._reconstructed", fails_late)
+    reconstruct_by(monkeypatch, fails_late)
     assert "no photo could be posed" in fails(capsys, str(photos), "--out", str(out))
     assert not list(out.iterdir())
-    monkeypatch.setattr("egs_warp.pipelines.pose_photos._reconstructed", lambda *_, **__: model())
+    reconstruct_by(monkeypatch, model)
     assert main(["pose", str(photos), "--out", str(out)]) == 0
     manifest = json.loads((out / MANIFEST).read_text())
     assert manifest["finished"] and manifest["command"] == "pose"
-    assert set(manifest["files"]) == {*(f"images/{number}.png" for number in range(3)), "sparse/0/cameras.bin"}
+    assert set(manifest["files"]) == {
+        *(f"images/{number}.png" for number in range(3)),
+        *(f"sparse/0/{name}" for name in COLMAP_BIN),
+    }
     assert "it has an earlier run" in fails(capsys, str(photos), "--out", str(out))
     assert main(["pose", str(photos), "--out", str(out), "--overwrite"]) == 0
     assert sorted(path.name for path in out.iterdir()) == ["earlier-1", "images", MANIFEST, "sparse"]
     assert (out / "earlier-1" / "sparse" / "0" / "cameras.bin").is_file()
+
+
+@pytest.mark.parametrize("room", [0, 50, 100])
+def test_a_model_that_does_not_fit_on_the_disk_is_told(
+    room: int, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """COLMAP keeps silent about it."""
+    reconstruct_by(monkeypatch, partial(model, room=room))
+    out = tmp_path / "out"
+    assert main(["pose", str(photos_of_noise(tmp_path / "photos")), "--out", str(out)]) == 1
+    assert "out: COLMAP's model is not whole, most likely the disk is full; free" in capsys.readouterr().err
+    assert not list(out.iterdir())
+
+
+def test_what_colmap_cannot_do_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such as a database on a disk that is full."""
+
+    def fails(*_: object, **__: object) -> None:
+        raise RuntimeError("No registered database factory succeeded.\nmore")
+
+    reconstruct_by(monkeypatch, fails)
+    out = tmp_path / "out"
+    assert main(["pose", str(photos_of_noise(tmp_path / "photos")), "--out", str(out)]) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith("egs-warp: pose: COLMAP cannot go on (No registered database factory succeeded.); is there")
+    assert not list(out.iterdir())
 
 
 @pytest.mark.data

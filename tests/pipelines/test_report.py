@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 
 from egs_warp.locomotion.stepper import StepReport
-from egs_warp.pipelines.report import StageTime, stage_times
+from egs_warp.pipelines.report import StageTime, stage_times, versions
 
 
 def test_a_frame_without_a_stage_spends_no_time_in_it() -> None:
@@ -17,3 +17,9 @@ def test_a_frame_without_a_stage_spends_no_time_in_it() -> None:
     steps = [cast(StepReport, SimpleNamespace(milliseconds=stages)) for stages in spent]
     timing = stage_times(steps, np.array([0, 2, 3, 4]), {"render": [2.0, 4.0], "split": []})
     assert timing == {"foresee": StageTime(5.0, 8.0), "again": StageTime(3.0, 9.0), "render": StageTime(3.0, 4.0)}
+
+
+def test_a_package_without_metadata_loses_no_report() -> None:
+    """One that is missing, or copied without its ``dist-info``."""
+    told = versions(("numpy", "egs-warp-is-no-such-package"))
+    assert told["numpy"] == np.__version__ and told["egs-warp-is-no-such-package"] == "no metadata"

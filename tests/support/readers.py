@@ -53,6 +53,7 @@ from tests.support import onnx
 from tests.support.captures import ARRAYS, good_bytes, small_cloud, spz_of_streams
 from tests.support.finished_runs import arrays_as_json, draw_run, finished_run, npz_of_json
 from tests.support.meshes import block_mesh
+from tests.support.reconstruction import COLMAP_BIN
 from tests.support.slides import slide
 
 LONGEST = 2.0
@@ -305,12 +306,6 @@ _COLMAP = {
     "images.txt": b"# images\n1 1 0 0 0 0 0 2 1 a.png\n1.0 2.0 -1 3.0 4.0 1\n",
     "points3D.txt": b"1 0.5 0.5 2 255 128 0 0.3 1 0\n2 1 1 3 0 0 0 0.1 1 1\n",
 }
-_SEEN = struct.pack("<Q2dq", 1, 3.0, 4.0, 1)
-_COLMAP_BIN = {
-    "cameras.bin": struct.pack("<QiiQQ4d", 1, 1, 1, 24, 16, 30.0, 30.0, 12.0, 8.0),
-    "images.bin": struct.pack("<Qi7di", 1, 1, 1, 0, 0, 0, 0, 0, 2, 1) + b"a.png\0" + _SEEN,
-    "points3D.bin": struct.pack("<QQ3d3Bd", 1, 1, 0.5, 0.5, 2.0, 255, 128, 0, 0.3) + struct.pack("<Q2i", 1, 1, 0),
-}
 
 
 def _network() -> bytes:
@@ -448,8 +443,8 @@ READERS: tuple[Reader, ...] = (
     Reader("transforms.json", "transforms.json", lambda: _json(_TRANSFORMS), _cameras, json=True),
     *(Reader(f"colmap {name}", name, lambda name=name: _COLMAP[name], _colmap, lambda: _COLMAP) for name in _COLMAP),
     *(
-        Reader(f"colmap {name}", name, lambda name=name: _COLMAP_BIN[name], _colmap, lambda: _COLMAP_BIN)
-        for name in _COLMAP_BIN
+        Reader(f"colmap {name}", name, lambda name=name: COLMAP_BIN[name], _colmap, lambda: COLMAP_BIN)
+        for name in COLMAP_BIN
     ),
     Reader("point ply", "input.ply", _point_ply, _points),
     Reader("plane.json", "plane.json", lambda: _json(_PLANES), _planes, json=True),

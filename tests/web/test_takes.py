@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +18,7 @@ from egs_warp.motions.style import PRESETS, Style
 from egs_warp.pipelines.report import AUDIT_LIMITS
 from egs_warp.web.recording import Recording
 from egs_warp.web.takes import script_text
+from tests.support.faults import fail_once
 from tests.support.lives import Played, coarse_pawn
 
 
@@ -122,3 +125,26 @@ def test_an_empty_take_and_a_folder_that_cannot_be_written_are_told(tmp_path: Pa
     played.ask("record", on=False)
     assert played.told[-1].startswith("the take could not be written: ")
     assert not played.session.standing()["recording"]
+
+
+@pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EACCES, errno.EPIPE], ids=["full", "refused", "pipe"])
+def test_each_opening_and_renaming_of_a_take_fails_once(
+    reason: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is told, nothing half-written stays, what is there is not called finished, and the session goes on."""
+    for number in range(100):
+        folder = tmp_path / str(number)
+        played = Played(coarse_pawn(), folder)
+        played.ask("record", on=True)
+        played.step()
+        with monkeypatch.context() as patch:
+            failed = fail_once(patch, number, reason)
+            played.ask("record", on=False)
+        finished = [path for path in folder.glob("*/manifest.json") if json.loads(path.read_text())["finished"]]
+        assert not list(folder.rglob(".egs-*"))
+        if not failed:
+            break
+        assert played.told[-1].startswith("the take could not be written: ") and os.strerror(reason) in played.told[-1]
+        assert not finished and not played.session.standing()["recording"]
+        played.step()
+    assert number > 8 and len(finished) == 1 and played.told[-1].startswith("wrote ")

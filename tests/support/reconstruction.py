@@ -1,0 +1,53 @@
+"""Photos, and a stand-in for pycolmap, which finds where they were taken from."""
+
+from __future__ import annotations
+
+import struct
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+_SEEN = struct.pack("<Q2dq", 1, 3.0, 4.0, 1)
+COLMAP_BIN = {
+    "cameras.bin": struct.pack("<QiiQQ4d", 1, 1, 1, 24, 16, 30.0, 30.0, 12.0, 8.0),
+    "images.bin": struct.pack("<Qi7di", 1, 1, 1, 0, 0, 0, 0, 0, 2, 1) + b"a.png\0" + _SEEN,
+    "points3D.bin": struct.pack("<QQ3d3Bd", 1, 1, 0.5, 0.5, 2.0, 255, 128, 0, 0.3) + struct.pack("<Q2i", 1, 1, 0),
+}
+"""A binary model of COLMAP by the names of its files: one photo, ``a.png``, two points."""
+
+
+def photos_of_noise(folder: Path) -> Path:
+    """Three photos of 64 by 48 pixels, each some kilobytes."""
+    folder.mkdir()
+    random = np.random.default_rng(0)
+    for number in range(3):
+        Image.fromarray(random.integers(0, 256, (48, 64, 3), dtype=np.uint8)).save(folder / f"{number}.png")
+    return folder
+
+
+def model(*_: object, room: int | None = None, **__: object) -> SimpleNamespace:
+    """What COLMAP's reconstruction is asked for. Of each file it writes ``room`` bytes at most and keeps silent, as
+    COLMAP does on a full disk.
+    """
+
+    def write_binary(folder: str) -> None:
+        for name, data in COLMAP_BIN.items():
+            (Path(folder) / name).write_bytes(data[:room])
+
+    return SimpleNamespace(
+        images={},
+        write_binary=write_binary,
+        num_points3D=lambda: 5,
+        compute_mean_reprojection_error=lambda: 0.5,
+    )
+
+
+def reconstruct_by(patch: pytest.MonkeyPatch, reconstructed: Callable[..., object]) -> None:
+    """``pose`` asks this in place of pycolmap."""
+    patch.setitem(sys.modules, "pycolmap", ModuleType("pycolmap"))
+    patch.setattr("egs_warp.pipelines.pose_photos._reconstructed", reconstructed)
