@@ -33,9 +33,6 @@ SETTLING = 0.3
 USUAL_LANDING, USUAL_LANDING_AHEAD = 0.7, 1.0
 """Of sqrt(H / g): from touch-down until it is at rest, as a rule, and more for each body height ahead (measured on the
 pawn)."""
-RUN_ON = 0.08
-"""Of sqrt(H / g): for how long the feet go on at the body's speed when they touch down, swinging and sliding (measured
-on the pawn)."""
 LANDING = 0.35
 """Of sqrt(H / g): in which the fall of a body on legs is stopped, while it goes on over its feet (measured on the
 robot, whose feet stay where they touch down).

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from egs_warp.fem.body import BodyState
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.objectives import Objective, SpinObjective
-from egs_warp.motions.jump import Jump
-from egs_warp.motions.jump_plan import JumpPhase, JumpTarget
+from egs_warp.motions.jump import FOOTHOLD, Jump
+from egs_warp.motions.jump_plan import JumpPhase, JumpTarget, stopping_time
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.twist import Turning
 from tests.support.meshes import coarse_stool
@@ -38,16 +40,16 @@ def test_the_weight_goes_ahead_with_the_distance_and_stays_well_behind_the_toes(
     assert Jump(place, JumpTarget(distance, 0.3)).plan.lean == pytest.approx(lean)
 
 
-@pytest.mark.parametrize(("mesh", "feet"), [(coarse_stool(), 4), (None, 0)])
-def test_feet_on_legs_swing_ahead_of_a_body_in_the_air(mesh: TetMesh | None, feet: int) -> None:
-    """Each asked to go ahead and not aside; a body on one base is asked for its pose alone."""
+@pytest.mark.parametrize(("mesh", "soles"), [(coarse_stool(), 4), (None, 1)])
+def test_soles_swing_ahead_of_a_body_in_the_air(mesh: TetMesh | None, soles: int) -> None:
+    """Each foot on legs, and the base of a body that has none: asked to go ahead and not aside."""
     place = block_place(mesh)
     jump = Jump(place, JumpTarget(0.5, 0.3))
     jump.phase = JumpPhase.THRUST
     flying, speed = place.standing + [0.25, 0.0, 0.3], np.array([0.8, 0.0, 0.0])
     asked = jump.objectives(BodyState(flying, np.tile(speed, (len(flying), 1)), 0.01), None, DT)
-    swung = [one for one in asked if isinstance(one, Objective) and one.name == "foot velocity"]
-    assert jump.phase is JumpPhase.FLIGHT and len(swung) == feet
+    swung = [one for one in asked if isinstance(one, Objective) and one.name == "sole velocity"]
+    assert jump.phase is JumpPhase.FLIGHT and len(swung) == soles
     for objective in swung:
         assert objective.target[0] > 0.05 > abs(objective.target[1])
 
@@ -63,3 +65,24 @@ def test_a_landing_that_may_fail_is_balanced_in_full() -> None:
         asked = jump.objectives(BodyState(place.standing, moving, 0.01), None, DT)
         weights.append(next(objective.weight for objective in asked if isinstance(objective, SpinObjective)))
     assert weights == pytest.approx([jump.weights.landing * jump.weights.spin, jump.weights.spin])
+
+
+@pytest.mark.parametrize("toes", [0.05, 0.2])
+def test_feet_come_down_so_far_ahead_that_the_body_stops_over_them(toes: float) -> None:
+    """Where the target lies too near to stop, the capture point is ahead of the middle of the feet by no more than its
+    share of what they reach ahead, however far they reach behind."""
+    place = block_place()
+    touching = place.touching[place.touching[:, 0] < toes + 1e-9]
+    place = replace(place, touching=np.vstack([touching, [toes, 0.0, 0.0]]))
+    jump, speed = Jump(place, JumpTarget(0.0, 0.3)), 1.0
+    jump.phase = JumpPhase.THRUST
+    state = BodyState(place.standing + [0.0, 0.0, 0.3], np.tile([speed, 0.0, -1.0], (len(place.standing), 1)), 0.01)
+    jump.objectives(state, None, DT)
+    assert jump.phase is JumpPhase.FLIGHT
+    seen = jump.pose.measure(state, None)
+    down = np.array([0.1, 0.0, jump.pose.standing_height])
+    left = 0.1
+    stop = stopping_time(jump.pose.standing_height, left * 9.81 + 1.0, 9.81)
+    placed = jump._foothold(state, seen, down, left)  # pyright: ignore[reportPrivateUsage]
+    ahead = down[0] + stop * speed + jump.pose.base_offset[0] - placed[0]
+    assert ahead == pytest.approx(FOOTHOLD * toes)
