@@ -9,7 +9,7 @@ a twist within 10 degrees in at most two jumps, a standard jump within 15 %; one
 m sqrt(g H) from the side, if it ends upright and no sole was ever 0.1 body heights from where it stood; one that is
 pushed by 1 m sqrt(g H) at 0.8 of its height, if it stands at the end, having got up where that threw it over. Slip is
 that of a foot while it stands over the stride; the cost of transport the muscles' work over m g times the way. What a
-body refuses in one line counts as a failure here. A ball is judged by its place and, where it does not roll, its
+body refuses in one line counts as a failure here; getting up is counted by itself, beside the aim. A ball is judged by its place and, where it does not roll, its
 heading. Captures take part where they are found. ``--unseen`` takes five bodies that no one had used while the motions
 were made.
 """
@@ -194,7 +194,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def summary(rows: list[Row], *, whole: bool) -> dict[str, Any]:
     """The aims."""
-    rate = float(np.mean([row["success"] for row in rows]))
+    asked = [row["success"] for row in rows if row["cell"] != "get up"]
+    rate = float(np.mean(asked)) if asked else 0.0
+    risen = [row["success"] for row in rows if row["cell"] == "get up"]
     slips = [row["slip"] for row in rows if row.get("slip") is not None and row["cell"] in ("walk", "walk to", "turn")]
     costs = [row["cost_of_transport"] for row in rows if row.get("cost_of_transport") is not None]
     fell = [row for row in rows if row.get("tilt_degrees", 0.0) > 60.0]
@@ -211,7 +213,7 @@ def summary(rows: list[Row], *, whole: bool) -> dict[str, Any]:
         "pushes": (all(pushed) if pushed else None) if enough else None,
     }
     nulls = {name: why or "no such cells were run" for name, value in aims.items() if value is None}
-    return {"success_rate": rate, "aims": aims, "why_null": nulls}
+    return {"success_rate": rate, "got_up": sum(risen), "thrown_over": len(risen), "aims": aims, "why_null": nulls}
 
 
 if __name__ == "__main__":
