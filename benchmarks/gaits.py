@@ -4,14 +4,14 @@ with one setting for all.
 python benchmarks/gaits.py [--quick] [--workers 2] [--nodes 500] [--bodies NAME ...] [--cells NAME ...] [--unseen]
     [--json PATH] [--join PATH]
 
-A walk succeeds if it ends within 0.1 body heights and 10 degrees of where it was told to, within 60 sqrt(H/g), upright;
-a twist within 10 degrees in at most two jumps, a standard jump within 15 %; one that stands and is pushed by 0.1
-m sqrt(g H) from the side, if it ends upright and no sole was ever 0.1 body heights from where it stood; one that is
-pushed by 1 m sqrt(g H) at 0.8 of its height, if it stands at the end, having got up where that threw it over. Slip is
-that of a foot while it stands over the stride; the cost of transport the muscles' work over m g times the way. What a
-body refuses in one line counts as a failure here; getting up is counted by itself, beside the aim. A ball is judged by its place and, where it does not roll, its
-heading. Captures take part where they are found. ``--unseen`` takes five bodies that no one had used while the motions
-were made.
+A walk succeeds if it ends within 0.1 body heights and 10 degrees of where it was told to, within 60 sqrt(H/g),
+upright; a twist within 10 degrees in at most two jumps, a standard jump within 15 %; one that stands and is pushed by
+0.1 m sqrt(g H) from the side, if it ends upright and no sole was ever 0.1 body heights from where it stood; one that
+is pushed by 1 m sqrt(g H) at 0.8 of its height, if it stands at the end, having got up where that threw it over. Slip
+is that of a foot while it stands over the stride; the cost of transport the muscles' work over m g times the way.
+What a body refuses in one line counts as a failure here; getting up is counted by itself, beside the aim. A ball is
+judged by its place and, where it does not roll, its heading. Captures take part where they are found. ``--unseen``
+takes five bodies that no one had used while the motions were made.
 """
 
 from __future__ import annotations
