@@ -34,6 +34,8 @@ _ROUNDS = 4
 """What is far from the hole may be stained, too, until the stain is part of the hole."""
 _FEW = 20
 """Texels: the rest of a stain that is not worth another round."""
+_REACH = 60.0
+"""Texels, half of the hole's side: no stain is followed further from the hole."""
 _MOST = 2.0
 """Of the hole's area: what is larger is another part of the floor, not a stain on it."""
 
@@ -42,11 +44,14 @@ def stain_around(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.
     """(rows, columns) bool: the part of the ``known`` (rows, columns) floor that hangs together with the ``hole``
     (rows, columns) and is darker there, in any of its ``colour``'s channels (rows, columns, 3), than the floor further
     out lets expect. The half of the floor that is further from the hole tells what to expect, and none of it is
-    stained; nothing is where more than twice the hole would be.
+    stained; nothing is what reaches further than half of the hole's side, or where more than twice the hole would be.
     """
-    stain = np.zeros_like(hole)
+    stain, away = np.zeros_like(hole), distance_to(hole)
     for _ in range(_ROUNDS):
-        more = _next_to(hole | stain, known, colour)
+        more = _next_to(hole | stain, known, colour) & ~stain
+        # What goes on beyond that is a seam between planks, or another floor.
+        parts, _ = connected_parts(more | stain)
+        more &= ~np.isin(parts, np.unique(parts[(more | stain) & (away > _REACH)]))
         stain |= more
         if stain.sum() > _MOST * hole.sum():
             return np.zeros_like(hole)

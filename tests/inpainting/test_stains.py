@@ -52,6 +52,17 @@ def test_the_darkest_squares_of_a_checked_cloth_are_no_stain():
     assert not stain_around(HOLE, ~HOLE, cloth).any()
 
 
+def test_a_seam_that_goes_on_is_no_stain():
+    """Between planks, from the hole outwards."""
+    wide = np.indices((360, 360))
+    hole = np.hypot(*(wide - 180)) < 50
+    seam = (np.abs(wide[1] - 180) < 8) & (np.abs(wide[0] - 180) < 140)
+    planks = (
+        np.where(seam[..., None], 0.3, 1.0) * (0.5 + 0.1 * np.sin(wide[0]) * np.sin(wide[1]))[..., None] * np.ones(3)
+    )
+    assert not stain_around(hole, ~hole, planks).any()
+
+
 def test_a_dark_place_apart_from_the_hole_stays():
     apart = np.hypot(ROWS - SIDE / 2, COLUMNS - SIDE / 2 - 55) < 10
     assert not stain_around(HOLE, ~HOLE, np.where(apart[..., None], 0.4, 1.0) * weave()).any()
