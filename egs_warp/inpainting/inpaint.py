@@ -23,6 +23,7 @@ from egs_warp.inpainting.inpainters import Inpainter
 from egs_warp.inpainting.new_floor import flat_gaussians, rim_heights, with_gloss
 from egs_warp.inpainting.patch_synthesis import PatchSynthesis
 from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, matte, rectify
+from egs_warp.inpainting.stains import stain_around
 from egs_warp.segmentation.plane_search import near_plane
 
 _MARGIN = 0.01
@@ -132,6 +133,9 @@ def inpaint(
     _check(grown, known)
     # The gaps that joined the hole hold some haze, too.
     junk = _in_hole(background, window, grown, hole.bounds()[1])
+    grown, known, stained = _without_stain(grown, known, before)
+    # A stain is on the floor: what is deep under it is a table's side.
+    junk |= _in_hole(background, window, grown, hole.bounds()[1], depth=_THICKNESS)
     kept = background.subset(~junk)
     clock.lap("rectify")
     painted = inpainter.fill(np.where(known[..., None], before.colour, 0.0), grown, known)
@@ -157,6 +161,7 @@ def inpaint(
     notes = (
         f"{int(junk.sum())} Gaussians in the hole were replaced by {new.count} on the plane",
         f"the hole is {grown.sum() * window.texel**2:.3g} square scene units, {window.texel:.3g} a texel",
+        *((f"{100 * stained:.0f} % of it was floor that the object's shadow or foot had stained",) if stained else ()),
     )
     is_new = np.arange(cloud.count) >= kept.count
     return InpaintResult(cloud, is_new, int(junk.sum()), window, grown, before, painted, clock.seconds, notes)
@@ -181,12 +186,14 @@ def _look(background: GaussianCloud, hole: Hole, margin: float) -> tuple[PlaneWi
     return window, mask, int(np.clip(round(_SHARPNESS * width / window.texel), 1, _MOST_SPACING))
 
 
-def _in_hole(background: GaussianCloud, window: PlaneWindow, mask: np.ndarray, side: float) -> np.ndarray:
-    """(n,) bool: Gaussians of the floor or of haze over the hole, not what hangs higher; and those under it, as deep as
-    it is wide, which show beyond a thin floor's edge."""
+def _in_hole(
+    background: GaussianCloud, window: PlaneWindow, mask: np.ndarray, side: float, *, depth: float = 1.0
+) -> np.ndarray:
+    """(n,) bool: Gaussians of the floor or of haze over the hole, not what hangs higher; and those under it, to a
+    ``depth`` of its ``side`` (scene units), which show beyond a thin floor's edge."""
     means = background.means.numpy()
     heights = window.plane.heights(means)
-    return window.sample(mask, means) & (heights > -side) & (heights < _HAZE * side)
+    return window.sample(mask, means) & (heights > -depth * side) & (heights < _HAZE * side)
 
 
 def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -205,6 +212,21 @@ def _closed(mask: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray
     shreds = (sizes < _SHRED * hole.sum()) & (np.arange(count + 1) > 0)
     hole |= shreds[parts]
     return hole, solid & ~hole
+
+
+def _without_stain(hole: np.ndarray, known: np.ndarray, before: RectifiedImage) -> tuple[np.ndarray, np.ndarray, float]:
+    """The hole with the stains around it, where enough of the floor is left to fill it from; where the floor is known;
+    both (rows, columns) bool; and the share of the hole that was stained."""
+    stain = stain_around(hole, known, before.colour)
+    if not stain.any():
+        return hole, known, 0.0
+    whole, left = _closed(hole | stain, before.alpha)
+    try:
+        _check(whole, left)
+    except UserError:
+        # A stain is better than no floor.
+        return hole, known, 0.0
+    return whole, left, float((whole & ~hole).sum() / whole.sum())
 
 
 def _void(missing: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.body_frame import upright_frame
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
+from egs_warp.geometry.rows import distinct_rows
 from egs_warp.meshing.body_gaussians import canonical_order, centred
 
 _COLUMNS = 64
@@ -19,6 +20,8 @@ _SEARCHED_SHARE = 0.15
 """The support is looked for in this share of the height, from the bottom."""
 _BANDWIDTH = 0.01
 """Of the height: undersides this close are one support."""
+_ENOUGH = 300_000
+"""Gaussians that tell which way is up: of more, only so many, spread evenly, are looked at."""
 _MAX_MASS_BELOW = 0.015
 """Share of the opacity mass that may lie below the plane: half of what contact can leave out."""
 
@@ -66,15 +69,23 @@ def find_base_plane(cloud: GaussianCloud, up: np.ndarray) -> Plane:
     """
     normal = np.asarray(up, dtype=np.float64)
     normal = normal / np.linalg.norm(normal)
-    near, anchor = centred(cloud)
+    near, anchor = _ordered(cloud)
     underside = _underside(near, normal)
     level = min(_support_level(underside), _mass_quantile(underside.heights, underside.opacities, _MAX_MASS_BELOW))
     return Plane(normal, -level).moved(anchor)
 
 
+def _ordered(cloud: GaussianCloud) -> tuple[GaussianCloud, np.ndarray]:
+    """The Gaussians about the origin, in an order in which that of a file has no say; and (3,) what they were moved
+    by.
+    """
+    near, anchor = centred(cloud)
+    return near.subset(canonical_order(near)), anchor
+
+
 def _underside(cloud: GaussianCloud, normal: np.ndarray) -> _Underside:
-    order = canonical_order(cloud)
-    means, opacities = cloud.means.numpy()[order].astype(np.float64), cloud.opacities()[order]
+    """Of a cloud in canonical order."""
+    means, opacities = cloud.means.numpy().astype(np.float64), cloud.opacities()
     heights = means @ normal
     low, high = (_mass_quantile(heights, opacities, share) for share in (0.002, 0.998))
     if not high > low:
@@ -89,9 +100,9 @@ def _underside(cloud: GaussianCloud, normal: np.ndarray) -> _Underside:
     visible = opacities >= min(0.3, 0.5 * _mass_quantile(opacities, opacities, 0.5))
     column = np.floor((across[visible] - box[:, 0]) / width).astype(np.int64)
     near = np.all((column >= -2) & (column <= _COLUMNS + 2), axis=1)
-    columns, of = np.unique(column[near], axis=0, return_inverse=True)
+    columns, of = distinct_rows(column[near])
     bottoms = np.full(len(columns), np.inf)
-    np.minimum.at(bottoms, of.ravel(), heights[visible][near])
+    np.minimum.at(bottoms, of, heights[visible][near])
     held = np.all((across >= box[:, 0]) & (across <= box[:, 1]), axis=1)
     weights = np.where(held, opacities, 0.0)
     centre = (weights @ across / max(float(weights.sum()), 1e-30) - box[:, 0]) / width - 0.5
@@ -137,7 +148,8 @@ def guess_up(cloud: GaussianCloud, capture_format_up: np.ndarray | None = None) 
     if capture_format_up is not None:
         return np.asarray(capture_format_up, dtype=np.float64), "the file format defines it"
     scores = []
-    near, _ = centred(cloud)
+    near, _ = _ordered(cloud)
+    near = near.subset(np.arange(0, near.count, -(-near.count // _ENOUGH)))
     for axis in range(3):
         for sign in (1.0, -1.0):
             up = np.zeros(3)

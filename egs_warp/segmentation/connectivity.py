@@ -18,6 +18,8 @@ _ARM = 1.5
 """Standard deviations: how far a Gaussian reaches to touch another, four cells at most."""
 _FOURTH = 4
 """Neighbour whose distance tells how sparse a capture is."""
+_ENOUGH = 200_000
+"""Gaussians that tell it: of more, only so many, spread evenly, are asked."""
 
 
 def connected_parts(
@@ -31,7 +33,8 @@ def connected_parts(
     points = cloud.means.numpy()[chosen].astype(np.float64)
     if len(points) > _FOURTH:
         # Not the nearest: training that splits in place leaves many at one point.
-        cell = max(cell, 2.0 * float(np.median(KDTree(points).query(points, k=_FOURTH + 1)[0][:, _FOURTH])))
+        few = points[:: -(-len(points) // _ENOUGH)]
+        cell = max(cell, 2.0 * float(np.median(KDTree(points).query(few, k=_FOURTH + 1)[0][:, _FOURTH])))
     lengths = np.minimum(_ARM * np.exp(cloud.log_scales.numpy()[chosen].astype(np.float64)), 4.0 * cell)
     turns = Rotation.from_quat(cloud.rotations.numpy()[chosen][:, [1, 2, 3, 0]]).as_matrix()
     arms = (turns * lengths[:, None, :]).transpose(0, 2, 1)

@@ -10,9 +10,14 @@ from egs_warp.geometry.rows import distinct_rows
 
 @pytest.mark.parametrize("count", [0, 1, 500])
 @pytest.mark.parametrize("width", [2, 3])
-def test_distinct_rows_are_those_of_numpy(count: int, width: int) -> None:
-    """In the same order, with the same numbers; far and negative ones, too."""
-    rows = np.random.default_rng(count).integers(-4, 4, (count, width)) * [10**18, *[1] * (width - 1)]
+@pytest.mark.parametrize("unit", [1, 2**28, 10**18])
+@pytest.mark.parametrize("whole", [np.int32, np.int64])
+def test_distinct_rows_are_those_of_numpy(count: int, width: int, unit: int, whole: type) -> None:
+    """In the same order, with the same numbers; negative ones, and too far apart for one number a row, too."""
+    if unit > np.iinfo(whole).max:
+        pytest.skip("no such numbers")
+    rows = np.random.default_rng(count).integers(-4, 4, (count, width)) * [unit, *[1] * (width - 1)]
+    rows = rows.astype(whole)
     distinct, number = distinct_rows(rows)
     wanted, which = np.unique(rows, axis=0, return_inverse=True)
     assert np.array_equal(distinct, wanted) and np.array_equal(number, which.ravel())

@@ -227,3 +227,17 @@ def test_what_shows_nothing_low_is_not_supported() -> None:
     opacities = np.repeat([0.1, 0.9], 8000)
     shape = _support_shape(opaque(np.concatenate([haze, block]), opacities), np.array([0.0, 0.0, 1.0]))
     assert (shape.polygon, shape.level, shape.depth) == (0.0, 0.0, 0.0)
+
+
+def test_up_of_a_huge_capture_is_told_by_few_of_its_gaussians(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An even choice of a table says what all of it says, whatever the order of the file."""
+    random = np.random.default_rng(0)
+    top = random.uniform([-1.0, -1.0, 1.0], [1.0, 1.0, 1.05], (6000, 3))
+    leg = random.uniform([-0.1, -0.1, 0.0], [0.1, 0.1, 1.0], (3000, 3))
+    foot = random.uniform([-0.6, -0.6, 0.0], [0.6, 0.6, 0.02], (3000, 3))
+    table = opaque(np.concatenate([top, leg, foot])[:, [2, 0, 1]])
+    whole = guess_up(table)[0]
+    monkeypatch.setattr("egs_warp.segmentation.base_plane._ENOUGH", 4000)
+    up, reason = guess_up(table)
+    np.testing.assert_array_equal(up, whole)
+    assert reason == guess_up(table.subset(random.permutation(table.count)))[1]
