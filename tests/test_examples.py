@@ -29,7 +29,7 @@ def example(name: str) -> ModuleType:
 @pytest.mark.parametrize(
     ("name", "motion", "asked"),
     [
-        ("twist", "twist", {"heading_degrees": 180.0, "distance": 0.0, "height": 0.3}),
+        ("twist", "twist", {"heading_degrees": 180.0, "distance": 0.0, "height": 0.2}),
         ("hop", "hop", {"distance": 0.7, "height": 0.3, "square": 1.0}),
         ("walk", "walk", {"distance": 0.4, "step_length": 0.1, "speed": 1.0}),
         ("waddle", "walk", {"distance": 0.6, "step_length": 0.1, "speed": 1.0}),
