@@ -2,7 +2,7 @@
 with one setting for all.
 
 python benchmarks/gaits.py [--quick] [--workers 2] [--nodes 500] [--bodies NAME ...] [--cells NAME ...] [--unseen]
-    [--json PATH] [--join PATH]
+    [--captures FOLDER] [--json PATH] [--join PATH]
 
 A walk succeeds if it ends within 0.1 body heights and 10 degrees of where it was told to, within 60 sqrt(H/g),
 upright; a twist within 10 degrees in at most two jumps, a standard jump within 15 %; one that stands and is pushed by
@@ -11,7 +11,8 @@ is pushed by 1 m sqrt(g H) at 0.8 of its height, if it stands at the end, having
 is that of a foot while it stands over the stride; the cost of transport the muscles' work over m g times the way.
 What a body refuses in one line counts as a failure here; getting up is counted by itself, beside the aim. A ball is
 judged by its place and, where it does not roll, its heading. Captures take part where they are found. ``--unseen``
-takes five bodies that no one had used while the motions were made.
+takes five bodies that no one had used while the motions were made; ``--captures`` those of a folder, as
+``trained_bodies.py`` writes them.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ import warp as wp
 
 from bodies import NAMES, Body, body
 from egs_warp.errors import ArgumentError, UserError
+from egs_warp.io import read_capture
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.ledger import ledger
 from egs_warp.locomotion.trajectory import measure
@@ -35,6 +37,7 @@ from egs_warp.motions.push import read_pushes
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import Creature, make_creature
 from egs_warp.pipelines.performance import Performance, simulate
+from egs_warp.segmentation.base_plane import find_base_plane
 from harness import Row, Table, flags, record, report, rows_of, timed, workers_flag
 from modelled import MODELLED, UNSEEN, modelled
 from sweep import bounds_broken, judge
@@ -62,16 +65,16 @@ def names() -> list[str]:
     return ["pawn", "figurine", "stool", *(name for name in CAPTURED if name in NAMES), *MODELLED]
 
 
-def run(name: str, cell: str, text: str, nodes: int) -> Row:
-    """Simulate one cell and judge it."""
+def run(name: str, cell: str, text: str, nodes: int, captures: Path | None) -> Row:
+    """Simulate one cell and judge it; the body is one of the folder ``captures``, if that is given."""
     wp.config.log_level = wp.LOG_WARNING
-    judged, milliseconds = timed(_run, name, cell, text, nodes)
+    judged, milliseconds = timed(_run, name, cell, text, nodes, captures)
     return {"body": name, "cell": cell, "told": text, **judged, "seconds": 1e-3 * milliseconds}
 
 
-def _run(name: str, cell: str, text: str, nodes: int) -> Row:
+def _run(name: str, cell: str, text: str, nodes: int, captures: Path | None) -> Row:
     try:
-        one = modelled(name) if name in MODELLED or name in UNSEEN else body(name)
+        one = _body(name, captures)
         creature = creature_of(one, nodes)
         unit = float(np.sqrt(creature.body.height / np.linalg.norm(creature.body.gravity)))
         performance = simulate(
@@ -124,6 +127,13 @@ def _run(name: str, cell: str, text: str, nodes: int) -> Row:
     }
 
 
+def _body(name: str, captures: Path | None) -> Body:
+    if captures is not None:
+        cloud = read_capture(captures / f"{name}.ply", device="cpu").cloud
+        return Body(name, cloud, find_base_plane(cloud, np.array([0.0, 0.0, 1.0])), str(captures))
+    return modelled(name) if name in MODELLED or name in UNSEEN else body(name)
+
+
 def creature_of(one: Body, nodes: int) -> Creature:
     """With a finer cage where so coarse a one falls apart."""
     try:
@@ -172,17 +182,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--nodes", type=int, default=500, help="of the cages, about")
     parser.add_argument("--bodies", nargs="*", help="only these")
     parser.add_argument("--unseen", action="store_true", help="the five bodies that were made last, and only these")
+    parser.add_argument("--captures", type=Path, metavar="FOLDER", help="NAME.ply in it, z up, and only these")
     parser.add_argument("--cells", nargs="*", help=f"only these of {', '.join(CELLS)}")
     parser.add_argument("--join", type=Path, help="JSON of an earlier run of the same code: its rows are not run again")
     options = parser.parse_args(arguments)
     rows: list[Row] = json.loads(options.join.read_text())["rows"] if options.join else []
     told = QUICK if options.quick else CELLS
     usual = ["pawn", "stool", "biped"] if options.quick else names()
-    chosen = options.bodies or (list(UNSEEN) if options.unseen else usual)
+    given = sorted(path.stem for path in options.captures.glob("*.ply")) if options.captures else []
+    chosen = options.bodies or given or (list(UNSEEN) if options.unseen else usual)
     cells = [(name, cell, text) for cell, text in told.items() for name in chosen if cell in (options.cells or told)]
     known = {(row["body"], row["cell"], row["told"]) for row in rows}
     table = Table(body="<10", cell="<8", seconds=".0f", time=".0f", slip=".1%", cost=".1f", outcome="<7")
-    for row in rows_of(run, [(*cell, options.nodes) for cell in cells if cell not in known], options.workers):
+    for row in rows_of(
+        run, [(*cell, options.nodes, options.captures) for cell in cells if cell not in known], options.workers
+    ):
         rows.append(row)
         figures = [row.get(key) for key in ("time", "slip", "cost_of_transport")]
         table.row(row["body"], row["cell"], row["seconds"], *figures, row["reason"] or "success")

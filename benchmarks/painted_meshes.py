@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -187,10 +187,27 @@ def table() -> PaintedMesh:
     """A generated table: a slab on four legs."""
     slab = ((-0.45, -0.3, 0.93), (0.45, 0.3, 1.0))
     legs = [((x - 0.03, y - 0.03, 0.0), (x + 0.03, y + 0.03, 0.95)) for x in (-0.4, 0.4) for y in (-0.25, 0.25)]
-    parts = [_box(*corners) for corners in (slab, *legs)]
-    faces = np.concatenate([part + 8 * number for number, (_, part) in enumerate(parts)])
-    vertices, faces = subdivided(np.concatenate([corners for corners, _ in parts]), faces)
+    vertices, faces = subdivided(*_boxes([slab, *legs]))
     return PaintedMesh("table", vertices, faces, checkers(0.07, ((0.5, 0.3, 0.15), (0.8, 0.6, 0.4))))
+
+
+def slender_chair() -> PaintedMesh:
+    """A generated chair on four legs a twenty-fifth of its height thick, its back to -x."""
+    seat, back = ((-0.22, -0.22, 0.42), (0.22, 0.22, 0.48)), ((-0.22, -0.22, 0.7), (-0.17, 0.22, 1.0))
+    legs = [((x - 0.02, y - 0.02, 0.0), (x + 0.02, y + 0.02, 0.45)) for x in (-0.19, 0.19) for y in (-0.19, 0.19)]
+    posts = [((-0.215, y - 0.02, 0.45), (-0.175, y + 0.02, 0.8)) for y in (-0.19, 0.19)]
+    paint = checkers(0.07, ((0.2, 0.45, 0.4), (0.85, 0.75, 0.55)))
+    return PaintedMesh("slender chair", *subdivided(*_boxes([seat, back, *legs, *posts])), paint)
+
+
+_Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
+
+
+def _boxes(corners: Sequence[_Corners]) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes between opposite corners, each whole."""
+    parts = [_box(low, high) for low, high in corners]
+    faces = np.concatenate([part + 8 * number for number, (_, part) in enumerate(parts)])
+    return np.concatenate([vertices for vertices, _ in parts]), faces
 
 
 def _box(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
