@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/trained"), help="folder of NAME.ply (%(default)s)")
     options = parser.parse_args(arguments)
     names = options.names or (["slender chair"] if options.quick else list(MESHES))
-    size, views, gaussians, iterations = (96, 12, 1500, 200) if options.quick else (256, 40, 8000, 2000)
+    size, views, gaussians, iterations = (96, 12, 1500, 200) if options.quick else (160, 24, 5000, 1000)
     options.out.mkdir(parents=True, exist_ok=True)
     table, rows = Table(capture="<14", gaussians=".0f", seconds=".0f"), []
     for name in names:

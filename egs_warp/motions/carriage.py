@@ -46,6 +46,8 @@ _PEAK = 5.77
 """Largest second derivative of the way from 0 to 1 that a foot is carried in a time of 1."""
 LEGS = 0.2
 """Body heights: on shorter legs a body goes as on one base."""
+PHASES = 4
+"""Feet from which on the others stand while one swings."""
 _SOLE = 0.02
 """Body heights: nodes at most this high are the sole of a base."""
 _FURTHEST_LEAN = 0.5
@@ -174,10 +176,20 @@ def carried_on(place: Place) -> tuple[tuple[Foot, ...], type[OnLegs] | type[OnBa
     feet, standing, height = place.feet(), place.ground.local(place.standing), place.body.height
     heights = standing[:, 2] - standing[:, 2].min()
     base = place.base()
-    if base is Base.FEET and min(foot.length for foot in feet) >= LEGS * height:
+
+    def on_leg(foot: Foot) -> bool:
+        # On few feet a swing is a fall that the next footprint catches: a stump wider than long does not reach there.
+        return foot.length >= max(LEGS * height, _width(standing[foot.sole]) if len(feet) < PHASES else 0.0)
+
+    if base is Base.FEET and all(on_leg(foot) for foot in feet):
         return feet, OnLegs
     if base is Base.FEET and len(feet) == 2:
         return feet, OnBase
     if base in (Base.LONG, Base.ROUND):
         return (), OnBase
     return halves(standing[:, :2], heights, np.flatnonzero(heights < _SOLE * height), height), OnBase
+
+
+def _width(sole: np.ndarray) -> float:
+    """Metres: side of the square that is as large as the box around a ``sole`` (k, 3)."""
+    return float(np.sqrt(np.ptp(sole[:, :2], axis=0).prod()))

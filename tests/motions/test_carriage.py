@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.motions.carriage import COUNTER, PIVOT, REACH, Carriage, OnBase, OnLegs, carried_on
 from egs_warp.motions.feet import Foot
 from egs_warp.motions.sequence import Place
-from tests.support.meshes import coarse_stool, figure
+from tests.support.meshes import carved, coarse_stool, figure
 from tests.support.places import block_place
 
 
@@ -87,3 +88,20 @@ def test_what_lies_or_rolls_has_no_feet_to_walk_on() -> None:
     mesh = replace(place.body.mesh, nodes=lying.standing)
     bar = block_place(mesh)
     assert carried_on(bar)[0] == ()
+
+
+def on_blocks(count: int, tall: float) -> TetMesh:
+    """A slab on ``count`` square blocks, 0.4 wide and ``tall`` high, two of them side by side in front."""
+    places = [(0.4, -0.4), (0.4, 0.4), *([(-0.4, 0.0)] if count == 3 else [(-0.4, -0.4), (-0.4, 0.4)])]
+
+    def keep(c: np.ndarray) -> np.ndarray:
+        under = [(np.abs(c[:, 0] - x) < 0.2) & (np.abs(c[:, 1] - y) < 0.2) for x, y in places]
+        return (c[:, 2] > tall) | np.any(under, axis=0)
+
+    return carved((1.2, 1.2, tall + 0.4), 0.1, keep)
+
+
+@pytest.mark.parametrize(("count", "tall", "swings"), [(3, 0.3, False), (3, 0.6, True), (4, 0.3, True)])
+def test_on_few_feet_a_stump_is_no_leg(count: int, tall: float, swings: bool) -> None:
+    """Wider than it is long it does not reach where a fall is caught; on four or more feet the others stand."""
+    assert (carried_on(block_place(on_blocks(count, tall)))[1] is OnLegs) is swings
