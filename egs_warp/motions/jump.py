@@ -277,16 +277,18 @@ class Jump:
         self, state: BodyState, landing: np.ndarray, standing: np.ndarray, elapsed: float, left: float, dt: float
     ) -> np.ndarray:
         """(3,) rad/s to ask for ``left`` seconds before take-off: from what keeps the body in the pose ``standing``
-        (3, 3) to what brings it to that of the ``landing`` (3, 3). The spin about up grows as the speed does, since
+        (3, 3) to what brings it to that of the ``landing`` (3, 3). The spin of a turn grows as the speed does, since
         friction does with the load."""
         up, inertia = self.ground.axes[2], self.body.inertia(state.positions)
         upright = self.pose.turn_towards(state, landing)
         wanted = self.facing.thrust_momentum(self.pose, state, upright, left=left, flight_time=self.plan.flight_time)
         share = min(elapsed / self.plan.thrust_time, 1.0)
         momentum = share * wanted + (1.0 - share) * (inertia @ self._upright(state, standing))
-        now = up @ self.body.angular_momentum(state.positions, state.velocities)
-        about_up = now + dt / max(THRUST_LEAD * left, dt) * (up @ wanted - now)
-        return np.linalg.solve(inertia, momentum + (about_up - up @ momentum) * up)
+        if self.facing.turn:
+            now = up @ self.body.angular_momentum(state.positions, state.velocities)
+            about_up = now + dt / max(THRUST_LEAD * left, dt) * (up @ wanted - now)
+            momentum += (about_up - up @ momentum) * up
+        return np.linalg.solve(inertia, momentum)
 
     def _fly(self, state: BodyState, seen: Measurement, dt: float) -> list[AnyObjective]:
         touch_down, left = self._touch_down(seen, dt)
