@@ -286,16 +286,18 @@ BESIDE_THE_PAPER: list[Mutation] = [
         ),
         (
             *("twist: the spin of the standing body, not of the crouched one", "motions/twist.py"),
-            *(
-                "yaw = yaw * self._standing_inertia / float(up @ self.body.inertia(state.positions) @ up)",
-                "yaw = 1.0 * yaw",
-            ),
+            *("return inertia @ spin_that_turns(", "return self.body.inertia(state.positions) @ spin_that_turns("),
             "motions/test_twist.py::test_a_twist_asks_friction_for_the_spin_that_is_left",
         ),
         (
             *("twist: the time of flight", "motions/twist.py"),
-            *("(AIRBORNE_SHARE * flight_time)", "(2.0 * AIRBORNE_SHARE * flight_time)"),
+            *("airborne = AIRBORNE_SHARE * flight_time", "airborne = 2.0 * AIRBORNE_SHARE * flight_time"),
             "motions/test_twist.py::test_a_twist_asks_friction_for_the_spin_that_is_left",
+        ),
+        (
+            *("twist: a free body keeps its momentum, not its spin", "motions/free_turn.py"),
+            *("axes @ np.linalg.solve(inertia, axes.T @ momentum)", "np.linalg.solve(inertia, momentum)"),
+            "motions/test_free_turn.py::test_the_axis_of_a_symmetric_top_goes_round_its_angular_momentum",
         ),
         (
             *("twist: arms as the square root of the inertia", "motions/twist.py"),
