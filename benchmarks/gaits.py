@@ -190,13 +190,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     told = QUICK if options.quick else CELLS
     usual = ["pawn", "stool", "biped"] if options.quick else names()
     given = sorted(path.stem for path in options.captures.glob("*.ply")) if options.captures else []
+    if options.captures and not given:
+        parser.error(f"--captures {options.captures}: no NAME.ply there; trained_bodies.py writes some")
     chosen = options.bodies or given or (list(UNSEEN) if options.unseen else usual)
     cells = [(name, cell, text) for cell, text in told.items() for name in chosen if cell in (options.cells or told)]
     known = {(row["body"], row["cell"], row["told"]) for row in rows}
     table = Table(body="<10", cell="<8", seconds=".0f", time=".0f", slip=".1%", cost=".1f", outcome="<7")
-    for row in rows_of(
-        run, [(*cell, options.nodes, options.captures) for cell in cells if cell not in known], options.workers
-    ):
+    new = [(*cell, options.nodes, options.captures) for cell in cells if cell not in known]
+    for row in rows_of(run, new, options.workers):
         rows.append(row)
         figures = [row.get(key) for key in ("time", "slip", "cost_of_transport")]
         table.row(row["body"], row["cell"], row["seconds"], *figures, row["reason"] or "success")

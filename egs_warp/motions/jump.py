@@ -376,9 +376,8 @@ class Jump:
         capture_time = stopping_time(self.pose.standing_height, falling, self.gravity, self._landing_time)
         capture = touch_down[:2] + seen.velocity[:2] * capture_time + self.pose.base_offset
         low, high = self.pose.support_low, self.pose.support_high
-        goal = self._start_base
         # The capture point stays within their share of the feet, wherever these are.
-        return np.clip(goal, capture - FOOTHOLD * high, capture - FOOTHOLD * low)
+        return np.clip(self._start_base, capture - FOOTHOLD * high, capture - FOOTHOLD * low)
 
     def _write(
         self,

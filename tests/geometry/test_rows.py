@@ -10,12 +10,11 @@ from egs_warp.geometry.rows import distinct_rows
 
 @pytest.mark.parametrize("count", [0, 1, 500])
 @pytest.mark.parametrize("width", [2, 3])
-@pytest.mark.parametrize("unit", [1, 2**28, 10**18])
-@pytest.mark.parametrize("whole", [np.int32, np.int64])
+@pytest.mark.parametrize(
+    ("unit", "whole"), [(1, np.int32), (2**28, np.int32), (1, np.int64), (2**28, np.int64), (10**18, np.int64)]
+)
 def test_distinct_rows_are_those_of_numpy(count: int, width: int, unit: int, whole: type) -> None:
     """In the same order, with the same numbers; negative ones, and too far apart for one number a row, too."""
-    if unit > np.iinfo(whole).max:
-        pytest.skip("no such numbers")
     rows = np.random.default_rng(count).integers(-4, 4, (count, width)) * [unit, *[1] * (width - 1)]
     rows = rows.astype(whole)
     distinct, number = distinct_rows(rows)
