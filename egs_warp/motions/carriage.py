@@ -67,6 +67,8 @@ class Carriage(Protocol):
     """How the gait shares out its time at the usual speed."""
     com: float
     """Weight of the motion of the centre of mass: balance."""
+    swing: float
+    """Weight of the motion of a sole that swings."""
     hold: float
     """Weight of contact points that stand and would slide, each by its share of the weight."""
 
@@ -92,6 +94,7 @@ class OnLegs:
         self.catch = REACH * min(foot.length for foot in feet)
         self.tempo = ON_LEGS
         self.com = 60.0
+        self.swing = 4.0
         self.hold = 100.0
 
     def pose(self, com: np.ndarray, heading: float, feet: np.ndarray) -> np.ndarray:
@@ -125,6 +128,7 @@ class OnBase:
         self.lift = min(ROLL * self._width, LIFT * body.height)
         self.catch = 0.0
         self.com = 300.0  # where friction gives too little for both, balance goes before turning
+        self.swing = 2.0  # half of the body swings: faster, it pushes the rest back, and that falls behind its feet
         self.hold = 5.0  # what turns about a patch slides at its edges
 
     def _inertia(self, node_mass: np.ndarray) -> float:

@@ -362,7 +362,7 @@ class Walk:
         # The sole that stood is not the flat one that swings: torn straight in the first step, it would drag.
         share = control.foot_share * self.gait.eased(elapsed / self.gait.swing_time)
         velocity = (share * (now - local[sole]) + then - now) / dt
-        return part_nodes(self.body, part, velocity @ self.ground.axes, control.swing)
+        return part_nodes(self.body, part, velocity @ self.ground.axes, self._carriage.swing)
 
     def _let_go(self, index: int, elapsed: float) -> LoadObjective:
         """A foot is unloaded bit by bit before it rises."""

@@ -39,7 +39,6 @@ class WalkControl:
 
     spin: float = 60.0
     pose: float = 0.1
-    swing: float = 4.0
     unload: float = 10.0
     """Of what contact points of a foot carry that is lifted."""
     balance: float = 3.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from egs_warp.errors import UserError
 from egs_warp.fem.body import DEFAULT_SAG
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
+from egs_warp.io import read_capture
 from egs_warp.locomotion.audit import audit
 from egs_warp.locomotion.recorder import Recorder
 from egs_warp.locomotion.stepper import StepReport
@@ -21,7 +23,11 @@ from egs_warp.motions.carriage import OnLegs
 from egs_warp.motions.footfalls import Footfalls
 from egs_warp.motions.pendulum import nearest_in_hull
 from egs_warp.motions.route import Route, along, straight, turning
+from egs_warp.motions.script import motion
 from egs_warp.motions.walk import Walk
+from egs_warp.pipelines.creature import make_creature
+from egs_warp.pipelines.performance import simulate
+from egs_warp.segmentation.base_plane import find_base_plane
 from tests.support.creatures import CoarseCreature, coarse_creature
 from tests.support.meshes import UP, block_mesh, carved, coarse_stool, figure, stool
 from tests.support.places import DT, block_place
@@ -123,6 +129,18 @@ def test_a_block_waddles(route: Route) -> None:
     assert reached.heading_degrees == pytest.approx(np.degrees(place[2]), abs=3.0) and reached.tilt_degrees < 3.0
     assert done.air > 0.0 and done.fell.landings >= 2
     check_audit(done)
+
+
+@pytest.mark.slow
+@pytest.mark.data
+def test_a_base_does_not_run_ahead_of_what_is_above_it(data_dir: Path) -> None:
+    """The monkey's base, which is long, falls no more behind its feet with each pace: it comes to its place."""
+    cloud = read_capture(data_dir / "objects" / "monkey.ply").cloud
+    plane = find_base_plane(cloud, up=np.array([0.0, 1.0, 0.0]))
+    done = simulate(make_creature(cloud, plane=plane, nodes=500), motion("walk 0.4"), get_up=False)
+    reached = measure(done.trajectory)
+    assert done.fallen is None and reached.tilt_degrees < 6.0
+    assert reached.distance == pytest.approx(0.4, abs=0.04)
 
 
 def test_a_pace_that_slipping_feet_have_lost_is_made_again() -> None:
