@@ -23,9 +23,10 @@ from egs_warp.locomotion.rollout import FRAME_RATE
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.pipelines.performance import Performance
 from egs_warp.pipelines.shot import Shot, nearest_steps, resized
-from egs_warp.render.backdrop import Behind, CapturedScene, Floor, PlainColour
+from egs_warp.render.backdrop import Behind, captured_scene, grid_floor, plain_colour
 from egs_warp.render.compositing import RenderedImage
 from egs_warp.render.rasteriser import render_gaussians
+from egs_warp.render.shadow import ContactShadow, grain_of
 
 SHEET_FRAMES = 12
 SPLIT_KEY_FRAMES = 24
@@ -49,8 +50,8 @@ class Frame:
 
     image: RenderedImage
     """Over what is behind it; over black where the shot is transparent."""
-    shade: np.ndarray | None
-    """(H, W) how much the shadow hides of what will be behind it, where the shot is transparent."""
+    shade: wp.array | None
+    """(H, W) float32: how much the shadow hides of what will be behind it, where the shot is transparent."""
     milliseconds: tuple[float, float]
     """To deform and to render."""
 
@@ -59,7 +60,7 @@ class Frame:
         if self.shade is None:
             return self.image.colour_srgb8()
         alpha = self.image.alpha.numpy()
-        whole = alpha + (1.0 - alpha) * self.shade
+        whole = alpha + (1.0 - alpha) * self.shade.numpy()
         straight = self.image.colour.numpy() / np.maximum(whole, 1e-6)[..., None]
         return np.rint(255.0 * np.clip(np.dstack([straight, whole]), 0.0, 1.0)).astype(np.uint8)
 
@@ -141,15 +142,16 @@ def drawn_frames(
     from one to the next is made once. ``scene`` lies in the body's frame.
     """
     path = np.einsum("n,fni->fi", trajectory.node_mass, trajectory.positions) / trajectory.node_mass.sum()
+    grain, device = grain_of(deformer.rest), deformer.rest.device
     behind: Behind | None = None
     for index, (step, camera) in enumerate(zip(steps, cameras, strict=True)):
-        if behind is None or camera is not cameras[index - 1]:
-            behind = _behind(path, trajectory.height, camera, scene, shot, shadow=shadow)
         marks = [time.perf_counter()]
         deformed = deformer.deform(trajectory.positions[step])
         marks.append(time.perf_counter())
         cloud, height = deformed.cloud, trajectory.height
-        shade = behind.cover(cloud, height=height) if isinstance(behind, PlainColour) and shot.transparent else None
+        if behind is None or camera is not cameras[index - 1]:
+            behind = _behind(path, height, camera, scene, shot, grain=grain, shadow=shadow, device=device)
+        shade = behind.cover(cloud, height=height) if shot.transparent else None
         backdrop = behind.background(cloud, height=height) if shade is None else (0.0, 0.0, 0.0)
         image = render_gaussians(cloud, camera, background=backdrop)
         wp.synchronize_device(cloud.device)
@@ -170,15 +172,24 @@ def _over_white(image: np.ndarray) -> np.ndarray:
 
 
 def _behind(
-    path: np.ndarray, height: float, camera: Camera, scene: GaussianCloud | None, shot: Shot, *, shadow: bool
+    path: np.ndarray,
+    height: float,
+    camera: Camera,
+    scene: GaussianCloud | None,
+    shot: Shot,
+    *,
+    grain: float,
+    shadow: bool,
+    device: wp.Device,
 ) -> Behind:
     """``path`` (F+1, 3) is that of the centre of mass of a body ``height`` tall."""
     com = path.mean(axis=0)
     centre = com * [1.0, 1.0, 0.0]
     reach = 2.2 * (height + float(np.linalg.norm(np.ptp(path, axis=0))))
-    if shot.transparent or shot.colour is not None:
-        colour = (0.0, 0.0, 0.0) if shot.colour is None else shot.colour
-        return PlainColour(colour, camera, GROUND, centre=centre, reach=reach, shadow=shadow)
-    if scene is None:
-        return Floor(camera, GROUND, centre=centre, reach=reach, cell=0.25 * height, shadow=shadow)
-    return CapturedScene(scene, camera, GROUND, centre=centre, reach=reach, shadow=shadow)
+    plain = shot.transparent or shot.colour is not None
+    if scene is not None and not plain:
+        return captured_scene(scene, camera, GROUND, centre=centre, reach=reach, grain=grain, shadow=shadow)
+    ground = ContactShadow(camera, GROUND, centre=centre, reach=reach, device=device, grain=grain)
+    if plain:
+        return plain_colour(ground, shot.colour or (0.0, 0.0, 0.0), shadow=shadow)
+    return grid_floor(ground, cell=0.25 * height, shadow=shadow)

@@ -12,8 +12,8 @@ from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.video import contact_sheet
-from egs_warp.render.backdrop import ContactShadow
 from egs_warp.render.rasteriser import render_gaussians
+from egs_warp.render.shadow import ContactShadow
 
 _BACKDROP = (0.55, 0.75, 0.55)
 _SIDE = 480
@@ -45,12 +45,14 @@ def plane_picture(
         for number, plane in enumerate(planes):
             # Hues a golden section apart differ, however many.
             colour = np.array(hsv_to_rgb((0.92 + 0.618 * number) % 1.0, 0.85, 0.95))
-            seen = ContactShadow(camera, plane, centre=centre, reach=size)
-            cell = 0.1 * size
-            distance = np.abs((seen.flat / cell + 0.5) % 1.0 - 0.5) * cell
-            line = np.clip(1.6 - distance / (1.0 * seen.pixel[..., None]), 0.0, 1.0).max(axis=-1)
-            line *= np.clip(4.0 - 2.0 * np.linalg.norm(seen.flat, axis=-1) / size, 0.0, 1.0) * seen.hit
-            line *= np.where(seen.depth < 1.01 * depth, 0.9, 0.12)
+            seen, cell = ContactShadow(camera, plane, centre=centre, reach=size, device=cloud.device), 0.1 * size
+            flat, pixel, ground = (
+                values.numpy().reshape(*depth.shape, -1) for values in (seen.flat, seen.pixel, seen.depth)
+            )
+            distance = np.abs((flat / cell + 0.5) % 1.0 - 0.5) * cell
+            line = np.clip(1.6 - distance / pixel, 0.0, 1.0).max(axis=-1)
+            line *= np.clip(4.0 - 2.0 * np.linalg.norm(flat, axis=-1) / size, 0.0, 1.0) * (ground[..., 0] > 0.0)
+            line *= np.where(ground[..., 0] < 1.01 * depth, 0.9, 0.12)
             picture = picture + line[..., None] * (colour - picture)
         frames.append(_bytes(picture))
     return contact_sheet(frames, 2, ["the grid must lie on what the object stands on", "", "", ""][: len(frames)])

@@ -12,6 +12,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.kernels.render.compositing import composite_tile_kernel
 from egs_warp.kernels.render.ellipse import TILE_PIXELS
 from egs_warp.kernels.render.geometry import composite_geometry_kernel, splat_normals_kernel
+from egs_warp.kernels.render.quantise import quantise_kernel
 from egs_warp.launching import device_of, empty, empty_together, launch_rows
 from egs_warp.render.projection import ProjectedGaussians
 from egs_warp.render.tiles import TileLists, build_tile_lists, lists_fit
@@ -46,7 +47,10 @@ class RenderedImage:
 
     def colour_srgb8(self) -> np.ndarray:
         """(H, W, 3) uint8 on the host, ready for PNG or video: clipped and quantised; SH colours are sRGB already."""
-        return np.rint(np.clip(self.colour.numpy(), 0.0, 1.0) * 255.0).astype(np.uint8)
+        device, (height, width) = device_of(self.colour), self.colour.shape
+        levels = empty((width * height, 3), wp.uint8, device)
+        launch_rows(quantise_kernel, width * height, inputs=[self.colour.flatten()], outputs=[levels], device=device)
+        return levels.numpy().reshape(height, width, 3)
 
 
 def list_and_composite(

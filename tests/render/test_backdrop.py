@@ -2,66 +2,154 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from egs_warp.geometry.camera import Camera
+import cv2
+import numpy as np
+import pytest
+
+from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.render.backdrop import CapturedScene, ContactShadow
+from egs_warp.geometry.plane import Plane
+from egs_warp.render.backdrop import captured_scene, grid_floor, plain_colour
+from egs_warp.render.compositing import RenderedImage
+from egs_warp.render.shadow import ContactShadow, grain_of
 from tests.support.scenes import FLOOR, ball_on_floor
+
+SIDE = 120
+
+
+def camera() -> Camera:
+    return Camera.look_at(np.array([0.0, -4.0, 2.5]), np.zeros(3), np.eye(3)[2], width=SIDE, height=SIDE)
+
+
+def placed(source: GaussianCloud, means: np.ndarray) -> GaussianCloud:
+    fields = ("rotations", "log_scales", "opacity_logits", "sh")
+    return GaussianCloud.from_numpy(means, *(getattr(source, name).numpy() for name in fields))
+
+
+def parts() -> tuple[GaussianCloud, GaussianCloud]:
+    """A flattened ball, and the floor under it."""
+    cloud, truth = ball_on_floor()
+    ball = cloud.subset(truth)
+    return placed(ball, ball.means.numpy() * [1.0, 1.0, 0.1]), cloud.subset(~truth)
+
+
+def over_scene(scene: GaussianCloud, body: GaussianCloud, *, shadow: bool) -> np.ndarray:
+    behind = captured_scene(scene, camera(), FLOOR, centre=np.zeros(3), reach=2.0, grain=grain_of(body), shadow=shadow)
+    return behind.background(body, height=1.0).numpy()
+
+
+def on_ground(body: GaussianCloud, plane: Plane = FLOOR, centre: np.ndarray | None = None) -> ContactShadow:
+    middle = np.zeros(3) if centre is None else centre
+    return ContactShadow(camera(), plane, centre=middle, reach=2.0, device=body.device, grain=grain_of(body))
+
+
+def square(values: Any) -> np.ndarray:
+    return values.numpy().reshape(SIDE, SIDE, -1).squeeze()
 
 
 def test_the_shadow_falls_where_the_floor_is_seen() -> None:
     """Darker under the body, unchanged elsewhere and on what hides the floor; softer and paler from above."""
-    cloud, truth = ball_on_floor()
-    floor = cloud.subset(~truth)
-    camera = Camera.look_at(np.array([0.0, -4.0, 2.5]), np.zeros(3), np.eye(3)[2], width=120, height=120)
-    where = {"centre": np.zeros(3), "reach": 2.0}
-    fields = ("rotations", "log_scales", "opacity_logits", "sh")
-
-    def placed(source: GaussianCloud, means: np.ndarray) -> GaussianCloud:
-        return GaussianCloud.from_numpy(means, *(getattr(source, name).numpy() for name in fields))
-
-    ball = cloud.subset(truth)
-    body = placed(ball, ball.means.numpy() * [1.0, 1.0, 0.1])
-    bare = CapturedScene(floor, camera, FLOOR, **where, shadow=False).background(body, height=1.0)
-    dark = CapturedScene(floor, camera, FLOOR, **where).background(body, height=1.0)
-    shadow = ContactShadow(camera, FLOOR, **where)
-    away = np.linalg.norm(shadow.flat, axis=-1)
-    under, far = shadow.hit & (away < 0.2), shadow.hit & (away > 1.2)
+    body, floor = parts()
+    bare, dark = (over_scene(floor, body, shadow=shadow) for shadow in (False, True))
+    ground = on_ground(body)
+    away, hit = np.linalg.norm(square(ground.flat), axis=-1), square(ground.depth) > 0.0
+    under, far = hit & (away < 0.2), hit & (away > 1.2)
     assert dark[under].mean() < 0.75 * bare[under].mean()
     np.testing.assert_array_equal(dark[far], bare[far])
-    lifted = shadow.darkness(placed(body, body.means.numpy() + [0.0, 0.0, 0.4]), height=1.0)
-    assert 0.0 < lifted.max() < shadow.darkness(body, height=1.0).max() <= 0.5
+    behind = plain_colour(ground, (1.0, 1.0, 1.0))
+    lifted = behind.cover(placed(body, body.means.numpy() + [0.0, 0.0, 0.4]), height=1.0).numpy()
+    assert 0.0 < lifted.max() < behind.cover(body, height=1.0).numpy().max() <= 0.5
     # A wall in front of the floor takes no shadow.
     wall = placed(floor, floor.means.numpy()[:, [0, 2, 1]] + [0.0, -1.2, 1.0])
-    plain, shaded = (
-        CapturedScene(wall, camera, FLOOR, **where, shadow=one).background(body, height=1.0) for one in (False, True)
-    )
+    plain, shaded = (over_scene(wall, body, shadow=shadow) for shadow in (False, True))
     np.testing.assert_allclose(shaded, plain, atol=0.02)
 
 
 def test_the_shadow_lies_on_an_uneven_floor_without_an_edge() -> None:
     """Half of a floor that stands 3 % of the reach above the fitted plane, as sheets do, bears nearly the same shadow;
     at a terrace too high for it the shadow ends, but not from one pixel to the next."""
-    cloud, truth = ball_on_floor()
-    camera = Camera.look_at(np.array([0.0, -4.0, 2.5]), np.zeros(3), np.eye(3)[2], width=120, height=120)
-    fields = ("rotations", "log_scales", "opacity_logits", "sh")
-
-    def placed(source: GaussianCloud, means: np.ndarray) -> GaussianCloud:
-        return GaussianCloud.from_numpy(means, *(getattr(source, name).numpy() for name in fields))
-
-    flat = cloud.subset(~truth)
-    body = placed(cloud.subset(truth), cloud.subset(truth).means.numpy() * [1.0, 1.0, 0.1])
+    body, flat = parts()
     darkness = []
     for step in (0.0, 0.06, 0.4):
         floor = placed(flat, flat.means.numpy() + np.outer(flat.means.numpy()[:, 0] > 0.0, [0.0, 0.0, step]))
-        bare, dark = (
-            CapturedScene(floor, camera, FLOOR, centre=np.zeros(3), reach=2.0, shadow=one).background(body, height=1.0)
-            for one in (False, True)
-        )
+        bare, dark = (over_scene(floor, body, shadow=shadow) for shadow in (False, True))
         darkness.append(1.0 - dark.mean(axis=2) / np.maximum(bare.mean(axis=2), 1e-3))
     even, uneven, terrace = darkness
     right = np.s_[:, 62:]
     assert uneven[right].sum() > 0.8 * even[right].sum()
     assert terrace[right].sum() < 0.3 * even[right].sum()
     assert np.abs(np.diff(terrace, axis=1)).max() < 1.5 * np.abs(np.diff(even, axis=1)).max()
+
+
+def blurred(values: np.ndarray, sigma: float) -> np.ndarray:
+    """As long a kernel as reaches four standard deviations."""
+    size = 2 * int(np.ceil(4.0 * sigma)) + 1
+    return cv2.GaussianBlur(values, (size, size), sigma)
+
+
+def darkness(body: GaussianCloud, plane: Plane, centre: np.ndarray, reach: float, height: float) -> np.ndarray:
+    """The shadow once more: bins, OpenCV's blur, and each pixel's ray."""
+    means, scales = body.means.numpy(), np.sort(np.exp(body.log_scales.numpy()), axis=1)
+    texel, tangents, shade = 2.0 * reach / 192, np.stack(plane.tangents()), np.zeros((192, 192))
+    hidden = body.opacities() * 2.0 * np.pi * scales[:, 1] * scales[:, 2] / texel**2
+    flat, above = (means - centre) @ tangents.T / texel + 96.0, np.maximum(plane.heights(means), 0.0)
+    for low, high, blur in ((0.0, 0.08, 0.02), (0.08, 0.3, 0.06), (0.3, 2.0, 0.13)):
+        chosen = (above >= low * height) & (above < high * height)
+        counts, *_ = np.histogram2d(
+            flat[chosen, 1], flat[chosen, 0], bins=192, range=((0, 192), (0, 192)), weights=hidden[chosen]
+        )
+        covered = 1.0 - np.exp(-blurred(counts, max(float(np.median(scales[:, 1])) / texel, 0.6)))
+        shade = np.maximum(shade, blurred(covered, max(blur * height / texel, 0.6)) * (0.5 - 1.4 * blur))
+    rays = camera_rays(camera())
+    depth = -plane.heights(camera().centre) / (rays @ plane.normal)
+    along = (camera().centre + depth[..., None] * rays - centre) @ tangents.T
+    fade = np.clip(1.6 - 1.6 * np.linalg.norm(along, axis=-1) / reach, 0.0, 1.0) * (depth > 0.0)
+    texels = (along / texel + 96.0 - 0.5).astype(np.float32)
+    seen = cv2.remap(shade.astype(np.float32), texels[..., 0], texels[..., 1], cv2.INTER_LINEAR)
+    return seen * fade
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.3])
+def test_it_is_what_bins_blurs_and_rays_make(tilt: float, device: str) -> None:
+    """On level and tilted ground, for a body of other heights and sizes of Gaussians, seen wholly and in part."""
+    plane = Plane(np.array([np.sin(tilt), 0.0, np.cos(tilt)]), 0.1)
+    random, (ball, _) = np.random.default_rng(3), parts()
+    body = GaussianCloud.from_numpy(
+        ball.means.numpy() * [1.0, 1.0, 12.0] + [0.2, 0.1, 0.0],
+        ball.rotations.numpy(),
+        random.uniform(-5.0, -2.0, ball.log_scales.shape + (3,)),
+        random.normal(0.0, 3.0, ball.count),
+        ball.sh.numpy(),
+        device=device,
+    )
+    centre = np.array([0.1, -0.2, 0.0])
+    found = on_ground(body, plane, centre).cover(body, on_ground(body, plane, centre).fade, height=0.7)
+    expected = darkness(body, plane, centre, 2.0, 0.7)
+    assert expected.max() > 0.3
+    np.testing.assert_allclose(square(found), expected, atol=0.01)
+    assert np.abs(square(found) - expected).mean() < 1e-4
+
+
+def test_a_floor_has_lines_and_ends_in_the_sky() -> None:
+    """Lines a cell apart, nothing of it from the reach on; without a shadow it is the same under a body."""
+    body, _ = parts()
+    ground = on_ground(body)
+    picture = grid_floor(ground, cell=0.5, shadow=False).background(body, height=1.0).numpy()
+    flat, fade = square(ground.flat), square(ground.fade)
+    assert (picture[fade == 0.0] == 1.0).all() and (fade == 0.0).any()
+    near = np.abs((flat / 0.5 + 0.5) % 1.0 - 0.5).min(axis=-1) * 0.5 / square(ground.pixel)
+    full = fade == 1.0
+    assert picture[full & (near < 0.1)].mean() < 0.8 < picture[full & (near > 1.3)].mean()
+
+
+def test_levels_are_clipped_and_halves_go_to_the_even_one() -> None:
+    """As NumPy has it."""
+    import warp as wp
+
+    colour = np.linspace(-0.2, 1.2, 3 * 7 * 511, dtype=np.float32).reshape(7, 511, 3)
+    colour.reshape(-1)[:4] = np.array([0.5, 1.5, 2.5, 3.5], np.float32) / np.float32(255.0)
+    image = RenderedImage(wp.array(colour, dtype=wp.vec3), wp.zeros(1, dtype=float), wp.zeros(1, dtype=float))
+    expected = np.rint(np.clip(colour, 0.0, 1.0) * np.float32(255.0)).astype(np.uint8)
+    np.testing.assert_array_equal(image.colour_srgb8(), expected)
