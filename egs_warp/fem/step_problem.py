@@ -14,7 +14,7 @@ from egs_warp.fem.factors import Factors
 from egs_warp.geometry.frames import turning
 from egs_warp.muscles.tension import MuscleTension
 
-_NEGLIGIBLE = 1e-3
+NEGLIGIBLE = 1e-3
 """Of the largest T / L of the muscles: those below it do not count in a tangent."""
 
 
@@ -115,7 +115,7 @@ class StepProblem:
         """
         definite = factors.update(self._entries(velocities, projected=False))
         if tension is not None:
-            across, rates = tension.hessian(self.end_positions(velocities)).factors(least=_NEGLIGIBLE)
+            across, rates = tension.hessian(self.end_positions(velocities)).factors(least=NEGLIGIBLE)
             if factors.add(across, self.dt**2 * rates):
                 return Tangent(self, factors)
         if not definite:

@@ -24,10 +24,10 @@ from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleTension, muscle_columns
 
-_MOST_HALVINGS = 4
+MOST_HALVINGS = 4
 _AMISS, _LITTLE = 1.2, 0.01
 """A step whose end costs more than this factor of what its program expected, and this much more, is asked for again."""
-_LOOKS = 2
+LOOKS = 2
 """Newton steps with contact in which a step is foreseen."""
 
 
@@ -158,7 +158,7 @@ class LocomotionStepper:
         end, after, report = done
         if report.converged:
             return end, after, [report]
-        return self._in_halves(state, memory, report.activations, dt, _MOST_HALVINGS)
+        return self._in_halves(state, memory, report.activations, dt, MOST_HALVINGS)
 
     def _in_halves(
         self, state: BodyState, memory: StepMemory, activations: np.ndarray, dt: float, left: int
@@ -266,7 +266,7 @@ class LocomotionStepper:
             velocities = ahead
             tangent = problem.tangent(self._factors, velocities, None)
         response = ContactResponse.of(tangent, contacts)
-        for _ in range(_LOOKS):
+        for _ in range(LOOKS):
             free = velocities.ravel() - tangent.solve(problem.residual(velocities, tension).ravel())
             forces, _ = response.forces(free, shift, self.geometry.friction, known)
             ahead = (free + response.columns @ forces.ravel()).reshape(velocities.shape)
