@@ -12,7 +12,7 @@ import warp as wp
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.contact.points import ContactPoints
 from egs_warp.errors import ArgumentError
-from egs_warp.fem.worlds import Worlds, launch_on, tiled
+from egs_warp.fem.worlds import Worlds, launch_on, shared, tiled
 from egs_warp.kernels.contact import coulomb
 from egs_warp.kernels.contact import many as kernels
 from egs_warp.kernels.contact.gaps import point_gaps_kernel
@@ -106,11 +106,11 @@ class BatchDetector:
         tet_count, node_count = len(geometry.mesh.tets), len(geometry.mesh.nodes)
         planes = np.array([[*plane.normal, plane.offset] for plane in geometry.planes])
         self._model = [
-            (tiled(geometry.mesh.tets, count, node_count, device), wp.vec4i),
-            (tiled(geometry.tet_from_point, count, tet_count, device), wp.int32),
-            (self._reals(geometry.weights).repeat(count, 1), Vec4),
-            (self._reals(planes), Vec4),
-            (torch.as_tensor(geometry.solid_of_each_plane, device=device), wp.int32),
+            shared(tiled(geometry.mesh.tets, count, node_count, device), wp.vec4i),
+            shared(tiled(geometry.tet_from_point, count, tet_count, device), wp.int32),
+            shared(self._reals(geometry.weights).repeat(count, 1), Vec4),
+            shared(self._reals(planes), Vec4),
+            shared(torch.as_tensor(geometry.solid_of_each_plane, device=device), wp.int32),
         ]
         self._cells = torch.as_tensor(points.cell_from_point.astype(np.int64), device=device)
         self._cell_count = int(points.cell_from_point.max()) + 1
@@ -168,9 +168,11 @@ class BatchDetector:
         first.scatter_reduce_(1, cells, candidates, "amin")
         return numbers == first.gather(1, cells)
 
-    def contacts(self, chosen: torch.Tensor, gaps: torch.Tensor, faces: torch.Tensor) -> BatchContacts:
-        """At the points ``chosen`` (c, P), in ascending order; ``gaps`` and ``faces`` (c, P) at the start of the
-        step. Waits for the device."""
+    def contacts(
+        self, chosen: torch.Tensor, gaps: torch.Tensor, faces: torch.Tensor, order: torch.Tensor | None = None
+    ) -> BatchContacts:
+        """At the points ``chosen`` (c, P), in ascending order, or in that of ``order`` (c, P); ``gaps`` and ``faces``
+        (c, P) at the start of the step. Waits for the device."""
         counts = chosen.sum(dim=1)
         most = int(counts.max()) if len(counts) else 0
         places = (chosen.cumsum(dim=1) - 1).clamp(min=0)
@@ -180,6 +182,9 @@ class BatchDetector:
         points.scatter_(1, torch.where(chosen, places, most), torch.where(chosen, numbers, 0))
         points = points[:, :most]
         there = torch.arange(most, device=self.device) < counts[:, None]
+        if order is not None:
+            key = torch.where(there, order.gather(1, points), torch.inf)
+            points = points.gather(1, key.argsort(dim=1, stable=True))
         at = faces.gather(1, points)
         return BatchContacts(
             points,
@@ -195,8 +200,7 @@ class BatchDetector:
         self, contacts: BatchContacts, forces: torch.Tensor, added: BatchContacts
     ) -> tuple[BatchContacts, torch.Tensor]:
         """The ``added`` behind the ``contacts``, with ``forces`` (c, K, 3) of zero. Waits for the device."""
-        most = int((contacts.counts + added.counts).max())
-        wide = contacts.widened(max(most, contacts.most))
+        wide = contacts.widened(max(int((contacts.counts + added.counts).max()), contacts.most))
         forces = padded(forces, wide.most - contacts.most)
         world, place = added.there.nonzero(as_tuple=True)
         at = contacts.counts.long()[world] + place

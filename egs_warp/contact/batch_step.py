@@ -148,11 +148,11 @@ class BatchSolver:
             if number == ROUNDS - 1:
                 break
             with self.stages("detect"):
-                added = self._added(part, touched, done, [each[todo] for each in start_gaps])
+                added, ends = self._added(part, touched, done, [each[todo] for each in start_gaps])
             more = indices(added.any(dim=1) & done.converged)
             if len(more) == 0:
                 break
-            new = self.detector.contacts(added[more], *(each[todo[more]] for each in start_gaps))
+            new = self.detector.contacts(added[more], *(each[todo[more]] for each in start_gaps), order=ends[more])
             grown, forces = self.detector.joined(touched.of(more), done.forces[more], new)
             wider = grown.most - contacts.most
             contacts = contacts.widened(grown.most)
@@ -165,13 +165,13 @@ class BatchSolver:
 
     def _added(
         self, problem: BatchProblem, contacts: BatchContacts, done: BatchResult, start_gaps: list[torch.Tensor]
-    ) -> torch.Tensor:
-        """(c, P) bool: the points that would end too deep."""
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """(c, P) bool: the points that would end too deep; (c, P) metres, the gaps of all at the end."""
         gaps, _ = self.detector.gaps(problem.end_positions(done.velocities))
         tolerance = self.penetration_tolerance
         allowed = torch.where(gaps < -tolerance, CREEPS * tolerance, SINKS * tolerance)
         sinking = torch.where(gaps < start_gaps[0] - allowed, gaps, 0.0)
-        return self.detector.deeper(contacts, sinking, ADDED * tolerance)
+        return self.detector.deeper(contacts, sinking, ADDED * tolerance), gaps
 
     def _round(
         self, task: _Task, response: BatchResponse, velocities: torch.Tensor, forces: torch.Tensor

@@ -5,16 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sparse
 import torch
+import warp as wp
 
 from egs_warp.fem.elasticity import ElasticAssembly
-from egs_warp.fem.worlds import launch_on, tiled, tiled_bounds
+from egs_warp.fem.worlds import launch_on, shared, tiled, tiled_bounds
 from egs_warp.kernels.fem import elasticity as kernels
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import FULL, SLACK
 from egs_warp.precision import Mat33, Vec3, real
-
-import warp as wp
 
 _NEGLIGIBLE = 1e-300
 """Metres: no segment is shorter, so that one whose ends meet has a direction of 0."""
@@ -29,37 +29,42 @@ class BatchElasticity:
         self.device = torch.device(str(assembly.device))
         self.node_count, self.tet_count = len(assembly.mesh.nodes), len(assembly.mesh.tets)
         self._material, maps = assembly.material, assembly.maps
-        self._tets = (tiled(assembly.mesh.tets, count, self.node_count, self.device), wp.vec4i)
-        self._rest_inverses = (self._tensor(maps.rest_inverses).repeat(count, 1, 1), Mat33)
-        self._volumes = (self._tensor(maps.volumes).repeat(count), real)
+        self._tets = shared(tiled(assembly.mesh.tets, count, self.node_count, self.device), wp.vec4i)
+        self._rest_inverses = shared(self._tensor(maps.rest_inverses).repeat(count, 1, 1), Mat33)
+        self._volumes = shared(self._tensor(maps.volumes).repeat(count), real)
         self._corners = [
-            (tiled_bounds(maps.corner_offsets, count, self.device), wp.int32),
-            (tiled(maps.corner_from_slot, count, 4 * self.tet_count, self.device), wp.int32),
+            shared(tiled_bounds(maps.corner_offsets, count, self.device), wp.int32),
+            shared(tiled(maps.corner_from_slot, count, 4 * self.tet_count, self.device), wp.int32),
         ]
         self._block_count, self._entry_count = len(maps.entry_from_block), assembly.upper_pattern.nnz
         self._gathering = [
-            (tiled_bounds(maps.contribution_offsets, matrices, self.device), wp.int32),
-            (tiled(maps.block_from_contribution, matrices, 16 * self.tet_count, self.device), wp.int32),
-            (tiled(maps.entry_from_block, matrices, self._entry_count, self.device), wp.int32),
+            shared(tiled_bounds(maps.contribution_offsets, matrices, self.device), wp.int32),
+            shared(tiled(maps.block_from_contribution, matrices, 16 * self.tet_count, self.device), wp.int32),
+            shared(tiled(maps.entry_from_block, matrices, self._entry_count, self.device), wp.int32),
         ]
-        columns = np.repeat(np.arange(3 * self.node_count), np.diff(assembly.upper_pattern.indptr))
-        lower = columns.astype(np.int64) * (3 * self.node_count) + assembly.upper_pattern.indices
-        self._lower = torch.as_tensor(lower, device=self.device)
+        size, pattern = 3 * self.node_count, assembly.upper_pattern
+        columns = np.repeat(np.arange(size), np.diff(pattern.indptr))
+        self._lower = torch.as_tensor(columns * size + pattern.indices.astype(np.int64), device=self.device)
         self._diagonal = torch.as_tensor(assembly.diagonal_entries.astype(np.int64), device=self.device)
-        rows, ends = muscles.difference_rows, muscles.difference_rows.T.tocsr()
+        rows = muscles.difference_rows
         self.segment_count = rows.shape[0]
         self._rows = self._tensor(rows.toarray())
         self._rest_lengths = self._tensor(muscles.rest_lengths)
         self._lines = [
-            (tiled_bounds(rows.indptr, count, self.device), wp.int32),
-            (tiled(rows.indices, count, self.node_count, self.device), wp.int32),
-            (self._tensor(rows.data).repeat(count), real),
-            (self._rest_lengths.repeat(count), real),
+            *self._copies(rows, count, self.node_count),
+            shared(self._rest_lengths.repeat(count), real),
         ]
-        self._ends = [
-            (tiled_bounds(ends.indptr, count, self.device), wp.int32),
-            (tiled(ends.indices, count, self.segment_count, self.device), wp.int32),
-            (self._tensor(ends.data).repeat(count), real),
+        self._ends = self._copies(rows.T.tocsr(), count, self.segment_count)
+        self._no_ends = self._copies(rows.T.tocsr(), 0, 0)
+        self._no_ends[0] = shared(torch.zeros(0, dtype=torch.int32, device=self.device), wp.int32)
+        self._no_gradients = shared(self._empty(0, 3, 3), Mat33)
+
+    def _copies(self, rows: sparse.csr_matrix, count: int, column_count: int) -> list[wp.array]:
+        """``rows`` over so many columns, ``count`` times: where each begins, its columns, its entries."""
+        return [
+            shared(tiled_bounds(rows.indptr, count, self.device), wp.int32),
+            shared(tiled(rows.indices, count, column_count, self.device), wp.int32),
+            shared(self._tensor(rows.data).repeat(count), real),
         ]
 
     def _tensor(self, values: np.ndarray) -> torch.Tensor:
@@ -92,7 +97,7 @@ class BatchElasticity:
             self.device,
             kernels.element_energies_kernel,
             energies.numel(),
-            inputs=[*self._model(), (self._empty(0, 3, 3), Mat33), (flat, Vec3), 0.0],
+            inputs=[*self._model(), self._no_gradients, (flat, Vec3), 0.0],
             outputs=[(energies.view(-1), real), (determinants.view(-1), real)],
         )
         return determinants.amin(dim=1) > 0.0
@@ -105,7 +110,7 @@ class BatchElasticity:
         """
         count, flat = len(positions), (positions.reshape(-1, 3), Vec3)
         corners, nodes = self._empty(count * self.tet_count, 4, 3), self._empty(count, self.node_count, 3)
-        ends, pulls = [(each[:0], kind) for each, kind in self._ends], self._empty(0, 3)
+        ends, pulls = self._no_ends, self._empty(0, 3)
         if tensions is not None:
             ends, pulls = self._ends, self._empty(count * self.segment_count, 3)
             launch_on(
@@ -163,7 +168,7 @@ class BatchElasticity:
         )
         entries[:, self._diagonal] += diagonal
         made = torch.zeros((count, size * size), dtype=torch.float64, device=self.device)
-        made[:, self._lower] = entries
+        made.index_copy_(1, self._lower, entries)
         return made.view(count, size, size)
 
     def add_stiffness(

@@ -33,8 +33,8 @@ class BatchFactors:
         self._inverses = torch.zeros((slots, len(self._starts), panel, panel), **real)
 
     def factor(self, slots: torch.Tensor, matrices: torch.Tensor) -> torch.Tensor:
-        """Factor ``matrices`` (k, n, n), lower triangles, which are used up, into ``slots`` (k,) where they are
-        positive definite; (k,) bool says where."""
+        """Factor ``matrices`` (k, n, n), lower triangles, which are used up, into ``slots`` (k,); (k,) bool says which
+        are positive definite, the others' slots must not be solved with."""
         count = len(slots)
         fine = torch.ones(count, dtype=torch.bool, device=matrices.device)
         inverses = self._inverses.new_zeros((count, *self._inverses.shape[1:]))
@@ -51,9 +51,7 @@ class BatchFactors:
             columns[:, : stop - start] = own
             if stop < self.size:
                 columns[:, stop - start :] = columns[:, stop - start :] @ inverse.mT
-        kept = fine.nonzero().squeeze(1)
-        self._factors[slots[kept]] = matrices[kept]
-        self._inverses[slots[kept]] = inverses[kept]
+        self._factors[slots], self._inverses[slots] = matrices, inverses
         return fine
 
     def solve(self, slots: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
@@ -73,11 +71,11 @@ class BatchFactors:
         for number, (start, stop) in enumerate(bounds):
             rows = answer[:, start:stop]
             if start > 0:
-                rows = rows - factors[:, start:stop, :start] @ answer[:, :start]
+                rows = torch.baddbmm(rows, factors[:, start:stop, :start], answer[:, :start], alpha=-1.0)
             answer[:, start:stop] = inverses[:, number, : stop - start, : stop - start] @ rows
         for number, (start, stop) in reversed(list(enumerate(bounds))):
             rows = answer[:, start:stop]
             if stop < self.size:
-                rows = rows - factors[:, stop:, start:stop].mT @ answer[:, stop:]
+                rows = torch.baddbmm(rows, factors[:, stop:, start:stop].mT, answer[:, stop:], alpha=-1.0)
             answer[:, start:stop] = inverses[:, number, : stop - start, : stop - start].mT @ rows
         return answer

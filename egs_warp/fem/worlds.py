@@ -80,8 +80,10 @@ def launch_on(
     wp.launch(kernel, dim, inputs=given, outputs=made, device=target, block_dim=block_dim)
 
 
-def _array(value: Any) -> Any:
-    if not isinstance(value, tuple):
-        return value
-    tensor, dtype = value
+def shared(tensor: torch.Tensor, dtype: Any) -> wp.array:
+    """A contiguous ``tensor`` as an array of Warp's, where it lies."""
     return wp.from_torch(tensor, dtype=dtype)
+
+
+def _array(value: Any) -> Any:
+    return shared(*value) if isinstance(value, tuple) else value
