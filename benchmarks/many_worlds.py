@@ -5,8 +5,8 @@ python benchmarks/many_worlds.py [--quick] [--worlds B ...] [--nodes N ...] [--s
 
 The pawn's jump is recorded once on each cage. Then so many ``--worlds`` make its first ``--steps`` steps with the
 recorded activations, each with its own share of them (0.7 to 1) and on its own friction (0.4 to 1.2). ``--alone`` of
-them are made by ``LocomotionStepper``, too: ``apart`` is how far a node of theirs is from where it is alone, at most, in
-body heights. Where the time goes is told of a few steps from the middle, in which every stage waits for the device.
+them are made by ``LocomotionStepper``, too: ``apart`` is how far a node of theirs is from where it is alone, at most,
+in body heights. Where the time goes is told of a few steps from the middle, in which every stage waits for the device.
 
 Aims of one GPU: ``many_2000``, 2,000 steps a second at 250 nodes and 600 at 541; ``many_alike``, at most 1e-9 body
 heights apart after 30 steps or more, on any device.
@@ -118,14 +118,14 @@ def measure(creature: Creature, jump: np.ndarray, worlds: int, *, alone: int, pa
     split["rest"] = 1e3 * whole / _SPLIT - sum(split.values())
     ends = state.positions.cpu().numpy()
     chosen = np.linspace(0, worlds - 1, alone).astype(int).tolist()
-    apart = [_apart(creature, jump * shares[one], frictions[one], dt, ends[one]) for one in chosen]
+    apart = [_apart(creature, jump * shares[one], float(frictions[one]), dt, ends[one]) for one in chosen]
     return {**made, "stages": split, "apart": max(apart, default=None)}
 
 
 def _apart(creature: Creature, activations: np.ndarray, friction: float, dt: float, end: np.ndarray) -> float:
     """Body heights from ``end`` (N, 3) to the end of the same steps alone, of the node that is furthest off."""
     device = str(creature.body.assembly.device)
-    geometry = replace(creature.geometry, friction=float(friction))
+    geometry = replace(creature.geometry, friction=friction)
     stepper = LocomotionStepper(creature.body, creature.muscles, geometry, device=device)
     state, memory = creature.start, stepper.initial_memory()
     for row in activations:

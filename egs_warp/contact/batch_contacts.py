@@ -85,7 +85,7 @@ class BatchContacts(Worlds):
     def widened(self, most: int) -> BatchContacts:
         """With places for ``most``, at least as many as now."""
         more = most - self.most
-        wide = {name: padded(value, more) for name, value in self._parts() if name != "counts"}
+        wide = {name: padded(value, more) for name, value in self.parts() if name != "counts"}
         return replace(self, **wide)
 
 
@@ -205,7 +205,7 @@ class BatchDetector:
         world, place = added.there.nonzero(as_tuple=True)
         at = contacts.counts.long()[world] + place
         counts = contacts.counts + added.counts
-        grown = {name: value.clone() for name, value in wide._parts() if name != "counts"}
+        grown = {name: value.clone() for name, value in wide.parts() if name != "counts"}
         for name, value in grown.items():
             value[world, at] = getattr(added, name)[world, place]
         return replace(wide, counts=counts, **grown), forces

@@ -289,12 +289,10 @@ class _Search(Worlds):
     """(c,) bool."""
 
     @classmethod
-    def begin(
-        cls, velocities: torch.Tensor, forces: torch.Tensor, free: torch.Tensor, size: torch.Tensor
-    ) -> _Search:
+    def begin(cls, velocities: torch.Tensor, forces: torch.Tensor, free: torch.Tensor, size: torch.Tensor) -> _Search:
         """All worlds are to go."""
         count, device = len(size), size.device
         numbers = torch.zeros((2, count), dtype=torch.int64, device=device)
         active, fresh, converged, lost = torch.zeros((4, count), dtype=torch.bool, device=device)
         recent = size.new_full((count, MEMORY), -1.0)
-        return cls(velocities, forces, free, size, recent, *numbers, ~active, fresh, converged, lost)
+        return cls(velocities, forces, free, size, recent, numbers[0], numbers[1], ~active, fresh, converged, lost)

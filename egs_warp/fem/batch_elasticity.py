@@ -47,7 +47,7 @@ class BatchElasticity:
         self._lower = torch.as_tensor(columns * size + pattern.indices.astype(np.int64), device=self.device)
         self._diagonal = torch.as_tensor(assembly.diagonal_entries.astype(np.int64), device=self.device)
         rows = muscles.difference_rows
-        self.segment_count = rows.shape[0]
+        self.segment_count = muscles.segment_count
         self._rows = self._tensor(rows.toarray())
         self._rest_lengths = self._tensor(muscles.rest_lengths)
         self._lines = [

@@ -15,9 +15,9 @@ CHUNK_BYTES = 2**31
 class BatchFactors:
     """A factor L of S = L L^T for each of B worlds, in slots.
 
-    ``slots`` in what follows are ascending. A left-looking factorisation by panels: a product with all columns before, the panel's own small factor, and a
+    A left-looking factorisation by panels: a product with all columns before, the panel's own small factor, and a
     product with its inverse, which is kept: so solving takes nothing but products either. CUDA's own batched
-    factorisation is made for small matrices.
+    factorisation is made for small matrices. ``slots`` in what follows are ascending.
     """
 
     def __init__(

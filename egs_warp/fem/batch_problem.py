@@ -25,12 +25,11 @@ class BatchBody:
         muscles: MuscleSet,
         count: int,
         *,
-        drag: float,
         panel: int = PANEL,
         chunk_bytes: int = CHUNK_BYTES,
     ) -> None:
-        """``drag``: alpha of Rayleigh damping, 1/s; ``panel``, ``chunk_bytes``: see ``BatchFactors``."""
-        self.body, self.drag = body, drag
+        """``panel``, ``chunk_bytes``: see ``BatchFactors``."""
+        self.body = body
         self.device = torch.device(str(body.assembly.device))
         size = 3 * len(body.mesh.nodes)
         self.factors = BatchFactors(count, size, self.device, panel=panel, chunk_bytes=chunk_bytes)
@@ -49,6 +48,8 @@ class BatchProblem(Worlds):
 
     common: BatchBody
     dt: float
+    drag: float
+    """1/s."""
     slots: torch.Tensor
     """(c,) where each world's factors lie."""
     positions: torch.Tensor
@@ -64,7 +65,14 @@ class BatchProblem(Worlds):
 
     @classmethod
     def at(
-        cls, common: BatchBody, slots: torch.Tensor, positions: torch.Tensor, velocities: torch.Tensor, dt: float
+        cls,
+        common: BatchBody,
+        slots: torch.Tensor,
+        positions: torch.Tensor,
+        velocities: torch.Tensor,
+        *,
+        dt: float,
+        drag: float = 0.0,
     ) -> BatchProblem:
         """From ``positions`` (c, N, 3) and ``velocities`` (c, N, 3) on."""
         arms = positions - common.centre(positions)
@@ -75,7 +83,7 @@ class BatchProblem(Worlds):
         turns = turns.flatten(1, 2)
         inertia = (turns * common.mass.repeat_interleave(3)[:, None]).mT @ turns
         gradients = common.elasticity.deformation_gradients(positions)
-        return cls(common, dt, slots, positions, velocities, gradients, turns, inertia)
+        return cls(common, dt, drag, slots, positions, velocities, gradients, turns, inertia)
 
     @property
     def momenta(self) -> torch.Tensor:
@@ -90,7 +98,7 @@ class BatchProblem(Worlds):
     @property
     def inertia_ratio(self) -> float:
         """1 + dt alpha."""
-        return 1.0 + self.dt * self.common.drag
+        return 1.0 + self.dt * self.drag
 
     def end_positions(self, velocities: torch.Tensor) -> torch.Tensor:
         """(c, N, 3)."""
@@ -142,15 +150,13 @@ class BatchProblem(Worlds):
         diagonal = self.inertia_ratio * self.common.mass.repeat_interleave(3)
         # With the muscles' stiffness, without it, and with the elements' alone that is surely definite.
         for muscles, projected in ((True, False), (False, False), (False, True)):
-            if muscles and pulls is None or len(left) == 0:
+            if (muscles and pulls is None) or len(left) == 0:
                 continue
             matrices = self.common.elasticity.matrices(
                 end[left], gradients[left], self.dt, diagonal, projected=projected
             )
             if muscles and pulls is not None:
-                self.common.elasticity.add_stiffness(
-                    matrices, end[left], pulls[left], self.dt**2, least=NEGLIGIBLE
-                )
+                self.common.elasticity.add_stiffness(matrices, end[left], pulls[left], self.dt**2, least=NEGLIGIBLE)
             fine[left] = self.common.factors.factor(slots[left], matrices)
             left = indices(~fine)
         return fine

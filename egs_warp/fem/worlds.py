@@ -16,22 +16,23 @@ class Worlds:
 
     def of(self, worlds: torch.Tensor) -> Self:
         """Of those ``worlds`` (k,) alone, rows of this record, in their order."""
-        return replace(self, **{name: _rows(value, worlds) for name, value in self._parts()})
+        return replace(self, **{name: _rows(value, worlds) for name, value in self.parts()})
 
     def kept(self, worlds: torch.Tensor) -> Self:
         """``of`` for ascending ``worlds``; where these are all, this very record, not a copy."""
-        _, first = next(iter(self._parts()))
+        _, first = next(iter(self.parts()))
         return self if len(worlds) == _count(first) else self.of(worlds)
 
     def put(self, worlds: torch.Tensor, given: Self) -> None:
         """Write what is ``given`` of the ``worlds`` (k,) into this record's own tensors."""
-        for name, value in self._parts():
+        for name, value in self.parts():
             if isinstance(value, Worlds):
                 value.put(worlds, getattr(given, name))
             else:
                 value[worlds] = getattr(given, name)
 
-    def _parts(self) -> list[tuple[str, Any]]:
+    def parts(self) -> list[tuple[str, Any]]:
+        """What has a row for each world, by name."""
         values = [(field.name, getattr(self, field.name)) for field in fields(self)]
         return [(name, value) for name, value in values if isinstance(value, torch.Tensor | Worlds)]
 
@@ -41,7 +42,7 @@ def _rows(value: Any, worlds: torch.Tensor) -> Any:
 
 
 def _count(value: Any) -> int:
-    return len(value) if isinstance(value, torch.Tensor) else _count(next(iter(value._parts()))[1])
+    return len(value) if isinstance(value, torch.Tensor) else _count(next(iter(value.parts()))[1])
 
 
 def indices(mask: torch.Tensor) -> torch.Tensor:

@@ -21,6 +21,7 @@ from egs_warp.fem.batch_factors import CHUNK_BYTES, PANEL
 from egs_warp.fem.batch_problem import BatchBody, BatchProblem, inverse_of
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.worlds import Worlds, indices
+from egs_warp.locomotion.rollout import SETTLING_STEP, SETTLING_STEPS, has_settled
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.stepper import LOOKS, MOST_HALVINGS, StepMemory, StepReport
 from egs_warp.muscles.muscle_set import MuscleSet
@@ -156,9 +157,7 @@ class BatchStepper:
         self.body, self.muscles = body, muscles
         near = self.settings.near * body.height
         points = ContactPoints(geometry, near=near, lower=0.1 * near)
-        self.common = BatchBody(
-            body, muscles, count, drag=self.settings.drag, panel=panel, chunk_bytes=chunk_bytes
-        )
+        self.common = BatchBody(body, muscles, count, panel=panel, chunk_bytes=chunk_bytes)
         self.detector = BatchDetector(geometry, points, count, device=self.device)
         self.solver = BatchSolver(
             self.detector,
@@ -191,6 +190,42 @@ class BatchStepper:
             torch.as_tensor(counts, device=self.device),
             self._tensor(forces),
         )
+
+    def settle(self) -> tuple[list[BodyState], torch.Tensor]:
+        """``settle`` of every world: at rest on its ground, and (B,) bool, for which that cannot be solved."""
+        body, nodes = self.body, self.body.mesh.nodes
+        with torch.no_grad(), torch_stream(self.device):
+            state = self.start([BodyState(nodes, np.zeros_like(nodes))] * len(self._frictions))
+            ends, begun = state.positions.clone(), self._tensor(body.centre_of_mass(nodes))
+            lost = torch.zeros(len(ends), dtype=torch.bool, device=self.device)
+            for _ in range(SETTLING_STEPS):
+                if len(state.worlds) == 0:
+                    break
+                state, moved, failed = self._passive_step(state, SETTLING_STEP * body.time_unit)
+                ends[state.worlds], lost[state.worlds] = state.positions, failed
+                gone = (self.common.centre(state.positions)[:, 0] - begun).norm(dim=1)
+                state = state.kept(indices(~has_settled(body, moved, gone) & ~failed))
+        return [BodyState(end, np.zeros_like(end)) for end in ends.cpu().numpy()], lost
+
+    def _passive_step(self, state: BatchState, dt: float) -> tuple[BatchState, torch.Tensor, torch.Tensor]:
+        """Without muscles and drag, its end at rest; (c,) metres that a coordinate of a node has moved at most, and
+        (c,) bool, for which a tangent had no factors."""
+        problem = self._problem(state, dt, 0.0)
+        contacts, known, start_gaps = self._detect(problem, state)
+        velocities = problem.start()
+        lost = ~problem.factor(velocities, None)
+        contacts, result = self.solver.solve(
+            *(problem, contacts, self.solver.respond(problem, contacts)),
+            *(self._stiffness.new_zeros((len(velocities), len(self._stiffness))), self._frictions[state.worlds]),
+            velocities=velocities,
+            forces=known,
+            start_gaps=start_gaps,
+        )
+        after = BatchState(
+            *(state.worlds, problem.end_positions(result.velocities), torch.zeros_like(velocities), state.time),
+            *(contacts.points, contacts.counts, result.forces),
+        )
+        return after, dt * result.velocities.abs().flatten(1).amax(dim=1), lost | result.lost
 
     def advance(
         self, state: BatchState, activations: np.ndarray | torch.Tensor, dt: float
@@ -233,13 +268,8 @@ class BatchStepper:
         """``LocomotionStepper.held_step`` of the worlds in ``state``; (c,) bool, for which a tangent had no factors."""
         frictions, tensions = self._frictions[state.worlds], self._stiffness * activations
         with self._stages("detect"):
-            problem = BatchProblem.at(self.common, state.worlds, state.positions, state.velocities, dt)
-            ballistic = state.velocities + dt * self.common.gravity
-            gaps, _ = self.detector.gaps(problem.end_positions(ballistic))
-            chosen = self.detector.choose(state.points, state.there, state.forces[:, :, 0] > 0.0, gaps)
-            start_gaps = self.detector.gaps(state.positions)
-            contacts = self.detector.contacts(chosen, *start_gaps)
-            known = self.detector.matched(contacts, state.points, state.there, state.forces)
+            problem = self._problem(state, dt, self.settings.drag)
+            contacts, known, start_gaps = self._detect(problem, state)
         response, velocities, forces, lost = self._foresee(problem, contacts, known, tensions, frictions)
         contacts, result = self.solver.solve(
             *(problem, contacts, response, tensions, frictions),
@@ -250,6 +280,20 @@ class BatchStepper:
         step = self._finish(problem, contacts, result, state, activations)
         lost |= result.lost
         return replace(step, converged=step.converged & ~lost), lost
+
+    def _problem(self, state: BatchState, dt: float, drag: float) -> BatchProblem:
+        return BatchProblem.at(self.common, state.worlds, state.positions, state.velocities, dt=dt, drag=drag)
+
+    def _detect(
+        self, problem: BatchProblem, state: BatchState
+    ) -> tuple[BatchContacts, torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
+        """Contacts, the forces (c, K, 3) newtons that they had in the last step, and gaps and faces at the start."""
+        ballistic = state.velocities + problem.dt * self.common.gravity
+        gaps, _ = self.detector.gaps(problem.end_positions(ballistic))
+        chosen = self.detector.choose(state.points, state.there, state.forces[:, :, 0] > 0.0, gaps)
+        start_gaps = self.detector.gaps(state.positions)
+        contacts = self.detector.contacts(chosen, *start_gaps)
+        return contacts, self.detector.matched(contacts, state.points, state.there, state.forces), start_gaps
 
     def _foresee(
         self,

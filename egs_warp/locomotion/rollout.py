@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -24,6 +24,8 @@ from egs_warp.locomotion.trajectory import Trajectory
 
 FRAME_RATE = 60
 """Frames of a video, 1/s."""
+SETTLING_STEP, SETTLING_STEPS = 0.25, 12
+"""sqrt(H / g) of each step in which a body comes to rest on its ground, and how many it has for that."""
 REST_FRAMES = 20
 """Frames shown after the last motion has come to rest."""
 
@@ -66,19 +68,24 @@ def settle(stepper: LocomotionStepper) -> BodyState:
     """
     body = stepper.body
     state = BodyState(body.mesh.nodes.copy(), np.zeros_like(body.mesh.nodes))
-    dt = 0.25 * body.time_unit
+    dt = SETTLING_STEP * body.time_unit
     memory = stepper.initial_memory()
-    for _ in range(12):
+    for _ in range(SETTLING_STEPS):
         with one_blas_thread():
             result = stepper.passive_step(state, memory, dt)
         moved = dt * float(np.abs(result.velocities).max())
         state = BodyState(state.positions + dt * result.velocities, np.zeros_like(state.positions))
         memory = replace(memory, points=result.contacts.points, forces=result.forces)
         gone = body.centre_of_mass(state.positions) - body.centre_of_mass(body.mesh.nodes)
-        gives_way = moved > 0.2 * body.height or np.linalg.norm(gone) > 0.1 * body.height
-        if gives_way or moved < 2e-4 * body.height:
+        if has_settled(body, moved, np.linalg.norm(gone)):
             break
     return state
+
+
+def has_settled(body: SoftBody, moved: Any, gone: Any) -> Any:
+    """Whether a body rests, or gives way, whose nodes have ``moved`` so many metres at most in the last step, and whose
+    centre of mass has ``gone`` so many in all: of one, or of as many as there are numbers."""
+    return (moved > 0.2 * body.height) | (gone > 0.1 * body.height) | (moved < 2e-4 * body.height)
 
 
 def roll_out(
@@ -95,6 +102,7 @@ def roll_out(
     finished: Callable[[], bool] = lambda: False,
     kicks: Callable[[float, float], np.ndarray | None] = lambda time, dt: None,
     activations: np.ndarray | None = None,
+    made: Sequence[Sequence[StepReport]] | None = None,
     progress: Callable[[int], object] = lambda frame: None,
 ) -> Simulation:
     """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``, or a step
@@ -104,8 +112,9 @@ def roll_out(
     capture; steps are written into the folder that ``parts`` tells as they are done (``Recorder``); those in the folder
     ``resume`` are not solved again (``Replay``). ``kicks`` tells the velocities (N, 3) m/s that something from outside
     gives the nodes in the step from a time on, if anything does. With ``activations`` (steps, M) metres muscles do what
-    those say, whatever the motion asks for, as long as there are any for a whole frame. ``progress`` is told each frame
-    done.
+    those say, whatever the motion asks for, as long as there are any for a whole frame; where those steps were ``made``
+    already, their reports, each step's in the parts it was divided into, are taken, and none ends the run.
+    ``progress`` is told each frame done.
     """
     dt, per_frame = solver_steps(stepper.body, step)
     if activations is not None:
@@ -135,7 +144,9 @@ def roll_out(
             asked = digest([*objectives, *(given for given in (kick, held) if given is not None)])
             done = replay.step(asked) if replay is not None else []
             begin = state.kicked(kick)
-            if held is None:
+            if made is not None:
+                done = list(made[frame * per_frame + part])
+            elif held is None:
                 done = done or _advanced(partial(stepper.advance, begin, memory, objectives, dt))
             else:
                 done = done or _advanced(partial(stepper.advance_held, begin, memory, held, dt))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -113,6 +114,17 @@ class LocomotionStepper:
             self.settings,
             factors_on(body.assembly.device, body.assembly.upper_pattern),
         )
+
+    def with_friction(self, friction: float) -> LocomotionStepper:
+        """The same on ground of another Coulomb coefficient, for nothing: it shares what this one works with, so the
+        two are for one thread."""
+        other = copy(self)
+        other.geometry = replace(self.geometry, friction=friction)
+        other.detector = copy(self.detector)
+        other.detector.geometry = other.geometry
+        other.solver = replace(self.solver, detector=other.detector)
+        other.planner = replace(self.planner, friction=friction)
+        return other
 
     def __reduce__(self) -> tuple[Any, ...]:
         """It is made anew wherever a copy of it is read: its arrays lie on a device."""

@@ -9,14 +9,16 @@ import pytest
 import torch
 
 from egs_warp.assets import pawn
+from egs_warp.contact.detection import ContactGeometry
 from egs_warp.errors import ArgumentError
-from egs_warp.fem.body import BodyState
+from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.locomotion.batch import BatchStepper
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.script import motion
+from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.pipelines.creature import Creature, make_creature
 from egs_warp.pipelines.performance import simulate
 
@@ -113,7 +115,7 @@ def test_each_goes_as_it_does_alone(creature: Creature, jump: Trajectory) -> Non
     assert apart > 1e-4 * creature.body.height
 
 
-def parts(creature: Creature) -> tuple:
+def parts(creature: Creature) -> tuple[SoftBody, MuscleSet, ContactGeometry]:
     return creature.body, creature.muscles, creature.geometry
 
 
@@ -166,8 +168,11 @@ def test_what_a_world_does_does_not_hang_on_its_neighbours(creature: Creature) -
 def test_small_chunks_change_nothing(creature: Creature) -> None:
     starts, activations, dt = rough(creature)
     whole, cut = (
-        runs_together(BatchStepper(*parts(creature), FRICTIONS, **options), starts, activations[:1], dt)
-        for options in ({}, {"chunk_bytes": 1, "panel": 100})
+        runs_together(stepper, starts, activations[:1], dt)
+        for stepper in (
+            BatchStepper(*parts(creature), FRICTIONS),
+            BatchStepper(*parts(creature), FRICTIONS, chunk_bytes=1, panel=100),
+        )
     )
     for one, other in zip(whole, cut, strict=True):
         for mine, its in zip(one[0], other[0], strict=True):
