@@ -14,6 +14,7 @@ from egs_warp.fem.factors import Factors
 from egs_warp.geometry.frames import turning
 from egs_warp.muscles.tension import MuscleTension
 
+UNSOLVABLE = "the tangent is singular or not finite"
 NEGLIGIBLE = 1e-3
 """Of the largest T / L of the muscles: those below it do not count in a tangent."""
 
@@ -121,7 +122,7 @@ class StepProblem:
         if not definite:
             factors.update(self._entries(velocities, projected=True))
         if not factors.ready:
-            raise UnsolvableStepError("the tangent is singular or not finite")
+            raise UnsolvableStepError(UNSOLVABLE)
         return Tangent(self, factors)
 
     def _entries(self, velocities: np.ndarray, *, projected: bool) -> np.ndarray:

@@ -102,7 +102,6 @@ def roll_out(
     finished: Callable[[], bool] = lambda: False,
     kicks: Callable[[float, float], np.ndarray | None] = lambda time, dt: None,
     activations: np.ndarray | None = None,
-    made: Sequence[Sequence[StepReport]] | None = None,
     progress: Callable[[int], object] = lambda frame: None,
 ) -> Simulation:
     """Run ``frames`` frames of ``motion`` from ``start``, fewer if it has ``finished`` for ``REST_FRAMES``, or a step
@@ -112,9 +111,8 @@ def roll_out(
     capture; steps are written into the folder that ``parts`` tells as they are done (``Recorder``); those in the folder
     ``resume`` are not solved again (``Replay``). ``kicks`` tells the velocities (N, 3) m/s that something from outside
     gives the nodes in the step from a time on, if anything does. With ``activations`` (steps, M) metres muscles do what
-    those say, whatever the motion asks for, as long as there are any for a whole frame; where those steps were ``made``
-    already, their reports, each step's in the parts it was divided into, are taken, and none ends the run.
-    ``progress`` is told each frame done.
+    those say, whatever the motion asks for, as long as there are any for a whole frame. ``progress`` is told each frame
+    done.
     """
     dt, per_frame = solver_steps(stepper.body, step)
     if activations is not None:
@@ -144,9 +142,7 @@ def roll_out(
             asked = digest([*objectives, *(given for given in (kick, held) if given is not None)])
             done = replay.step(asked) if replay is not None else []
             begin = state.kicked(kick)
-            if made is not None:
-                done = list(made[frame * per_frame + part])
-            elif held is None:
+            if held is None:
                 done = done or _advanced(partial(stepper.advance, begin, memory, objectives, dt))
             else:
                 done = done or _advanced(partial(stepper.advance_held, begin, memory, held, dt))

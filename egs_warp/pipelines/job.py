@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from egs_warp.locomotion.ledger import ledger
-from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.push import Push
 from egs_warp.motions.script import Script
@@ -49,15 +48,11 @@ class Job:
         return self.performed(creature, progress=progress)
 
     def performed(
-        self,
-        creature: Creature,
-        *,
-        made: Sequence[Sequence[StepReport]] | None = None,
-        progress: Callable[[int, int], object] = lambda done, expected: None,
+        self, creature: Creature, *, progress: Callable[[int, int], object] = lambda done, expected: None
     ) -> Performance:
-        """The run of a ``creature`` that stands on its ground already; ``made``: as in ``simulate``."""
+        """The run of a ``creature`` that stands on its ground already."""
         asked = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in ("motion", "friction")}
-        return simulate(creature, self.motion, **asked, made=made, progress=progress)
+        return simulate(creature, self.motion, **asked, progress=progress)
 
     def outcome(self, creature: Creature, performance: Performance) -> Told:
         """What is told of the run: report, frames and trajectory."""

@@ -13,7 +13,6 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.frames import box_corners
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.locomotion.rollout import FRAME_RATE, REST_FRAMES, Simulation, roll_out, solver_steps
-from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.fall import FallWatch
 from egs_warp.motions.push import Kicks, Push
@@ -158,7 +157,6 @@ def simulate(
     pushes: Sequence[Push] = (),
     get_up: bool = True,
     activations: np.ndarray | None = None,
-    made: Sequence[Sequence[StepReport]] | None = None,
     parts: Callable[[], Path] | None = None,
     resume: Path | None = None,
     progress: Callable[[int, int], object] = lambda done, expected: None,
@@ -169,8 +167,7 @@ def simulate(
     ``longest``: seconds after which it is cut off, if that is earlier; ``step``: those of a solver step, if not the
     usual; ``style``: how it jumps; ``pushes``: what hits it meanwhile; ``get_up``: whether a body that has fallen is to
     get up and go on; ``activations`` (steps, M) metres: what muscles do in each solver step, whatever the motion would
-    have them do, which then only says what is measured; the run ends with the last of them. ``made``: what those steps
-    were, where they are solved already (``roll_out``). ``parts`` tells the folder
+    have them do, which then only says what is measured; the run ends with the last of them. ``parts`` tells the folder
     that takes the steps as they are done, ``resume`` is that of a run that was cut off and goes on. ``progress`` is
     told after each frame how many are done, and how many are expected in all by now. Raises ``UserError`` for a motion
     that the body cannot do, and a folder that another run has left.
@@ -206,7 +203,6 @@ def simulate(
         finished=lambda: frames is None and over(),
         kicks=Kicks(place, pushes),
         activations=activations,
-        made=made,
         progress=lambda last: progress(
             last + 1, max(last + 1, outlook.frames(last + 1, finished=watch.finished)) if frames is None else most
         ),

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from egs_warp.fem.step_problem import UnsolvableStepError
+from egs_warp.fem.body import BodyState
+from egs_warp.fem.step_problem import UNSOLVABLE, UnsolvableStepError
 from egs_warp.locomotion.rollout import solver_steps
-from egs_warp.locomotion.stepper import StepReport
+from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory, StepReport
 from egs_warp.pipelines.creature import Creature, checked_friction
 from egs_warp.pipelines.crew import Ended, Tell, attempted
 from egs_warp.pipelines.job import Job, Told
@@ -127,8 +128,25 @@ def _ended(
 
 def _outcome(creature: Creature, made: list[list[StepReport]], lost: bool, job: Job, _: Tell) -> Told:
     if lost:
-        raise UnsolvableStepError("the tangent is singular or not finite")
-    return job.outcome(creature, job.performed(creature, made=made))
+        raise UnsolvableStepError(UNSOLVABLE)
+    return job.outcome(creature, job.performed(replace(creature, stepper=_MadeStepper(creature.stepper, made))))
+
+
+class _MadeStepper(LocomotionStepper):
+    """Of a run whose steps were made beside others: it tells them again, for the motion to measure."""
+
+    def __init__(self, stepper: LocomotionStepper, made: list[list[StepReport]]) -> None:
+        vars(self).update(vars(stepper))
+        self._made = iter(made)
+
+    def advance_held(
+        self, state: BodyState, memory: StepMemory, activations: np.ndarray, dt: float
+    ) -> tuple[BodyState, StepMemory, list[StepReport]]:
+        """The next step in its parts."""
+        done = next(self._made)
+        if not done:
+            raise UnsolvableStepError(UNSOLVABLE)
+        return done[-1].state, StepMemory.after(done[-1]), done
 
 
 def _stepped(
