@@ -40,7 +40,8 @@ if TYPE_CHECKING:
     from egs_warp.motions.style import Style, read_style
     from egs_warp.pipelines.animate import AnimateOptions, animate
     from egs_warp.pipelines.creature import Creature, make_creature
-    from egs_warp.pipelines.many import Job, Outcome, simulate_many
+    from egs_warp.pipelines.job import Job
+    from egs_warp.pipelines.many import Outcome, simulate_many
     from egs_warp.pipelines.performance import Performance, simulate
     from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene
     from egs_warp.pipelines.report import Report
@@ -92,7 +93,8 @@ _HOMES: dict[str, tuple[str, ...]] = {
     "motions.style": ("Style", "read_style"),
     "pipelines.animate": ("AnimateOptions", "animate"),
     "pipelines.creature": ("Creature", "make_creature"),
-    "pipelines.many": ("Job", "Outcome", "simulate_many"),
+    "pipelines.job": ("Job",),
+    "pipelines.many": ("Outcome", "simulate_many"),
     "pipelines.performance": ("Performance", "simulate"),
     "pipelines.prepare_scene": ("PreparedScene", "SceneOptions", "prepare_scene"),
     "pipelines.report": ("Report",),

@@ -32,16 +32,19 @@ def coulomb_forces(
     count = len(shift)
     if count == 0:
         return start, 0.0
-    contacts, newton = contacts_of(delassus, free_velocity, shift, friction), kernels.Newton()
-    each, rows, matrix = ((3 * count, real),) * 5, (3 * count, int), ((3 * count, (3 * count + 4) // 4), Vec4)
-    *vectors, newton.unknowns, newton.pivots, newton.matrix = empty_together("cpu", *each, rows, rows, matrix)
-    newton.velocities, newton.values, newton.step, newton.change, newton.best = vectors
+    size = 3 * count
+    wanted = ((1, 5, size), real), ((1, 2, size), int), ((1, size, (size + 4) // 4), Vec4)
     forces = np.array(start, dtype=np.float64, order="C")
     residual = np.empty(1)
     wp.launch(
         kernels.coulomb_kernel,
-        dim=1,
-        inputs=[contacts, tolerance, iteration_limit, _shared(forces.reshape(-1)), newton],
+        dim=(1, 1),
+        inputs=[
+            wp.array(np.array([count], np.int32), dtype=int, device="cpu", copy=False),
+            *(_shared(given[None]) for given in (delassus, free_velocity, shift)),
+            *(_shared(np.array([friction])), tolerance, iteration_limit, _shared(forces.reshape(1, -1))),
+            *empty_together("cpu", *wanted),
+        ],
         outputs=[_shared(residual)],
         device="cpu",
     )
@@ -51,8 +54,8 @@ def coulomb_forces(
 def contacts_of(delassus: np.ndarray, free_velocity: np.ndarray, shift: np.ndarray, friction: float) -> Any:
     """The kernels' ``Contacts``, where they lie in the arrays: see ``coulomb_forces``."""
     contacts = kernels.Contacts()
+    contacts.count, contacts.friction = len(shift), friction
     contacts.delassus, contacts.free, contacts.shifts = _shared(delassus), _shared(free_velocity), _shared(shift)
-    contacts.friction = friction
     return contacts
 
 

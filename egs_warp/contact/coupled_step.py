@@ -14,26 +14,26 @@ from egs_warp.fem.factors import Factors
 from egs_warp.fem.step_problem import Tangent
 from egs_warp.muscles.tension import MuscleTension
 
-_ITERATIONS = 60
-_SLOW = 0.5
+ITERATIONS = 60
+SLOW = 0.5
 """A tangent is made anew where the residual falls by less than this factor."""
-_SHORTEST = 1e-3
-_MEMORY = 3
+SHORTEST = 1e-3
+MEMORY = 3
 """Residuals of which the largest must be undercut."""
-_ROUNDS = 6
-_PUSH_OUT = 0.2
+ROUNDS = 6
+PUSH_OUT = 0.2
 """Of the depth beyond the tolerance, a step."""
-_ADDED = 0.6
+ADDED = 0.6
 """Of the tolerance: points that would end deeper join at once."""
-_SINKS = 0.3
+SINKS = 0.3
 """Of the tolerance: by how much what is deep already may go deeper in a step; by next to nothing beyond the tolerance.
 """
-_CREEPS = 0.02
-_ANSWERED = 1e-6
+CREEPS = 0.02
+ANSWERED = 1e-6
 """Of dt g, which a step gives what falls: by how much less the forces of its end miss Coulomb's law."""
-_UNANSWERED = 3
+UNANSWERED = 3
 """Times that forces may miss it by more before the step is given up, to be done in halves."""
-_SINGULAR = 1e-7
+SINGULAR = 1e-7
 """Of the mean of the Delassus operator's diagonal: more points than the cage can resolve leave it singular."""
 
 
@@ -59,7 +59,7 @@ class ContactResponse:
     @cached_property
     def _regular(self) -> np.ndarray:
         regular = self.delassus.copy()
-        regular[np.diag_indices_from(regular)] += _SINGULAR * regular.diagonal().mean()
+        regular[np.diag_indices_from(regular)] += SINGULAR * regular.diagonal().mean()
         return regular
 
     def forces(
@@ -106,7 +106,7 @@ class CoupledSolver:
     def shift(self, contacts: ContactSet, dt: float) -> np.ndarray:
         """(n,) m/s, the constant of the normal measure of a step of ``dt`` seconds: nothing goes deeper, and
         what is deeper than the tolerance comes out gently."""
-        return push_out_speeds(contacts.gaps, dt, self.push_out_cap, _PUSH_OUT, self.penetration_tolerance)
+        return push_out_speeds(contacts.gaps, dt, self.push_out_cap, PUSH_OUT, self.penetration_tolerance)
 
     def solve(
         self,
@@ -122,17 +122,17 @@ class CoupledSolver:
         problem = response.tangent.problem
         iterations = tangents = 0
         start_gaps, _ = self.detector.gaps(problem.state.positions)
-        for number in range(_ROUNDS):
+        for number in range(ROUNDS):
             result, response = self._round(response, tension, velocities, forces)
             iterations, tangents = iterations + result.iterations, tangents + result.tangents
             velocities, forces = result.velocities, result.forces
             gaps, _ = self.detector.gaps(problem.end_positions(velocities))
             contacts = response.contacts
             # What is deep already is held where it is only once it would go deeper.
-            allowed = np.where(gaps < -self.penetration_tolerance, _CREEPS, _SINKS) * self.penetration_tolerance
+            allowed = np.where(gaps < -self.penetration_tolerance, CREEPS, SINKS) * self.penetration_tolerance
             sinking = np.where(gaps < start_gaps - allowed, gaps, 0.0)
-            added = self.points.deeper(contacts.points, sinking, _ADDED * self.penetration_tolerance)
-            if not result.converged or len(added) == 0 or number == _ROUNDS - 1:
+            added = self.points.deeper(contacts.points, sinking, ADDED * self.penetration_tolerance)
+            if not result.converged or len(added) == 0 or number == ROUNDS - 1:
                 break
             contacts = self.detector.contact_set(np.concatenate([contacts.points, added]), problem.state.positions)
             new = contacts.frame[3 * len(forces) :].T
@@ -150,7 +150,7 @@ class CoupledSolver:
         dt = problem.dt
         shift = self.shift(contacts, dt)
         friction = self.detector.geometry.friction
-        answered = _ANSWERED * problem.unit / problem.body.mass
+        answered = ANSWERED * problem.unit / problem.body.mass
         tangents, unanswered, fresh = 0, 0, False
 
         def missing(v: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, float]:
@@ -160,13 +160,13 @@ class CoupledSolver:
 
         free, size = missing(velocities, forces)
         recent: list[float] = []
-        for iteration in range(1, _ITERATIONS + 1):
+        for iteration in range(1, ITERATIONS + 1):
             loose = velocities.ravel() - response.tangent.solve(free.ravel())
             wanted, missed = response.forces(loose, shift, friction, forces)
             unanswered += missed > answered
             change = (loose + response.columns @ wanted.ravel()).reshape(velocities.shape) - velocities
             length, better = 1.0, False
-            while length > _SHORTEST:
+            while length > SHORTEST:
                 trial, trial_forces = velocities + length * change, forces + length * (wanted - forces)
                 trial_free, trial_size = missing(trial, trial_forces)
                 # Contacts that open, close or begin to slide change the forces at once: the residual need not fall in
@@ -178,16 +178,16 @@ class CoupledSolver:
                 length *= 0.5
             if better:
                 before, velocities, forces, free, size = size, trial, trial_forces, trial_free, trial_size
-                recent = [*recent[1 - _MEMORY :], size]
+                recent = [*recent[1 - MEMORY :], size]
                 # After a whole step the contact velocities are those that were solved for, by linearity.
                 if length == 1.0 and size <= self.tolerance and missed <= answered:
                     return CoupledResult(velocities, contacts, forces, True, size, iteration, tangents), response
-                slow = size > _SLOW * before or length < 1.0 or missed > answered
+                slow = size > SLOW * before or length < 1.0 or missed > answered
             else:
                 slow = True
                 if fresh:
                     break
-            if unanswered > _UNANSWERED:
+            if unanswered > UNANSWERED:
                 break
             fresh = False
             if slow:

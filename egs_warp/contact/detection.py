@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -80,15 +81,22 @@ class ContactSet:
     """(n, 3, 3): rows are the normal and two tangents, unit."""
     gaps: np.ndarray
     """(n,) signed distance at the start of the step, metres."""
-    frame: np.ndarray
-    """(3n, 3N): rows 3i, 3i+1, 3i+2 give the velocity of contact i along its normal and two tangents."""
     faces: np.ndarray
     """(n,) int32: which of the geometry's planes each is held to; 0 is the ground, flat or not."""
+    node_count: int
+    """N."""
 
     @property
     def count(self) -> int:
         """n."""
         return len(self.points)
+
+    @cached_property
+    def frame(self) -> np.ndarray:
+        """(3n, 3N): rows 3i, 3i+1, 3i+2 give the velocity of contact i along its normal and two tangents."""
+        frame = np.zeros((self.count, 3, self.node_count, 3))
+        frame[np.arange(self.count)[:, None], :, self.nodes] = self.weights[:, :, None, None] * self.axes[:, None]
+        return frame.reshape(3 * self.count, 3 * self.node_count)
 
     @property
     def nearest(self) -> np.ndarray:
@@ -104,7 +112,7 @@ class ContactSet:
     def pushes(self, forces: np.ndarray) -> np.ndarray:
         """(3N,) ``frame`` transposed times ``forces`` (n, 3), newtons on each node's axes."""
         at_points = (forces[:, None, :] @ self.axes)[:, 0]
-        nodal = np.zeros((self.frame.shape[1] // 3, 3))
+        nodal = np.zeros((self.node_count, 3))
         np.add.at(nodal, self.nodes, self.weights[:, :, None] * at_points[:, None, :])
         return nodal.ravel()
 
@@ -310,15 +318,11 @@ class ContactDetector:
         weights = self.geometry.weights[points]
         faces = nearest[points]
         axes = np.stack([np.stack([p.normal, *p.tangents()]) for p in self.geometry.planes])[faces]
-        count = len(points)
         if self.geometry.field is not None:
             uneven = faces == 0
             places = np.einsum("nw,nwi->ni", weights[uneven], positions[nodes[uneven]])
             axes[uneven] = self.geometry.field.frames(places)
-        frame = np.zeros((count, 3, *positions.shape))
-        frame[np.arange(count)[:, None], :, nodes] = weights[:, :, None, None] * axes[:, None]
-        rows = frame.reshape(3 * count, positions.size)
-        return ContactSet(points, nodes, weights, axes, gaps[points], rows, faces)
+        return ContactSet(points, nodes, weights, axes, gaps[points], faces, len(positions))
 
 
 def push_out_speeds(gaps: np.ndarray, dt: float, cap: float, factor: float, slop: float) -> np.ndarray:

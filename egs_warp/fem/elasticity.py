@@ -54,6 +54,26 @@ class Damping:
     """(T,) deformation gradients at its start."""
 
 
+@dataclass(frozen=True)
+class ElasticMaps:
+    """One mesh as the kernels of elasticity read it."""
+
+    rest_inverses: np.ndarray
+    """(T, 3, 3) 1/m, inverse edges at rest."""
+    volumes: np.ndarray
+    """(T,) m^3."""
+    corner_offsets: np.ndarray
+    """(N + 1,) where the slots of a node's corners begin."""
+    corner_from_slot: np.ndarray
+    """(4 T,)."""
+    contribution_offsets: np.ndarray
+    """(blocks + 1,) where the slots of a 3x3 block of the matrix begin."""
+    block_from_contribution: np.ndarray
+    """(slots,) 16 times the element, and which of its blocks."""
+    entry_from_block: np.ndarray
+    """(blocks, 9) of the upper triangle, -1 for those below it."""
+
+
 class _MuscleLines:
     """Kernel, index maps and scratch memory for the segments of one set of muscles."""
 
@@ -109,6 +129,16 @@ class ElasticAssembly:
     def __reduce__(self) -> tuple[Any, ...]:
         """It is made anew wherever a copy of it is read: its arrays lie on a device."""
         return partial(ElasticAssembly, device=str(self.device)), (self.mesh, self.material)
+
+    @property
+    def maps(self) -> ElasticMaps:
+        """What the kernels read of the mesh, for those who lay it out for many bodies."""
+        return ElasticMaps(
+            *(each.numpy() for each in (self._rest_inverses, self._volumes)),
+            *(each.numpy() for each in (self._corner_offsets, self._corner_from_slot)),
+            *(each.numpy() for each in (self._contribution_offsets, self._block_from_contribution)),
+            self._entry_from_block.numpy(),
+        )
 
     def _index_corners(self) -> None:
         flat = self.mesh.tets.ravel()

@@ -14,7 +14,8 @@ from egs_warp.fem.factors import Factors
 from egs_warp.geometry.frames import turning
 from egs_warp.muscles.tension import MuscleTension
 
-_NEGLIGIBLE = 1e-3
+UNSOLVABLE = "the tangent is singular or not finite"
+NEGLIGIBLE = 1e-3
 """Of the largest T / L of the muscles: those below it do not count in a tangent."""
 
 
@@ -115,13 +116,13 @@ class StepProblem:
         """
         definite = factors.update(self._entries(velocities, projected=False))
         if tension is not None:
-            across, rates = tension.hessian(self.end_positions(velocities)).factors(least=_NEGLIGIBLE)
+            across, rates = tension.hessian(self.end_positions(velocities)).factors(least=NEGLIGIBLE)
             if factors.add(across, self.dt**2 * rates):
                 return Tangent(self, factors)
         if not definite:
             factors.update(self._entries(velocities, projected=True))
         if not factors.ready:
-            raise UnsolvableStepError("the tangent is singular or not finite")
+            raise UnsolvableStepError(UNSOLVABLE)
         return Tangent(self, factors)
 
     def _entries(self, velocities: np.ndarray, *, projected: bool) -> np.ndarray:

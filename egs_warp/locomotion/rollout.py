@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -24,6 +24,8 @@ from egs_warp.locomotion.trajectory import Trajectory
 
 FRAME_RATE = 60
 """Frames of a video, 1/s."""
+SETTLING_STEP, SETTLING_STEPS = 0.25, 12
+"""sqrt(H / g) of each step in which a body comes to rest on its ground, and how many it has for that."""
 REST_FRAMES = 20
 """Frames shown after the last motion has come to rest."""
 
@@ -66,19 +68,24 @@ def settle(stepper: LocomotionStepper) -> BodyState:
     """
     body = stepper.body
     state = BodyState(body.mesh.nodes.copy(), np.zeros_like(body.mesh.nodes))
-    dt = 0.25 * body.time_unit
+    dt = SETTLING_STEP * body.time_unit
     memory = stepper.initial_memory()
-    for _ in range(12):
+    for _ in range(SETTLING_STEPS):
         with one_blas_thread():
             result = stepper.passive_step(state, memory, dt)
         moved = dt * float(np.abs(result.velocities).max())
         state = BodyState(state.positions + dt * result.velocities, np.zeros_like(state.positions))
         memory = replace(memory, points=result.contacts.points, forces=result.forces)
         gone = body.centre_of_mass(state.positions) - body.centre_of_mass(body.mesh.nodes)
-        gives_way = moved > 0.2 * body.height or np.linalg.norm(gone) > 0.1 * body.height
-        if gives_way or moved < 2e-4 * body.height:
+        if has_settled(body, moved, np.linalg.norm(gone)):
             break
     return state
+
+
+def has_settled(body: SoftBody, moved: Any, gone: Any) -> Any:
+    """Whether a body rests, or gives way, whose nodes have ``moved`` so many metres at most in the last step, and whose
+    centre of mass has ``gone`` so many in all: of one, or of as many as there are numbers."""
+    return (moved > 0.2 * body.height) | (gone > 0.1 * body.height) | (moved < 2e-4 * body.height)
 
 
 def roll_out(

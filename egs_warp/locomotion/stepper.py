@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -24,10 +25,10 @@ from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleTension, muscle_columns
 
-_MOST_HALVINGS = 4
+MOST_HALVINGS = 4
 _AMISS, _LITTLE = 1.2, 0.01
 """A step whose end costs more than this factor of what its program expected, and this much more, is asked for again."""
-_LOOKS = 2
+LOOKS = 2
 """Newton steps with contact in which a step is foreseen."""
 
 
@@ -114,6 +115,17 @@ class LocomotionStepper:
             factors_on(body.assembly.device, body.assembly.upper_pattern),
         )
 
+    def with_friction(self, friction: float) -> LocomotionStepper:
+        """The same on ground of another Coulomb coefficient, for nothing: it shares what this one works with, so the
+        two are for one thread."""
+        other = copy(self)
+        other.geometry = replace(self.geometry, friction=friction)
+        other.detector = copy(self.detector)
+        other.detector.geometry = other.geometry
+        other.solver = replace(self.solver, detector=other.detector)
+        other.planner = replace(self.planner, friction=friction)
+        return other
+
     def __reduce__(self) -> tuple[Any, ...]:
         """It is made anew wherever a copy of it is read: its arrays lie on a device."""
         device = str(self.body.assembly.device)
@@ -158,7 +170,7 @@ class LocomotionStepper:
         end, after, report = done
         if report.converged:
             return end, after, [report]
-        return self._in_halves(state, memory, report.activations, dt, _MOST_HALVINGS)
+        return self._in_halves(state, memory, report.activations, dt, MOST_HALVINGS)
 
     def _in_halves(
         self, state: BodyState, memory: StepMemory, activations: np.ndarray, dt: float, left: int
@@ -266,7 +278,7 @@ class LocomotionStepper:
             velocities = ahead
             tangent = problem.tangent(self._factors, velocities, None)
         response = ContactResponse.of(tangent, contacts)
-        for _ in range(_LOOKS):
+        for _ in range(LOOKS):
             free = velocities.ravel() - tangent.solve(problem.residual(velocities, tension).ravel())
             forces, _ = response.forces(free, shift, self.geometry.friction, known)
             ahead = (free + response.columns @ forces.ravel()).reshape(velocities.shape)

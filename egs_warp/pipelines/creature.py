@@ -79,10 +79,8 @@ class Creature:
     def with_friction(self, friction: float) -> Creature:
         """The same body on ground of another Coulomb coefficient, standing anew. Raises ``ArgumentError`` for one below
         0."""
-        if not 0.0 <= friction < np.inf:
-            raise ArgumentError("friction", "give a Coulomb coefficient of at least 0", value=friction)
         old = self.stepper
-        geometry, device = replace(old.geometry, friction=friction), str(old.body.assembly.device)
+        geometry, device = replace(old.geometry, friction=checked_friction(friction)), str(old.body.assembly.device)
         stepper = LocomotionStepper(old.body, old.muscles, geometry, settings=old.settings, device=device)
         return replace(self, stepper=stepper, start=settle(stepper))
 
@@ -307,6 +305,13 @@ def _stands(stepper: LocomotionStepper, start: BodyState) -> bool:
     gaps, _ = stepper.detector.gaps(start.positions)
     upright = np.trace(turn) > 1.0 + 2.0 * np.cos(np.radians(10.0))
     return bool(np.linalg.norm(moved) < 0.04 * body.height and upright and gaps.min() > -0.01 * body.height)
+
+
+def checked_friction(friction: float) -> float:
+    """A Coulomb coefficient. Raises ``ArgumentError`` for one below 0."""
+    if not 0.0 <= friction < np.inf:
+        raise ArgumentError("friction", "give a Coulomb coefficient of at least 0", value=friction)
+    return friction
 
 
 def first_place(creature: Creature, *, step: float | None = None, style: Style | None = None) -> Place:

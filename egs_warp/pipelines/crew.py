@@ -107,14 +107,15 @@ def ended_tasks(crew: Crew, tasks: Sequence[Any], told: Callable[..., object]) -
 
 def attempt(work: Work, task: Any, tell: Tell) -> bytes:
     """Pickled: ``done`` and the result, or ``failed`` and a line."""
-    kind, value = _attempted(work, task, tell)
+    kind, value = attempted(work, task, tell)
     try:
         return pickle.dumps((kind, value))
     except Exception as error:
         return pickle.dumps(("failed", f"what it returns cannot be sent: {error}"))
 
 
-def _attempted(work: Work, task: Any, tell: Tell) -> tuple[str, Any]:
+def attempted(work: Work, task: Any, tell: Tell) -> tuple[str, Any]:
+    """``done`` and the result, or ``failed`` and a line."""
     try:
         return "done", work(task, tell)
     except UserError as error:

@@ -1,4 +1,5 @@
-"""One creature, many runs of it, over processes of this machine or over the hosts of a Ray cluster."""
+"""One creature, many runs of it: side by side on a GPU, over processes of this machine, or over the hosts of a Ray
+cluster."""
 
 from __future__ import annotations
 
@@ -13,45 +14,14 @@ import numpy as np
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.launching import available_threads, use_device
-from egs_warp.locomotion.ledger import ledger
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.motions.push import Push
-from egs_warp.motions.script import Script
-from egs_warp.motions.style import Style
 from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.crew import Crew, Ended, Processes, Tell, Work, ended_tasks
 from egs_warp.pipelines.ending import State
-from egs_warp.pipelines.performance import Performance, simulate
+from egs_warp.pipelines.job import Job, Told
 from egs_warp.pipelines.ray_crew import HERE, RayCrew
-from egs_warp.pipelines.report import GaussianCounts, Report, report_of_run
-
-
-@dataclass(frozen=True)
-class Job:
-    """One run: what ``simulate`` takes, under the same names, and the ground."""
-
-    motion: Script
-    friction: float | None = None
-    """Of the ground (``Creature.with_friction``), if not the creature's own."""
-    frames: int | None = None
-    longest: float | None = None
-    """Seconds."""
-    step: float | None = None
-    """Seconds."""
-    style: Style | None = None
-    pushes: tuple[Push, ...] = ()
-    get_up: bool = True
-    activations: np.ndarray | None = None
-    """(steps, M) metres."""
-
-    def perform(
-        self, creature: Creature, *, progress: Callable[[int, int], object] = lambda done, expected: None
-    ) -> Performance:
-        """The run alone, here."""
-        if self.friction is not None:
-            creature = creature.with_friction(self.friction)
-        asked = {name: getattr(self, name) for name in self.__dataclass_fields__ if name not in ("motion", "friction")}
-        return simulate(creature, self.motion, **asked, progress=progress)
+from egs_warp.pipelines.report import GaussianCounts, Report
+from egs_warp.pipelines.side_by_side import fits, most_worlds, performed
 
 
 @dataclass(frozen=True)
@@ -90,12 +60,18 @@ def simulate_many(
     jobs: Sequence[Job],
     *,
     workers: int | str | None = None,
+    worlds: int | None = None,
     out: Path | str | None = None,
     ended: Callable[[int, Outcome], object] = lambda number, outcome: None,
     progress: Callable[[int, int], object] = lambda done, expected: None,
 ) -> tuple[Outcome, ...]:
     """Run all ``jobs`` of one ``creature``, several at a time; the outcomes are in the order of the jobs. Each has the
-    bits of its run alone (``Job.perform``) on a machine of this kind.
+    bits of its run alone (``Job.perform``) on a machine of this kind, or, made side by side, its nodes within 1e-9 body
+    heights of those for 30 steps.
+
+    ``worlds``: of the jobs whose activations are given and that nothing pushes, how many are made side by side in this
+    process, on the creature's device; as many as a GPU has room for, up to 1,024, and none on a CPU if None; none if 0.
+    All others go to workers.
 
     ``workers``: how many processes of this machine, as many as it has cores if None; ``"ray"``, or the address of a Ray
     cluster, for its cores (docs/guide/many.md). Each is sent the creature once, and uses one core. A job whose worker
@@ -109,7 +85,7 @@ def simulate_many(
         folder.mkdir(parents=True, exist_ok=True)
     outcomes: list[Outcome | None] = [None] * len(jobs)
     counts = _Frames(len(jobs), progress)
-    for task in farmed(_Performing(creature), jobs, workers=workers, told=counts.told):
+    for task in _over(creature, jobs, workers, most_worlds(creature) if worlds is None else worlds, counts):
         report, frames, trajectory = task.value or (None, np.zeros(0, int), None)
         if report is not None:
             report = replace(report, gaussians=GaussianCounts.of(creature))
@@ -124,6 +100,25 @@ def simulate_many(
         counts.over(task.number)
         ended(task.number, outcome)
     return tuple(outcome for outcome in outcomes if outcome is not None)
+
+
+def _over(
+    creature: Creature, jobs: Sequence[Job], workers: int | str | None, worlds: int, counts: _Frames
+) -> Iterator[Ended]:
+    """The jobs as they end: first those side by side."""
+    if worlds < 0:
+        raise ArgumentError("worlds", "give how many are made side by side, at least 0", value=worlds)
+    beside = [number for number, job in enumerate(jobs) if worlds > 0 and fits(job)]
+    yield from performed(creature, [(number, jobs[number]) for number in beside], worlds=worlds, told=counts.all_told)
+    left = sorted(set(range(len(jobs))) - set(beside))
+    given = [jobs[number] for number in left]
+
+    def told(number: int, *values: Any) -> None:
+        counts.told(left[number], *values)
+
+    if given:
+        for task in farmed(_Performing(creature), given, workers=workers, told=told):
+            yield replace(task, number=left[task.number])
 
 
 def farmed(
@@ -165,32 +160,13 @@ class _Performing:
         self._sent: bytes = pickle.dumps(replace(creature, cloud=cloud))
         self._creature: Creature | None = None
 
-    def __call__(self, job: Job, tell: Tell) -> tuple[Report, np.ndarray, Trajectory]:
+    def __call__(self, job: Job, tell: Tell) -> Told:
         if self._creature is None:
             use_device(self._device)
             self._creature = pickle.loads(self._sent)
             assert self._creature is not None, "it was sent"
         creature = self._creature
-        performance = job.perform(creature, progress=tell)
-        simulation = performance.simulation
-        report = report_of_run(
-            *(creature, simulation.trajectory, simulation.reports, simulation.frames),
-            *(performance.sequence.done, ledger(simulation.trajectory)),
-            gaussians=GaussianCounts.of(creature),
-            drawing={},
-            source="",
-            notes=performance.cut_short(),
-            seed=0,
-            asked=_asked(job),
-            ending=performance.ending,
-        )
-        return report, simulation.frames, simulation.trajectory
-
-
-def _asked(job: Job) -> dict[str, Any]:
-    """``asked`` of the report."""
-    given = {name: getattr(job, name) for name in ("friction", "frames", "longest", "step", "get_up")}
-    return {**given, "pushes": len(job.pushes), "activations": job.activations is not None}
+        return job.outcome(creature, job.perform(creature, progress=tell))
 
 
 class _Frames:
@@ -202,7 +178,11 @@ class _Frames:
 
     def told(self, number: int, done: int, expected: int) -> None:
         """By a job, after a frame."""
-        self._known[number] = done, expected
+        self.all_told({number: (done, expected)})
+
+    def all_told(self, told: dict[int, tuple[int, int]]) -> None:
+        """Likewise by several at a time."""
+        self._known |= told
         done, expected = np.sum(list(self._known.values()), axis=0).tolist()
         self._progress(done, round(expected * self._jobs / len(self._known)))
 

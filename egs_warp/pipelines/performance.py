@@ -174,7 +174,7 @@ def simulate(
     """
     check_frames(frames)
     if activations is not None:
-        activations = _checked(creature, activations, step)
+        activations = checked_activations(creature, activations, step)
     place = first_place(creature, step=step, style=style)
     expected = motion.check(place)
     sequence = MotionSequence(place, motion.parts(creature.body.height))
@@ -213,7 +213,7 @@ def simulate(
     return Performance(creature, place, sequence, simulation, watch.fallen, tuple(pushes))
 
 
-def _checked(creature: Creature, activations: np.ndarray, step: float | None) -> np.ndarray:
+def checked_activations(creature: Creature, activations: np.ndarray, step: float | None) -> np.ndarray:
     """(steps, M) float64 metres. Raises ``ArgumentError`` for anything else, for too few of them, and for what a muscle
     cannot do."""
     count, least = creature.muscles.segment_count, solver_steps(creature.body, step)[1]

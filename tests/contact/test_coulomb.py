@@ -6,8 +6,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 import warp as wp
 
+from egs_warp.contact.batch_contacts import coulomb_forces_of_many
 from egs_warp.contact.coulomb import contacts_of, coulomb_forces
 from egs_warp.kernels.contact.coulomb import sweeps_kernel
 
@@ -83,6 +85,27 @@ def test_forces_of_what_is_no_number_are_those_of_the_start() -> None:
     free[4] = np.nan
     forces, size = coulomb_forces(delassus, free, shift, 0.5, start)
     assert size == np.inf and np.array_equal(forces[:, 0], start[:, 0])
+
+
+def test_problems_side_by_side_have_the_bits_of_each_alone() -> None:
+    """Whatever room for contacts there is behind theirs, and whatever lies in it."""
+    counts, room, frictions = [5, 3, 0], 7, np.array([0.4, 1.5, 0.8])
+    random = np.random.default_rng(3)
+    delassus, free = random.normal(size=(3, 3 * room, 3 * room)), random.normal(size=(3, 3 * room))
+    shifts, starts = random.normal(size=(3, room)), random.normal(size=(3, room, 3))
+    alone = []
+    for world, count in enumerate(counts):
+        given = problem(world)
+        part = (given[0][: 3 * count, : 3 * count], given[1][: 3 * count], given[2][:count], given[3][:count])
+        delassus[world, : 3 * count, : 3 * count], free[world, : 3 * count] = part[:2]
+        shifts[world, :count], starts[world, :count] = part[2:]
+        alone.append(coulomb_forces(*part[:3], frictions[world], part[3]))
+    together = (torch.from_numpy(each) for each in (delassus, free, shifts, frictions, starts))
+    forces, missed = coulomb_forces_of_many(torch.tensor(counts, dtype=torch.int32), *together)
+    for world, count in enumerate(counts):
+        assert np.array_equal(forces[world, :count].numpy(), alone[world][0])
+        assert float(missed[world]) == alone[world][1]
+        assert np.array_equal(forces[world, count:].numpy(), starts[world, count:])
 
 
 def test_many_points_under_a_soft_base_are_solved_from_rest() -> None:

@@ -18,7 +18,8 @@ from egs_warp.motions.script import motion
 from egs_warp.motions.style import read_style
 from egs_warp.pipelines.creature import Creature, make_creature
 from egs_warp.pipelines.ending import State
-from egs_warp.pipelines.many import Job, Outcome, simulate_many
+from egs_warp.pipelines.job import Job
+from egs_warp.pipelines.many import Outcome, simulate_many
 from egs_warp.pipelines.performance import simulate
 
 FRAMES, FEW = 31, 11
@@ -110,6 +111,56 @@ def test_progress_ends_where_all_is_done(told: list[tuple[int, int]], outcomes: 
     frames = sum(len(outcome.frames) - 1 for outcome in outcomes if outcome.report is not None)
     done = [one for one, _ in told]
     assert told[-1] == (frames, frames) and done == sorted(done) and all(one <= of for one, of in told)
+
+
+def test_side_by_side_each_is_as_alone(creature: Creature, tmp_path: Path) -> None:
+    """Jobs of two lengths of step, on three grounds, one longer than the others, beside one that goes to a worker and
+    two that cannot be done: trajectories to 1e-9 body heights, all in the order of the jobs."""
+    count = creature.muscles.segment_count
+    held = 0.3 * np.sin(np.arange(6.0)[:, None] + np.arange(count)) * creature.muscles.bounds
+    asked = motion("stand 1")
+    jobs = [
+        Job(asked, friction=0.3, activations=held, get_up=False),
+        Job(asked, frames=4),
+        Job(asked, activations=held[:4], get_up=False),
+        Job(asked, friction=1.1, activations=-held, frames=4),
+        Job(asked, activations=held, step=1.0 / 120.0),
+        Job(asked, friction=-1.0, activations=held),
+        Job(asked, activations=held[:, 1:]),
+    ]
+    told: list[tuple[int, int]] = []
+    ended: list[int] = []
+    made = simulate_many(
+        *(creature, jobs),
+        worlds=2,
+        workers=1,
+        out=tmp_path,
+        ended=lambda number, one: ended.append(number),
+        progress=lambda done, of: told.append((done, of)),
+    )
+    assert sorted(ended) == list(range(7)) and told[-1] == (19, 19)
+    assert [one.error for one in made[:5]] == [None] * 5
+    assert made[5].error == "friction -1.0: give a Coulomb coefficient of at least 0"
+    assert made[6].error is not None and made[6].error.startswith("activations: of shape (6, ")
+    steps = []
+    for job, outcome in zip(jobs[:5], made, strict=False):
+        alone = job.perform(creature)
+        one, other = outcome.trajectory, alone.trajectory
+        steps.append(len(one.dt))
+        assert outcome.job is job and one.friction == other.friction == (job.friction or 0.8)
+        assert np.array_equal(outcome.frames, alone.simulation.frames)
+        assert np.array_equal(one.dt, other.dt) and np.array_equal(one.contact_step, other.contact_step)
+        for name, unit in (("positions", creature.body.height), ("velocities", creature.body.speed_unit)):
+            np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=0, atol=1e-9 * unit)
+        assert outcome.state is not None and outcome.report is not None
+        assert outcome.report.audit.momentum_residual < 1e-9
+        assert outcome.report.asked["activations"] == (job.activations is not None)
+    assert steps == [6, 3, 4, 3, 6]
+
+
+def test_how_many_worlds_is_at_least_none(creature: Creature) -> None:
+    with pytest.raises(ArgumentError, match=r"^worlds -1: give how many are made side by side, at least 0$"):
+        simulate_many(creature, [Job(motion("stand 1"))], worlds=-1)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed: egs-warp[ray]")

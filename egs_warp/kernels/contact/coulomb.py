@@ -1,11 +1,19 @@
-"""Contact forces with Coulomb friction for a given Delassus operator: sweeps, then Newton's method on projections."""
+"""Contact forces with Coulomb friction for given Delassus operators: sweeps, then Newton's method on projections.
+
+Each problem has a block of threads to itself on a GPU, one thread on a CPU; what a thread is within its block is its
+``lane``. All lanes take the same way: each does its share of what is wide, and all of what is short.
+"""
 
 import warp as wp
 
-from egs_warp.precision import Vec4, real
+from egs_warp.precision import Vec3, Vec4, real
 
 wp.set_module_options({"enable_backward": False})
 
+BLOCK = 128
+"""Threads for each problem on a GPU."""
+_ACROSS = wp.constant(32)
+"""Of them side by side in a row of the equations."""
 _FEW_SWEEPS, _MORE_SWEEPS = wp.constant(3), wp.constant(20)
 """Before the first attempt, and before each further one."""
 _Rates = wp.types.vector(7, real)
@@ -36,8 +44,10 @@ _SINGULAR = wp.constant(real(1e-14))
 
 @wp.struct
 class Contacts:
-    """n contacts; forces and velocities are contact-major: normal and two tangents."""
+    """n contacts; forces and velocities are contact-major: normal and two tangents. Arrays may have room for more."""
 
+    count: int
+    """n."""
     delassus: wp.array2d[real]
     """(3n, 3n) m/(N s)."""
     free: wp.array[real]
@@ -51,12 +61,13 @@ class Contacts:
 class Newton:
     """Scratch memory of the search for 3n forces."""
 
+    lane: int
     velocities: wp.array[real]
     values: wp.array[real]
     """(3n,) what the projection equations miss."""
     step: wp.array[real]
     change: wp.array[real]
-    """(3n,) of the velocities by a whole step."""
+    """(3n,) of the velocities by a whole step; while one is sought, the shares of the pivot's row in others."""
     best: wp.array[real]
     unknowns: wp.array[int]
     """(3n,) rows that the equations do not give at once."""
@@ -66,10 +77,20 @@ class Newton:
     """(3n, >= (3n + 1) / 4) their linear equations, right sides last, columns by fours: taken at once."""
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+#endif
+""")
+def wait_for_lanes():
+    """Until all lanes of a problem are here, and see what each has written."""
+    ...
+
+
 @wp.func
 def sweep(contacts: Contacts, sweeps: int, forces: wp.array[real]):
     """``sweeps`` rounds over all contacts: each takes the force that its own normal and tangents ask for (Eq. 8, 9)."""
-    count = contacts.shifts.shape[0]
+    count = contacts.count
     for _ in range(sweeps):
         for i in range(count):
             n = 3 * i
@@ -108,9 +129,7 @@ def rate_of(contacts: Contacts, i: int, scale: real):
 def missed(contacts: Contacts, forces: wp.array[real], scale: real, length: real, newton: Newton):
     """Value f - projection of f - rate u at ``length`` of the step from ``forces``; its largest part and its norm, both
     in m/s."""
-    most = real(0.0)
-    square = real(0.0)
-    for i in range(contacts.shifts.shape[0]):
+    for i in range(newton.lane, contacts.count, wp.block_dim()):
         n = 3 * i
         rate = rate_of(contacts, i, scale)
         normal = forces[n] + length * newton.step[n]
@@ -127,10 +146,17 @@ def missed(contacts: Contacts, forces: wp.array[real], scale: real, length: real
             share = radius / pull
         newton.values[n + 1] = f1 - share * first
         newton.values[n + 2] = f2 - share * second
+    wait_for_lanes()
+    most = real(0.0)
+    square = real(0.0)
+    for i in range(contacts.count):
+        rate = rate_of(contacts, i, scale)
         for t in range(3):
-            speed = newton.values[n + t] / rate
+            speed = newton.values[3 * i + t] / rate
             most = wp.max(most, wp.abs(speed))
             square += speed * speed
+    # The next values are written once all lanes have read these.
+    wait_for_lanes()
     # A maximum passes over what is no number, a sum does not.
     if not square < real(wp.inf):
         most = real(wp.inf)
@@ -138,12 +164,26 @@ def missed(contacts: Contacts, forces: wp.array[real], scale: real, length: real
 
 
 @wp.func
+def equation_entry(contacts: Contacts, weights: Vec3, own: Vec3, n: int, column: int):
+    """Of a row of the derivative: ``weights`` of the contact's three rows of the Delassus operator, and what is added
+    in its ``own`` three columns, from ``n`` on."""
+    value = (
+        weights[0] * contacts.delassus[n, column]
+        + weights[1] * contacts.delassus[n + 1, column]
+        + weights[2] * contacts.delassus[n + 2, column]
+    )
+    if column >= n and column < n + 3:
+        value += own[column - n]
+    return value
+
+
+@wp.func
 def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, short: real, newton: Newton):
     """The derivative of the values, row by row as each contact separates, sticks or slides, and how many unknowns it
     leaves: steps of forces that fall to zero are their values."""
-    count = contacts.shifts.shape[0]
+    # Each lane writes the same here.
     unknowns = int(0)
-    for i in range(count):
+    for i in range(contacts.count):
         n = 3 * i
         rate = rate_of(contacts, i, scale)
         if forces[n] - rate * newton.velocities[n] > real(0.0):
@@ -163,16 +203,16 @@ def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, sho
             newton.unknowns[unknowns] = n + 1
             newton.unknowns[unknowns + 1] = n + 2
             unknowns += 2
-    for a in range(unknowns):
+    wait_for_lanes()
+    for a in range(newton.lane, unknowns, wp.block_dim()):
         row = newton.unknowns[a]
         i = row / 3
         n = 3 * i
         rate = rate_of(contacts, i, scale)
-        own = real(0.0)
-        normal_part = real(0.0)
-        along_first = real(0.0)
-        along_second = real(0.0)
-        along = rate
+        weights = Vec3()
+        own = Vec3()
+        weights[row - n] = rate
+        own[row - n] = short
         if row > n:
             first = forces[n + 1] - rate * newton.velocities[n + 1]
             second = forces[n + 2] - rate * newton.velocities[n + 2]
@@ -181,37 +221,27 @@ def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, sho
             if pull > radius:
                 # Sliding: 1 - share (1 - d d^T) (1 - rate G) - friction d by the normal force.
                 share = radius / pull
-                d1 = first / pull
-                d2 = second / pull
-                along = real(0.0)
-                if row == n + 1:
-                    along_first = share * (real(1.0) - d1 * d1)
-                    along_second = -share * d1 * d2
-                    normal_part = -contacts.friction * d1
-                else:
-                    along_first = -share * d1 * d2
-                    along_second = share * (real(1.0) - d2 * d2)
-                    normal_part = -contacts.friction * d2
-                own = real(1.0)
+                d = wp.vec2d(first / pull, second / pull)
+                mine = d[row - n - 1]
+                along = wp.vec2d(-share * mine * d[0], -share * mine * d[1])
+                along[row - n - 1] = share * (real(1.0) - mine * mine)
+                weights = Vec3(real(0.0), rate * along[0], rate * along[1])
+                own = Vec3(-contacts.friction * mine, -along[0], -along[1])
+                own[row - n] = own[row - n] + real(1.0)
         right = -newton.values[row]
-        if own > real(0.0):
-            along_first *= rate
-            along_second *= rate
-            for c in range(3 * count):
-                newton.change[c] = (
-                    along_first * contacts.delassus[n + 1, c] + along_second * contacts.delassus[n + 2, c]
-                )
-            newton.change[n] = newton.change[n] + normal_part
-            newton.change[n + 1] = newton.change[n + 1] - along_first / rate
-            newton.change[n + 2] = newton.change[n + 2] - along_second / rate
-        else:
-            for c in range(3 * count):
-                newton.change[c] = along * contacts.delassus[row, c]
-            own = short
-        newton.change[row] = newton.change[row] + own
-        for c in range(3 * count):
-            right -= newton.change[c] * newton.step[c]
-        write_row(newton.change, newton.unknowns, unknowns, right, newton.matrix, a)
+        for c in range(3 * contacts.count):
+            if newton.step[c] != real(0.0):
+                right -= equation_entry(contacts, weights, own, n, c) * newton.step[c]
+        for quad in range((unknowns + 4) / 4):
+            four = Vec4()
+            for k in range(4):
+                b = 4 * quad + k
+                if b < unknowns:
+                    four[k] = equation_entry(contacts, weights, own, n, newton.unknowns[b])
+                if b == unknowns:
+                    four[k] = right
+            newton.matrix[a, quad] = four
+    wait_for_lanes()
     return unknowns
 
 
@@ -222,25 +252,11 @@ def entry(matrix: wp.array2d[Vec4], row: int, column: int):
 
 
 @wp.func
-def write_row(
-    values: wp.array[real], columns: wp.array[int], count: int, right: real, matrix: wp.array2d[Vec4], row: int
-):
-    """The ``count`` ``columns`` of ``values`` and ``right`` as ``row``."""
-    for quad in range((count + 4) / 4):
-        four = Vec4()
-        for k in range(4):
-            b = 4 * quad + k
-            if b < count:
-                four[k] = values[columns[b]]
-            if b == count:
-                four[k] = right
-        matrix[row, quad] = four
-
-
-@wp.func
 def solve_equations(unknowns: int, newton: Newton):
     """Gaussian elimination, rows exchanged; unknowns that the others make redundant stay zero, which keeps the forces
     bounded. The step has them in the end."""
+    lanes = wp.block_dim()
+    across = wp.min(lanes, _ACROSS)
     rank = int(0)
     largest = real(0.0)
     quads = (unknowns + 4) / 4
@@ -252,21 +268,28 @@ def solve_equations(unknowns: int, newton: Newton):
             if candidate > size:
                 size = candidate
                 pivot = a
+        wait_for_lanes()
         if size > _SINGULAR * largest:
             largest = wp.max(largest, size)
             if pivot != rank:
-                for quad in range(j / 4, quads):
+                for quad in range(j / 4 + newton.lane, quads, lanes):
                     kept = newton.matrix[rank, quad]
                     newton.matrix[rank, quad] = newton.matrix[pivot, quad]
                     newton.matrix[pivot, quad] = kept
+            wait_for_lanes()
             own = entry(newton.matrix, rank, j)
-            for a in range(rank + 1, unknowns):
-                factor = entry(newton.matrix, a, j) / own
+            for a in range(rank + 1 + newton.lane, unknowns, lanes):
+                newton.change[a] = entry(newton.matrix, a, j) / own
+            wait_for_lanes()
+            for a in range(rank + 1 + newton.lane / across, unknowns, lanes / across):
+                factor = newton.change[a]
                 if factor != real(0.0):
-                    for quad in range(j / 4, quads):
+                    for quad in range(j / 4 + newton.lane % across, quads, across):
                         newton.matrix[a, quad] = newton.matrix[a, quad] - factor * newton.matrix[rank, quad]
+            wait_for_lanes()
             newton.pivots[rank] = j
             rank += 1
+    # Each lane writes the same here.
     for back in range(rank):
         row = rank - 1 - back
         j = newton.pivots[row]
@@ -274,6 +297,7 @@ def solve_equations(unknowns: int, newton: Newton):
         for b in range(j + 1, unknowns):
             value -= entry(newton.matrix, row, b) * newton.step[newton.unknowns[b]]
         newton.step[newton.unknowns[j]] = value / entry(newton.matrix, row, j)
+    wait_for_lanes()
 
 
 @wp.func
@@ -281,56 +305,53 @@ def find_step(contacts: Contacts, forces: wp.array[real], scale: real, short: re
     """A Newton step from the values at ``forces``, and what it changes of the velocities."""
     unknowns = write_equations(contacts, forces, scale, short, newton)
     solve_equations(unknowns, newton)
-    for k in range(forces.shape[0]):
+    for k in range(newton.lane, 3 * contacts.count, wp.block_dim()):
         speed = real(0.0)
-        for c in range(forces.shape[0]):
+        for c in range(3 * contacts.count):
             speed += contacts.delassus[k, c] * newton.step[c]
         newton.change[k] = speed
+    wait_for_lanes()
 
 
 @wp.func
 def find_velocities(contacts: Contacts, forces: wp.array[real], newton: Newton):
     """Those at ``forces``; no step is left."""
-    for k in range(forces.shape[0]):
+    for k in range(newton.lane, 3 * contacts.count, wp.block_dim()):
         speed = contacts.free[k]
-        for c in range(forces.shape[0]):
+        for c in range(3 * contacts.count):
             speed += contacts.delassus[k, c] * forces[c]
         if k % 3 == 0:
             speed += contacts.shifts[k / 3]
         newton.velocities[k] = speed
         newton.step[k] = real(0.0)
         newton.change[k] = real(0.0)
+    wait_for_lanes()
 
 
 @wp.func
 def move(contacts: Contacts, forces: wp.array[real], length: real, newton: Newton):
     """Go ``length`` of the step; no step is left."""
-    for k in range(forces.shape[0]):
+    for k in range(newton.lane, 3 * contacts.count, wp.block_dim()):
         forces[k] = forces[k] + length * newton.step[k]
         newton.velocities[k] = newton.velocities[k] + length * newton.change[k]
         newton.step[k] = real(0.0)
         newton.change[k] = real(0.0)
+    wait_for_lanes()
 
 
-@wp.kernel
-def coulomb_kernel(
-    contacts: Contacts,
-    tolerance: real,
-    iterations: int,
-    # In and out:
-    forces: wp.array[real],
-    newton: Newton,
-    # Out:
-    residual: wp.array[real],
-):
-    """In one thread: sweeps, then semismooth Newton on the projection equations of Alart and Curnier, the step halved
-    until it makes them smaller; where that gets stuck, more sweeps and whole steps at other rates. ``forces`` are the
-    best that were met, within the cone; ``residual`` is how far from the equations they are,
-    m/s, and infinite where nothing is a number."""
-    count = contacts.shifts.shape[0]
+@wp.func
+def keep(contacts: Contacts, source: wp.array[real], target: wp.array[real], newton: Newton):
+    """``target`` is ``source`` (3n,) then."""
+    for k in range(newton.lane, 3 * contacts.count, wp.block_dim()):
+        target[k] = source[k]
+    wait_for_lanes()
+
+
+@wp.func
+def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp.array[real], newton: Newton):
+    """Of one problem, see ``coulomb_kernel``; its residual."""
     least = real(wp.inf)
-    for k in range(3 * count):
-        newton.best[k] = forces[k]
+    keep(contacts, forces, newton.best, newton)
     for attempt in range(7):
         scale = _RATES[attempt]
         sweeps = _MORE_SWEEPS
@@ -338,7 +359,9 @@ def coulomb_kernel(
         if attempt == 0:
             sweeps = _FEW_SWEEPS
             steps = iterations
-        sweep(contacts, sweeps, forces)
+        if newton.lane == 0:
+            sweep(contacts, sweeps, forces)
+        wait_for_lanes()
         find_velocities(contacts, forces, newton)
         for number in range(steps):
             short = _SHORT
@@ -349,8 +372,7 @@ def coulomb_kernel(
             size = missed(contacts, forces, scale, real(0.0), newton)
             if size[0] < least:
                 least = size[0]
-                for k in range(3 * count):
-                    newton.best[k] = forces[k]
+                keep(contacts, forces, newton.best, newton)
             if size[0] < tolerance:
                 break
             find_step(contacts, forces, scale, short, newton)
@@ -369,8 +391,7 @@ def coulomb_kernel(
             move(contacts, forces, length, newton)
         if least < tolerance:
             break
-    for k in range(3 * count):
-        forces[k] = newton.best[k]
+    keep(contacts, newton.best, forces, newton)
     if least < tolerance:
         one = real(1.0)
         find_velocities(contacts, forces, newton)
@@ -385,8 +406,7 @@ def coulomb_kernel(
                 break
             least = size[0]
             move(contacts, forces, one, newton)
-    residual[0] = least
-    for i in range(count):
+    for i in range(newton.lane, contacts.count, wp.block_dim()):
         n = 3 * i
         normal = wp.max(forces[n], real(0.0))
         pull = wp.sqrt(forces[n + 1] * forces[n + 1] + forces[n + 2] * forces[n + 2])
@@ -396,6 +416,50 @@ def coulomb_kernel(
         forces[n] = normal
         forces[n + 1] = share * forces[n + 1]
         forces[n + 2] = share * forces[n + 2]
+    return least
+
+
+@wp.kernel
+def coulomb_kernel(
+    # In:
+    counts: wp.array[int],
+    delassus: wp.array3d[real],
+    free: wp.array2d[real],
+    shifts: wp.array2d[real],
+    frictions: wp.array[real],
+    tolerance: real,
+    iterations: int,
+    # In and out:
+    forces: wp.array2d[real],
+    vectors: wp.array3d[real],
+    indices: wp.array3d[int],
+    matrices: wp.array3d[Vec4],
+    # Out:
+    residuals_out: wp.array[real],
+):
+    """Of each problem ``Contacts`` and ``Newton``, whose vectors and indices lie in ``vectors`` (B, 5, 3n) and
+    ``indices`` (B, 2, 3n): sweeps, then semismooth Newton on the projection equations of Alart and Curnier, the step
+    halved until it makes them smaller; where that gets stuck, more sweeps and whole steps at other rates. ``forces``
+    are the best that were met, within the cone; ``residuals_out`` is how far from the equations they are, m/s, and
+    infinite where nothing is a number."""
+    problem, lane = wp.tid()
+    contacts = Contacts()
+    contacts.count = counts[problem]
+    contacts.delassus = delassus[problem]
+    contacts.free = free[problem]
+    contacts.shifts = shifts[problem]
+    contacts.friction = frictions[problem]
+    newton = Newton()
+    newton.lane = lane
+    newton.velocities = vectors[problem, 0]
+    newton.values = vectors[problem, 1]
+    newton.step = vectors[problem, 2]
+    newton.change = vectors[problem, 3]
+    newton.best = vectors[problem, 4]
+    newton.unknowns = indices[problem, 0]
+    newton.pivots = indices[problem, 1]
+    newton.matrix = matrices[problem]
+    residuals_out[problem] = find_forces(contacts, tolerance, iterations, forces[problem], newton)
 
 
 @wp.kernel

@@ -1,0 +1,199 @@
+"""How many steps of a creature a second are made side by side on one device, over the number of worlds.
+
+python benchmarks/many_worlds.py [--quick] [--worlds B ...] [--nodes N ...] [--steps N] [--alone N] [--panel N]
+    [--chunk-bytes N] [--device cuda:0] [--json PATH] [--plot PATH]
+
+The pawn's jump is recorded once on each cage. Then so many ``--worlds`` make its first ``--steps`` steps with the
+recorded activations, each with its own share of them (0.7 to 1) and on its own friction (0.4 to 1.2). ``--alone`` of
+them are made by ``LocomotionStepper``, too: ``apart`` is how far a node of theirs is from where it is alone, at most,
+in body heights. Where the time goes is told of a few steps from the middle, in which every stage waits for the device.
+
+Aims of one GPU: ``many_2000``, 2,000 steps a second at 250 nodes and 600 at 541; ``many_alike``, at most 1e-9 body
+heights apart after 30 steps or more, on any device.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from egs_warp.assets import pawn
+from egs_warp.locomotion.batch import BatchStepper
+from egs_warp.locomotion.rollout import solver_steps
+from egs_warp.locomotion.stepper import LocomotionStepper
+from egs_warp.motions.script import motion
+from egs_warp.pipelines.creature import Creature, make_creature
+from egs_warp.pipelines.performance import simulate
+from harness import Row, Table, flags, record, report
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+ASKED = (175, 500)
+"""--nodes that give the pawn cages of about 250 and 541."""
+AIMS = {250: 2000.0, 541: 600.0}
+"""Steps a second at so many nodes."""
+NEAR = 0.1
+"""Of the nodes that an aim is for."""
+ALIKE, LEAST_STEPS = 1e-9, 30
+STAGES = ("detect", "elasticity", "factor", "substitute", "coulomb")
+_SPLIT = 3
+"""Steps of which is told where their time goes."""
+
+
+@dataclass
+class Stopwatch:
+    """Seconds of each stage, while it is ``on``."""
+
+    device: torch.device
+    on: bool = False
+    seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        """``Stages``."""
+        begun = self.now() if self.on else 0.0
+        yield
+        if self.on:
+            self.seconds[name] += self.now() - begun
+
+    def now(self) -> float:
+        """Seconds, once the device has done what it was asked."""
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+        return time.perf_counter()
+
+
+def recorded(creature: Creature, steps: int) -> np.ndarray:
+    """(steps, M) metres, the activations of the first ``steps`` of a jump."""
+    frames = -(-steps // solver_steps(creature.body)[1])
+    return simulate(creature, motion("jump"), frames=frames + 1).trajectory.activations[:steps]
+
+
+def measure(creature: Creature, jump: np.ndarray, worlds: int, *, alone: int, panel: int, chunk_bytes: int) -> Row:
+    """The rate of so many ``worlds``, where the time goes, and how far from their runs alone so many are."""
+    device = torch.device(str(creature.body.assembly.device))
+    watch = Stopwatch(device)
+    dt, _ = solver_steps(creature.body)
+    frictions, shares = np.linspace(0.4, 1.2, worlds), np.random.default_rng(0).uniform(0.7, 1.0, worlds)
+    stepper = BatchStepper(
+        *(creature.body, creature.muscles, creature.geometry, frictions),
+        panel=panel,
+        chunk_bytes=chunk_bytes,
+        stages=watch,
+    )
+    start = stepper.start([creature.start] * worlds)
+    given = torch.as_tensor(jump[:, None] * shares[:, None], device=device)
+    stepper.advance(start, given[0], dt)
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    state, middle, halved = start, start, 0
+    begun = watch.now()
+    for number, row in enumerate(given):
+        middle = state if number == len(given) // 2 else middle
+        state, done, lost = stepper.advance(state, row, dt)
+        if bool(lost.any()):
+            raise RuntimeError(f"{int(lost.sum())} worlds of {worlds} could not be solved in step {number}")
+        halved += worlds - int(done[0].converged.sum()) if done[0].dt == dt else worlds
+    seconds = watch.now() - begun
+    made = {
+        "nodes": len(creature.body.mesh.nodes),
+        "worlds": worlds,
+        "steps": len(given),
+        "rate": worlds * len(given) / seconds,
+        "halved": halved,
+        "gib": torch.cuda.max_memory_allocated(device) / 2**30 if device.type == "cuda" else None,
+    }
+    watch.on, begun = True, watch.now()
+    for row in given[len(given) // 2 :][:_SPLIT]:
+        middle, _, _ = stepper.advance(middle, row, dt)
+    whole = watch.now() - begun
+    split = {name: 1e3 * value / _SPLIT for name, value in watch.seconds.items()}
+    split["rest"] = 1e3 * whole / _SPLIT - sum(split.values())
+    ends = state.positions.cpu().numpy()
+    chosen = np.linspace(0, worlds - 1, alone).astype(int).tolist()
+    apart = [_apart(creature, jump * shares[one], float(frictions[one]), dt, ends[one]) for one in chosen]
+    return {**made, "stages": split, "apart": max(apart, default=None)}
+
+
+def _apart(creature: Creature, activations: np.ndarray, friction: float, dt: float, end: np.ndarray) -> float:
+    """Body heights from ``end`` (N, 3) to the end of the same steps alone, of the node that is furthest off."""
+    device = str(creature.body.assembly.device)
+    geometry = replace(creature.geometry, friction=friction)
+    stepper = LocomotionStepper(creature.body, creature.muscles, geometry, device=device)
+    state, memory = creature.start, stepper.initial_memory()
+    for row in activations:
+        state, memory, _ = stepper.advance_held(state, memory, row, dt)
+    return float(np.abs(state.positions - end).max()) / creature.body.height
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Time each number of worlds for each cage."""
+    parser = flags(__doc__, quick="250 nodes, 4 worlds, 3 steps", seed="of the pawn's Gaussians")
+    parser.add_argument("--worlds", type=int, nargs="*", default=[64, 256, 1024], help="side by side, of each row")
+    parser.add_argument("--nodes", type=int, nargs="*", default=list(ASKED), help="asked for, of each cage")
+    parser.add_argument("--steps", type=int, default=30, help="of each world (30)")
+    parser.add_argument("--alone", type=int, default=3, help="worlds that are run alone, too (3)")
+    parser.add_argument("--panel", type=int, default=96, help="columns that are factored at a time (96)")
+    parser.add_argument("--chunk-bytes", type=int, default=2**31, help="matrices that are factored at a time (2^31)")
+    options = parser.parse_args(arguments)
+    if options.quick:
+        options.nodes, options.worlds, options.steps = options.nodes[:1], [4], 3
+    rows: list[Row] = []
+    stages = dict.fromkeys((*STAGES, "rest"), ".1f")
+    table = Table(nodes="d", worlds="d", steps_a_second="8.1f", halved="d", gib=".1f", apart="8.1e", **stages)
+    made = pawn(seed=options.seed, device=options.device)
+    for nodes in options.nodes:
+        creature = make_creature(made.cloud, plane=made.plane, nodes=nodes)
+        jump = recorded(creature, options.steps)
+        for worlds in options.worlds:
+            row = measure(
+                *(creature, jump, worlds),
+                alone=min(options.alone, worlds),
+                panel=options.panel,
+                chunk_bytes=options.chunk_bytes,
+            )
+            rows.append(row)
+            figures = [row[name] for name in ("nodes", "worlds", "rate", "halved", "gib", "apart")]
+            table.row(*figures, *row["stages"].values())
+            record(options, rows, **summary(rows, options.device))
+    report(options, rows, **summary(rows, options.device), draw=lambda figure: draw(figure, rows))
+
+
+def summary(rows: list[Row], device: str) -> dict[str, Any]:
+    """The aims, and why one is null."""
+    best = {
+        nodes: max((row["rate"] for row in rows if abs(row["nodes"] - nodes) <= NEAR * nodes), default=None)
+        for nodes in AIMS
+    }
+    known = {nodes: rate for nodes, rate in best.items() if rate is not None}
+    aims: dict[str, bool | None] = {"many_2000": None, "many_alike": None}
+    why = {"many_2000": "a GPU's aim" if device == "cpu" else "not both cages were run"}
+    if device != "cpu" and len(known) == len(AIMS):
+        aims["many_2000"] = all(rate >= AIMS[nodes] for nodes, rate in known.items())
+    apart = [row["apart"] for row in rows if row["apart"] is not None and row["steps"] >= LEAST_STEPS]
+    if apart:
+        aims["many_alike"] = max(apart) <= ALIKE
+    else:
+        why["many_alike"] = f"no world was run alone for {LEAST_STEPS} steps"
+    return {"aims": aims, "why_null": {name: why[name] for name, value in aims.items() if value is None}}
+
+
+def draw(figure: Figure, rows: list[Row]) -> None:
+    """Steps a second over worlds, by nodes."""
+    axes = figure.subplots()
+    for nodes in dict.fromkeys(row["nodes"] for row in rows):
+        chosen = [row for row in rows if row["nodes"] == nodes]
+        axes.loglog([row["worlds"] for row in chosen], [row["rate"] for row in chosen], "o-", label=f"{nodes} nodes")
+    axes.set(xlabel="worlds", ylabel="steps a second")
+    axes.legend()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,194 @@
+"""Elasticity, damping and muscles of many bodies with one mesh: the kernels of one body over copies of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sparse
+import torch
+import warp as wp
+
+from egs_warp.fem.elasticity import ElasticAssembly
+from egs_warp.fem.worlds import launch_on, shared, tiled, tiled_bounds
+from egs_warp.kernels.fem import elasticity as kernels
+from egs_warp.muscles.muscle_set import MuscleSet
+from egs_warp.muscles.tension import FULL, SLACK
+from egs_warp.precision import Mat33, Vec3, real
+
+_NEGLIGIBLE = 1e-300
+"""Metres: no segment is shorter, so that one whose ends meet has a direction of 0."""
+
+
+class BatchElasticity:
+    """Index maps of ``count`` copies of a body's mesh and muscles, which lie one behind the other. Tensors of c bodies
+    go in and out, c at most ``count``: they use the first c copies."""
+
+    def __init__(self, assembly: ElasticAssembly, muscles: MuscleSet, count: int, *, matrices: int) -> None:
+        """``matrices``: bodies whose matrices are asked for at a time."""
+        self.device = torch.device(str(assembly.device))
+        self.node_count, self.tet_count = len(assembly.mesh.nodes), len(assembly.mesh.tets)
+        self._material, maps = assembly.material, assembly.maps
+        self._tets = shared(tiled(assembly.mesh.tets, count, self.node_count, self.device), wp.vec4i)
+        self._rest_inverses = shared(self._tensor(maps.rest_inverses).repeat(count, 1, 1), Mat33)
+        self._volumes = shared(self._tensor(maps.volumes).repeat(count), real)
+        self._corners = [
+            shared(tiled_bounds(maps.corner_offsets, count, self.device), wp.int32),
+            shared(tiled(maps.corner_from_slot, count, 4 * self.tet_count, self.device), wp.int32),
+        ]
+        self._block_count, self._entry_count = len(maps.entry_from_block), assembly.upper_pattern.nnz
+        self._gathering = [
+            shared(tiled_bounds(maps.contribution_offsets, matrices, self.device), wp.int32),
+            shared(tiled(maps.block_from_contribution, matrices, 16 * self.tet_count, self.device), wp.int32),
+            shared(tiled(maps.entry_from_block, matrices, self._entry_count, self.device), wp.int32),
+        ]
+        size, pattern = 3 * self.node_count, assembly.upper_pattern
+        columns = np.repeat(np.arange(size), np.diff(pattern.indptr))
+        self._lower = torch.as_tensor(columns * size + pattern.indices.astype(np.int64), device=self.device)
+        self._diagonal = torch.as_tensor(assembly.diagonal_entries.astype(np.int64), device=self.device)
+        rows = muscles.difference_rows
+        self.segment_count = muscles.segment_count
+        self._rows = self._tensor(rows.toarray())
+        self._rest_lengths = self._tensor(muscles.rest_lengths)
+        self._lines = [
+            *self._copies(rows, count, self.node_count),
+            shared(self._rest_lengths.repeat(count), real),
+        ]
+        self._ends = self._copies(rows.T.tocsr(), count, self.segment_count)
+        self._no_ends = self._copies(rows.T.tocsr(), 0, 0)
+        self._no_ends[0] = shared(torch.zeros(0, dtype=torch.int32, device=self.device), wp.int32)
+        self._no_gradients = shared(self._empty(0, 3, 3), Mat33)
+
+    def _copies(self, rows: sparse.csr_matrix, count: int, column_count: int) -> list[wp.array]:
+        """``rows`` over so many columns, ``count`` times: where each begins, its columns, its entries."""
+        return [
+            shared(tiled_bounds(rows.indptr, count, self.device), wp.int32),
+            shared(tiled(rows.indices, count, column_count, self.device), wp.int32),
+            shared(self._tensor(rows.data).repeat(count), real),
+        ]
+
+    def _tensor(self, values: np.ndarray) -> torch.Tensor:
+        return torch.as_tensor(np.asarray(values, dtype=np.float64), device=self.device)
+
+    def _model(self) -> list[Any]:
+        material = self._material
+        return [self._tets, self._rest_inverses, self._volumes, material.mu, material.lam, material.damping_time]
+
+    def _empty(self, *shape: int) -> torch.Tensor:
+        return torch.empty(shape, dtype=torch.float64, device=self.device)
+
+    def deformation_gradients(self, positions: torch.Tensor) -> torch.Tensor:
+        """(c, T, 3, 3) F at ``positions`` (c, N, 3)."""
+        gradients = self._empty(len(positions), self.tet_count, 3, 3)
+        launch_on(
+            self.device,
+            kernels.deformation_gradients_kernel,
+            len(positions) * self.tet_count,
+            inputs=[self._tets, self._rest_inverses, (positions.reshape(-1, 3), Vec3)],
+            outputs=[(gradients.view(-1, 3, 3), Mat33)],
+        )
+        return gradients
+
+    def upright(self, positions: torch.Tensor) -> torch.Tensor:
+        """(c,) bool: whether no element is inverted at ``positions`` (c, N, 3)."""
+        energies, determinants = self._empty(2, len(positions), self.tet_count)
+        flat = positions.reshape(-1, 3)
+        launch_on(
+            self.device,
+            kernels.element_energies_kernel,
+            energies.numel(),
+            inputs=[*self._model(), self._no_gradients, (flat, Vec3), 0.0],
+            outputs=[(energies.view(-1), real), (determinants.view(-1), real)],
+        )
+        return determinants.amin(dim=1) > 0.0
+
+    def gradient(
+        self, positions: torch.Tensor, start_gradients: torch.Tensor, dt: float, tensions: torch.Tensor | None
+    ) -> torch.Tensor:
+        """(c, N, 3) newtons, minus the forces of elasticity, of damping over a step of ``dt`` seconds from
+        ``start_gradients`` (c, T, 3, 3), and of muscles with ``tensions`` (c, M) newtons, at ``positions`` (c, N, 3).
+        """
+        count, flat = len(positions), (positions.reshape(-1, 3), Vec3)
+        corners, nodes = self._empty(count * self.tet_count, 4, 3), self._empty(count, self.node_count, 3)
+        ends, pulls = self._no_ends, self._empty(0, 3)
+        if tensions is not None:
+            ends, pulls = self._ends, self._empty(count * self.segment_count, 3)
+            launch_on(
+                self.device,
+                kernels.segment_pulls_kernel,
+                len(pulls),
+                inputs=[*self._lines, SLACK, FULL, (tensions.reshape(-1), real), flat],
+                outputs=[(pulls, Vec3)],
+            )
+        launch_on(
+            self.device,
+            kernels.element_gradients_kernel,
+            count * self.tet_count,
+            inputs=[*self._model(), (start_gradients.view(-1, 3, 3), Mat33), flat, dt],
+            outputs=[(corners, Vec3)],
+        )
+        launch_on(
+            self.device,
+            kernels.gather_forces_kernel,
+            count * self.node_count,
+            inputs=[*self._corners, *ends, (corners, Vec3), (pulls, Vec3)],
+            outputs=[(nodes.view(-1, 3), Vec3)],
+        )
+        return nodes
+
+    def matrices(
+        self,
+        positions: torch.Tensor,
+        start_gradients: torch.Tensor,
+        dt: float,
+        diagonal: torch.Tensor,
+        *,
+        projected: bool,
+    ) -> torch.Tensor:
+        """(c, 3N, 3N) kg, lower triangles of ``diagonal`` (3N,) plus dt^2 times the second derivative of elasticity and
+        damping; ``projected``: each element's part is made positive semi-definite."""
+        count, size = len(positions), 3 * self.node_count
+        blocks, entries = self._empty(count * self.tet_count, 16, 3, 3), self._empty(count, self._entry_count)
+        launch_on(
+            self.device,
+            kernels.element_projected_hessians_kernel if projected else kernels.element_hessians_kernel,
+            count * self.tet_count,
+            inputs=[
+                *self._model(),
+                *((start_gradients.view(-1, 3, 3), Mat33), (positions.reshape(-1, 3), Vec3), dt),
+            ],
+            outputs=[(blocks, Mat33)],
+        )
+        launch_on(
+            self.device,
+            kernels.gather_matrix_kernel,
+            count * self._block_count,
+            inputs=[*self._gathering, (blocks, Mat33), dt**2],
+            outputs=[(entries.view(-1), real)],
+        )
+        entries[:, self._diagonal] += diagonal
+        made = torch.zeros((count, size * size), dtype=torch.float64, device=self.device)
+        made.index_copy_(1, self._lower, entries)
+        return made.view(count, size, size)
+
+    def add_stiffness(
+        self, matrices: torch.Tensor, positions: torch.Tensor, tensions: torch.Tensor, factor: float, *, least: float
+    ) -> None:
+        """Add ``factor`` times the second derivative of the energy of muscles with ``tensions`` (c, M) newtons to the
+        ``matrices`` (c, 3N, 3N); rates below ``least`` of a body's largest do not count (``TensionHessian``)."""
+        lines = self._rows @ positions
+        lengths = lines.norm(dim=2).clamp(min=_NEGLIGIBLE)
+        directions = lines / lengths[:, :, None]
+        along = ((lengths / self._rest_lengths - SLACK) / (FULL - SLACK)).clamp(0.0, 1.0)
+        across = tensions * along**2 * (3.0 - 2.0 * along) / lengths
+        stretch = tensions * 6.0 * along * (1.0 - along) / (FULL - SLACK) / self._rest_lengths
+        largest = torch.maximum(across.abs(), stretch.abs()).amax(dim=1, keepdim=True).clamp(min=_NEGLIGIBLE)
+        across, stretch = (torch.where(rate.abs() > least * largest, rate, 0.0) for rate in (across, stretch))
+        blocks = matrices.view(len(matrices), self.node_count, 3, self.node_count, 3)
+        for i in range(3):
+            for k in range(i + 1):
+                rates = (stretch - across) * directions[:, :, i] * directions[:, :, k] + (across if i == k else 0.0)
+                part = self._rows.T @ (factor * rates[:, :, None] * self._rows)
+                blocks[:, :, i, :, k] += part
+                if i != k:
+                    blocks[:, :, k, :, i] += part

@@ -1,0 +1,180 @@
+"""Jobs whose activations are given, many at a time in one process on the creature's own device."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from egs_warp.fem.body import BodyState
+from egs_warp.fem.step_problem import UNSOLVABLE, UnsolvableStepError
+from egs_warp.locomotion.rollout import solver_steps
+from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory, StepReport
+from egs_warp.pipelines.creature import Creature, checked_friction
+from egs_warp.pipelines.crew import Ended, Tell, attempted
+from egs_warp.pipelines.job import Job, Told
+from egs_warp.pipelines.performance import check_frames, checked_activations
+
+if TYPE_CHECKING:
+    from egs_warp.locomotion.batch import BatchStepper
+
+MOST_WORLDS = 1024
+"""Side by side: more are hardly faster, and what they have done lies in memory until they end."""
+_SHARE = 0.4
+"""Of the free memory of a GPU that factors of matrices may take."""
+
+
+def most_worlds(creature: Creature) -> int:
+    """How many jobs the creature's device has room for side by side; 0 where that is a CPU, torch does not see it, or
+    the ground is not flat."""
+    device = creature.body.assembly.device
+    if not device.is_cuda or creature.geometry.field is not None:
+        return 0
+    try:
+        import torch
+    except ImportError:
+        return 0
+    if not torch.cuda.is_available():
+        return 0
+    free, _ = torch.cuda.mem_get_info(str(device))
+    return min(MOST_WORLDS, int(_SHARE * free) // (72 * len(creature.body.mesh.nodes) ** 2))
+
+
+def fits(job: Job) -> bool:
+    """Whether the job can be done beside others: its muscles do what is given, and nothing pushes it."""
+    return job.activations is not None and not job.pushes
+
+
+def performed(
+    creature: Creature,
+    jobs: Sequence[tuple[int, Job]],
+    *,
+    worlds: int,
+    told: Callable[[dict[int, tuple[int, int]]], object],
+) -> Iterator[Ended]:
+    """The ``jobs``, each with its number, as each ends: so many ``worlds`` side by side, those of one length of step
+    together. ``told`` hears after each frame of each job in work how many it has done, and of how many."""
+    entered: list[_Entered] = []
+    for number, job in jobs:
+        kind, value = attempted(partial(_entered, creature, number), job, told)
+        if kind == "done":
+            entered.append(value)
+        else:
+            yield Ended(number, None, value, 1)
+    entered.sort(key=lambda one: (one.dt, one.number))
+    for _, alike in groupby(entered, key=lambda one: one.dt):
+        every = list(alike)
+        for first in range(0, len(every), worlds):
+            yield from _ended(creature, every[first : first + worlds], told)
+
+
+@dataclass(frozen=True)
+class _Entered:
+    """A job that can be done."""
+
+    number: int
+    job: Job
+    friction: float
+    dt: float
+    """Seconds of a step."""
+    per_frame: int
+    activations: np.ndarray
+    """(steps, M) metres, of whole frames."""
+
+
+def _entered(creature: Creature, number: int, job: Job, _: Tell) -> _Entered:
+    """Raises ``UserError`` for what cannot be done."""
+    assert job.activations is not None, "it fits"
+    check_frames(job.frames)
+    friction = creature.geometry.friction if job.friction is None else checked_friction(job.friction)
+    given = checked_activations(creature, job.activations, job.step)
+    dt, per_frame = solver_steps(creature.body, job.step)
+    frames = len(given) // per_frame
+    frames = frames if job.frames is None else min(frames, job.frames - 1)
+    return _Entered(number, job, friction, dt, per_frame, given[: frames * per_frame])
+
+
+def _ended(
+    creature: Creature, together: Sequence[_Entered], told: Callable[[dict[int, tuple[int, int]]], object]
+) -> Iterator[Ended]:
+    """Step all, then tell of each."""
+    from egs_warp.locomotion.batch import BatchStepper
+
+    stepper = BatchStepper(
+        *(creature.body, creature.muscles, creature.geometry, [one.friction for one in together]),
+        settings=creature.stepper.settings,
+    )
+    starts = [creature.start] * len(together)
+    lost = [False] * len(together)
+    # On its own ground the creature stands already.
+    if any(one.job.friction is not None for one in together):
+        settled, failed = stepper.settle()
+        moved = [one.job.friction is not None for one in together]
+        starts = [there if anew else start for there, anew, start in zip(settled, moved, starts, strict=True)]
+        lost = [bool(gone) and anew for gone, anew in zip(failed.tolist(), moved, strict=True)]
+    creatures = [
+        replace(creature, stepper=creature.stepper.with_friction(one.friction), start=start)
+        for one, start in zip(together, starts, strict=True)
+    ]
+    runs = _stepped(stepper, together, creatures, told)
+    for one, its, made, gone in zip(together, creatures, runs, lost, strict=True):
+        kind, value = attempted(partial(_outcome, its, made, gone), one.job, told)
+        yield Ended(one.number, *((value, None) if kind == "done" else (None, value)), 1)
+
+
+def _outcome(creature: Creature, made: list[list[StepReport]], lost: bool, job: Job, _: Tell) -> Told:
+    if lost:
+        raise UnsolvableStepError(UNSOLVABLE)
+    return job.outcome(creature, job.performed(replace(creature, stepper=_MadeStepper(creature.stepper, made))))
+
+
+class _MadeStepper(LocomotionStepper):
+    """Of a run whose steps were made beside others: it tells them again, for the motion to measure."""
+
+    def __init__(self, stepper: LocomotionStepper, made: list[list[StepReport]]) -> None:
+        vars(self).update(vars(stepper))
+        self._made = iter(made)
+
+    def advance_held(
+        self, state: BodyState, memory: StepMemory, activations: np.ndarray, dt: float
+    ) -> tuple[BodyState, StepMemory, list[StepReport]]:
+        """The next step in its parts."""
+        done = next(self._made)
+        if not done:
+            raise UnsolvableStepError(UNSOLVABLE)
+        return done[-1].state, StepMemory.after(done[-1]), done
+
+
+def _stepped(
+    stepper: BatchStepper,
+    together: Sequence[_Entered],
+    creatures: Sequence[Creature],
+    told: Callable[[dict[int, tuple[int, int]]], object],
+) -> list[list[list[StepReport]]]:
+    """Of each the reports of each of its steps; the last of one that cannot be solved has none."""
+    import torch
+
+    runs: list[list[list[StepReport]]] = [[] for _ in together]
+    state = stepper.start([creature.start for creature in creatures])
+    longest, per_frame = max(len(one.activations) for one in together), together[0].per_frame
+    for number in range(longest):
+        asked = torch.tensor([len(together[world].activations) > number for world in state.worlds.tolist()])
+        state = state.of(asked.nonzero().squeeze(1).to(stepper.device))
+        if len(state.worlds) == 0:
+            break
+        worlds = state.worlds.tolist()
+        for world in worlds:
+            runs[world].append([])
+        given = np.stack([together[world].activations[number] for world in worlds])
+        state, done, _ = stepper.advance(state, given, together[0].dt)
+        for step in done:
+            for world, report in zip(step.worlds.tolist(), step.reports(), strict=True):
+                runs[world][-1].append(report)
+        if (number + 1) % per_frame == 0:
+            frame = (number + 1) // per_frame
+            told({together[w].number: (frame, len(together[w].activations) // per_frame) for w in worlds})
+    return runs

@@ -1,0 +1,51 @@
+"""The figures of worlds side by side: the aims, and why one is null; and a row of a small one."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+from egs_warp.assets import pawn
+from egs_warp.pipelines.creature import make_creature
+from tests.support.scripts import BENCHMARKS, module_of
+
+
+@pytest.fixture
+def many_worlds(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return module_of("many_worlds")
+
+
+def row(nodes: int, rate: float, apart: float | None = 1e-12, steps: int = 30) -> dict[str, Any]:
+    return {"nodes": nodes, "rate": rate, "apart": apart, "steps": steps}
+
+
+def test_the_rate_that_is_asked_is_that_of_both_cages_on_a_gpu(many_worlds: ModuleType) -> None:
+    rows = [row(253, 1900.0), row(253, 2100.0), row(541, 650.0)]
+    assert many_worlds.summary(rows, "cuda:0") == {"aims": {"many_2000": True, "many_alike": True}, "why_null": {}}
+    slow = many_worlds.summary([*rows[:2], row(541, 590.0)], "cuda:0")
+    assert slow["aims"]["many_2000"] is False
+    assert many_worlds.summary([rows[0], rows[2]], "cuda:0")["aims"]["many_2000"] is False
+    assert many_worlds.summary(rows[:2], "cuda:0")["why_null"] == {"many_2000": "not both cages were run"}
+    assert many_worlds.summary(rows, "cpu")["why_null"] == {"many_2000": "a GPU's aim"}
+
+
+def test_all_that_were_run_alone_for_long_enough_must_be_alike(many_worlds: ModuleType) -> None:
+    rows = [row(253, 1.0), row(253, 1.0, 2e-9), row(253, 1.0, None)]
+    assert many_worlds.summary(rows, "cpu")["aims"]["many_alike"] is False
+    assert many_worlds.summary(rows[:1], "cpu")["aims"]["many_alike"] is True
+    few = [row(253, 1.0, 1e-16, 29), row(253, 1.0, None)]
+    assert many_worlds.summary(few, "cpu")["why_null"]["many_alike"] == "no world was run alone for 30 steps"
+
+
+def test_a_row_tells_the_rate_where_the_time_goes_and_how_far_apart(many_worlds: ModuleType) -> None:
+    made = pawn(gaussian_count=3000)
+    creature = make_creature(made.cloud, plane=made.plane, nodes=50)
+    jump = many_worlds.recorded(creature, 2)
+    assert jump.shape == (2, creature.muscles.segment_count)
+    found = many_worlds.measure(creature, jump, 3, alone=2, panel=96, chunk_bytes=2**20)
+    assert found["worlds"] == 3 and found["steps"] == 2 and found["rate"] > 0.0 and found["halved"] == 0
+    assert set(found["stages"]) == {*many_worlds.STAGES, "rest"} and min(found["stages"].values()) > 0.0
+    assert found["apart"] < 1e-12

@@ -1,0 +1,200 @@
+"""Many worlds side by side: each goes as it does alone, and as it does beside others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from egs_warp.assets import pawn
+from egs_warp.contact.detection import ContactGeometry
+from egs_warp.errors import ArgumentError
+from egs_warp.fem.body import BodyState, SoftBody
+from egs_warp.geometry.height_field import HeightField
+from egs_warp.locomotion.batch import BatchStepper
+from egs_warp.locomotion.rollout import solver_steps
+from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
+from egs_warp.locomotion.trajectory import Trajectory
+from egs_warp.motions.script import motion
+from egs_warp.muscles.muscle_set import MuscleSet
+from egs_warp.pipelines.creature import Creature, make_creature
+from egs_warp.pipelines.performance import simulate
+
+FRICTIONS = (0.8, 0.3, 1.2)
+STRENGTHS = (1.0, 0.9, 0.5)
+"""Of the recorded activations, for each world."""
+FIRST, STEPS = 29, 30
+"""Steps of the recorded jump: the body leaves the ground in its 34th and is back in its 56th."""
+
+
+@pytest.fixture(scope="module")
+def creature() -> Creature:
+    made = pawn(gaussian_count=3000)
+    return make_creature(made.cloud, plane=made.plane, nodes=50)
+
+
+@pytest.fixture(scope="module")
+def jump(creature: Creature) -> Trajectory:
+    return simulate(creature, motion("jump"), frames=FIRST + STEPS + 1).trajectory
+
+
+def alone(creature: Creature, friction: float) -> LocomotionStepper:
+    geometry = replace(creature.geometry, friction=friction)
+    return LocomotionStepper(creature.body, creature.muscles, geometry, device="cpu")
+
+
+def runs_alone(
+    creature: Creature, starts: list[BodyState], activations: np.ndarray, dt: float
+) -> list[list[list[StepReport]]]:
+    """Of each world and each step of ``activations`` (steps, worlds, M) the reports."""
+    runs = []
+    for world, (friction, state) in enumerate(zip(FRICTIONS, starts, strict=True)):
+        stepper = alone(creature, friction)
+        memory, reports = stepper.initial_memory(), []
+        for given in activations[:, world]:
+            state, memory, done = stepper.advance_held(state, memory, given, dt)
+            reports.append(done)
+        runs.append(reports)
+    return runs
+
+
+def runs_together(stepper: BatchStepper, starts: list[BodyState], activations: np.ndarray, dt: float) -> list:
+    """The same side by side."""
+    runs: list[list[list[StepReport]]] = [[] for _ in starts]
+    state = stepper.start(starts)
+    for given in activations:
+        state, done, lost = stepper.advance(state, given, dt)
+        assert not lost.any()
+        for run in runs:
+            run.append([])
+        for step in done:
+            for world, report in zip(step.worlds.tolist(), step.reports(), strict=True):
+                runs[world][-1].append(report)
+    return runs
+
+
+def check(creature: Creature, one: StepReport, other: StepReport) -> None:
+    """The same step, to 1e-9 of the body's units."""
+    body = creature.body
+    assert (one.dt, one.converged, one.newton_iterations) == (other.dt, other.converged, other.newton_iterations)
+    assert np.array_equal(one.contacts.points, other.contacts.points)
+    assert np.array_equal(one.contacts.faces, other.contacts.faces)
+    assert np.array_equal(one.activations, other.activations)
+    assert one.state.time == pytest.approx(other.state.time, abs=1e-12)
+    for mine, its, unit in (
+        (one.state.positions, other.state.positions, body.height),
+        (one.state.velocities, other.state.velocities, body.speed_unit),
+        (one.end_gaps, other.end_gaps, body.height),
+        (one.contacts.axes, other.contacts.axes, 1.0),
+        (one.min_gap, other.min_gap, body.height),
+        (one.added_spin, other.added_spin, 1.0 / body.time_unit),
+    ):
+        np.testing.assert_allclose(mine, its, rtol=0, atol=1e-9 * unit)
+    # Redundant points share a load in more than one way.
+    nodal = [report.contacts.pushes(report.forces) for report in (one, other)]
+    np.testing.assert_allclose(*nodal, rtol=0, atol=1e-6 * body.weight)
+
+
+def test_each_goes_as_it_does_alone(creature: Creature, jump: Trajectory) -> None:
+    """30 steps of a jump, off the ground and back, on three grounds with three strengths."""
+    dt, _ = solver_steps(creature.body)
+    starts = [BodyState(jump.positions[FIRST], jump.velocities[FIRST])] * 3
+    activations = np.stack([strength * jump.activations[FIRST:][:STEPS] for strength in STRENGTHS], axis=1)
+    expected = runs_alone(creature, starts, activations, dt)
+    made = runs_together(BatchStepper(*parts(creature), FRICTIONS), starts, activations, dt)
+    for run, its in zip(made, expected, strict=True):
+        assert [len(done) for done in run] == [len(done) for done in its] == [1] * STEPS
+        for one, other in zip(run, its, strict=True):
+            check(creature, one[0], other[0])
+    pressed = [[bool((done[0].forces[:, 0] > 0.0).any()) for done in run] for run in made]
+    # It stood, flew, and stood again; grounds differ.
+    assert all(run[0] for run in pressed) and not all(pressed[0]) and pressed[0][-1]
+    apart = np.abs(made[0][-1][0].state.positions - made[1][-1][0].state.positions).max()
+    assert apart > 1e-4 * creature.body.height
+
+
+def parts(creature: Creature) -> tuple[SoftBody, MuscleSet, ContactGeometry]:
+    return creature.body, creature.muscles, creature.geometry
+
+
+def rough(creature: Creature) -> tuple[list[BodyState], np.ndarray, float]:
+    """Starts, activations (2, 3, M) and the step of two worlds that fall on their ground with all muscles at odds, in
+    steps too long for that, and one between them that stands."""
+    body, down = creature.body, creature.body.gravity / np.linalg.norm(creature.body.gravity)
+    dt = 4.0 * solver_steps(body)[0]
+    starts = [
+        BodyState(creature.start.positions - 0.05 * body.height * down, creature.start.velocities + speed * down)
+        for speed in (3.0 * body.speed_unit, body.speed_unit)
+    ]
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (2, 3, len(creature.muscles.bounds)))
+    signs[:, 1] = 0.0
+    return [starts[0], creature.start, starts[1]], signs * creature.muscles.bounds, dt
+
+
+def test_what_does_not_converge_is_done_in_halves_as_alone(creature: Creature) -> None:
+    starts, activations, dt = rough(creature)
+    expected = runs_alone(creature, starts, activations[:1], dt)
+    made = runs_together(BatchStepper(*parts(creature), FRICTIONS), starts, activations[:1], dt)
+    lengths = [[report.dt / dt for report in run[0]] for run in made]
+    assert lengths == [[report.dt / dt for report in run[0]] for run in expected]
+    assert lengths[1] == [1.0] and min(lengths[0]) <= 0.25 and sum(lengths[0]) == pytest.approx(1.0)
+    for run, its in zip(made, expected, strict=True):
+        for one, other in zip(run[0], its[0], strict=True):
+            check(creature, one, other)
+
+
+def test_what_a_world_does_does_not_hang_on_its_neighbours(creature: Creature) -> None:
+    """Whatever the others do meanwhile: stand, fall, go in halves, or break. To rounding: products of fewer or more
+    worlds, and with more contacts, round otherwise."""
+    starts, activations, dt = rough(creature)
+    stood = starts[1]
+    broken = replace(stood, velocities=np.full_like(stood.velocities, np.nan))
+    given = np.repeat(0.1 * activations[:, :1], 3, axis=1)
+    other = activations.copy()
+    other[:, 1] = given[:, 1]
+    ends = []
+    for states, muscles in (([stood] * 3, given), (starts, other), ([broken, stood, stood], given)):
+        stepper = BatchStepper(*parts(creature), FRICTIONS)
+        state = stepper.start(states)
+        for row in muscles:
+            state, _, _ = stepper.advance(state, row[state.worlds], dt)
+        ends.append(state.positions[state.worlds.tolist().index(1)].numpy())
+    for end in ends[1:]:
+        np.testing.assert_allclose(end, ends[0], rtol=0, atol=1e-13 * creature.body.height)
+
+
+def test_small_chunks_change_nothing(creature: Creature) -> None:
+    starts, activations, dt = rough(creature)
+    whole, cut = (
+        runs_together(stepper, starts, activations[:1], dt)
+        for stepper in (
+            BatchStepper(*parts(creature), FRICTIONS),
+            BatchStepper(*parts(creature), FRICTIONS, chunk_bytes=1, panel=100),
+        )
+    )
+    for one, other in zip(whole, cut, strict=True):
+        for mine, its in zip(one[0], other[0], strict=True):
+            check(creature, mine, its)
+
+
+def test_a_world_that_cannot_be_solved_is_told_and_leaves(creature: Creature) -> None:
+    """And the others go on."""
+    dt, _ = solver_steps(creature.body)
+    broken = replace(creature.start, velocities=np.full_like(creature.start.velocities, np.nan))
+    stepper = BatchStepper(*parts(creature), FRICTIONS)
+    state = stepper.start([creature.start, broken, creature.start])
+    given = np.zeros((3, creature.muscles.segment_count))
+    state, done, lost = stepper.advance(state, given, dt)
+    assert lost.tolist() == [False, True, False] and state.worlds.tolist() == [0, 2]
+    assert [step.worlds.tolist() for step in done] == [[0, 2]]
+    state, done, lost = stepper.advance(state, given[:2], dt)
+    assert not lost.any() and torch.isfinite(state.positions).all()
+
+
+def test_ground_that_is_not_flat_is_refused(creature: Creature) -> None:
+    ground = HeightField(np.eye(3), np.zeros(3), 1.0, np.zeros((3, 3)))
+    geometry = replace(creature.geometry, field=ground)
+    with pytest.raises(ArgumentError, match=r"^geometry: many worlds stand on flat ground only; run these over "):
+        BatchStepper(creature.body, creature.muscles, geometry, FRICTIONS)
