@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from egs_warp.fem.worlds import launch_on
-from egs_warp.kernels.fem import panels as kernels
+from egs_warp.kernels.fem import batch_factors as kernels
 from egs_warp.precision import real
 
 PANEL = 96
