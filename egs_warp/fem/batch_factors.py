@@ -33,9 +33,9 @@ class BatchFactors:
         self.chunk = max(1, chunk_bytes // (8 * size * size))
         """Worlds whose matrices are worked on at a time."""
         self._starts = range(0, size, panel)
-        real = {"dtype": torch.float64, "device": device}
-        self._factors = torch.zeros((slots, size, size), **real)
-        self._inverses = torch.zeros((slots, len(self._starts), panel, panel), **real)
+        kind = {"dtype": torch.float64, "device": device}
+        self._factors = torch.zeros((slots, size, size), **kind)
+        self._inverses = torch.zeros((slots, len(self._starts), panel, panel), **kind)
 
     def factor(self, slots: torch.Tensor, matrices: torch.Tensor) -> torch.Tensor:
         """Factor ``matrices`` (k, n, n), lower triangles, which are used up, into ``slots`` (k,); (k,) bool says which
