@@ -1,12 +1,15 @@
 """How many steps of a creature a second are made side by side on one device, over the number of worlds.
 
 python benchmarks/many_worlds.py [--quick] [--worlds B ...] [--nodes N ...] [--steps N] [--alone N] [--panel N]
-    [--chunk-bytes N] [--device cuda:0] [--json PATH] [--plot PATH]
+    [--chunk-bytes N] [--matrices B] [--device cuda:0] [--json PATH] [--plot PATH]
 
 The pawn's jump is recorded once on each cage. Then so many ``--worlds`` make its first ``--steps`` steps with the
 recorded activations, each with its own share of them (0.7 to 1) and on its own friction (0.4 to 1.2). ``--alone`` of
 them are made by ``LocomotionStepper``, too: ``apart`` is how far a node of theirs is from where it is alone, at most,
 in body heights. Where the time goes is told of a few steps from the middle, in which every stage waits for the device.
+
+``--matrices`` compares, beside all that, what factors of so many dense matrices of each cage's size take by panels of
+several widths, and by torch's own Cholesky factorisation, in ms; and what they take to solve with 1 and 96 right sides.
 
 Aims of one GPU: ``many_2000``, 2,000 steps a second at 250 nodes and 600 at 541; ``many_alike``, at most 1e-9 body
 heights apart after 30 steps or more, on any device.
@@ -15,7 +18,7 @@ heights apart after 30 steps or more, on any device.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
@@ -24,6 +27,7 @@ import numpy as np
 import torch
 
 from egs_warp.assets import pawn
+from egs_warp.fem.batch_factors import BatchFactors
 from egs_warp.locomotion.batch import BatchStepper
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.stepper import LocomotionStepper
@@ -43,6 +47,7 @@ NEAR = 0.1
 """Of the nodes that an aim is for."""
 ALIKE, LEAST_STEPS = 1e-9, 30
 STAGES = ("detect", "elasticity", "factor", "substitute", "coulomb")
+PANELS = (32, 64, 96, 128, 192)
 _SPLIT = 3
 """Steps of which is told where their time goes."""
 
@@ -133,6 +138,36 @@ def _apart(creature: Creature, activations: np.ndarray, friction: float, dt: flo
     return float(np.abs(state.positions - end).max()) / creature.body.height
 
 
+def matrices(size: int, count: int, device: torch.device) -> list[Row]:
+    """What ``count`` factorisations of matrices (size, size) and solutions take."""
+    watch = Stopwatch(device)
+    half = torch.randn((count, size, 8), dtype=torch.float64, device=device)
+    given = half @ half.mT + size * torch.eye(size, dtype=torch.float64, device=device)
+    slots = torch.arange(count, device=device)
+
+    def factored(factors: BatchFactors, spent: list[torch.Tensor]) -> None:
+        factors.factor(slots, spent.pop())
+
+    def took(action: Callable[..., object], *arguments: object) -> float:
+        best = np.inf
+        for _ in range(3):
+            begun = watch.now()
+            action(*arguments)
+            best = min(best, 1e3 * (watch.now() - begun))
+        return float(best)
+
+    rows: list[Row] = [{"size": size, "panel": None, "factor": took(torch.linalg.cholesky_ex, given)}]
+    for panel in PANELS:
+        factors = BatchFactors(count, size, device, panel=panel)
+        spent = [given.clone() for _ in range(3)]
+        row: Row = {"size": size, "panel": panel, "factor": took(factored, factors, spent)}
+        for columns in (1, 96):
+            right = torch.ones((count, size, columns), dtype=torch.float64, device=device)
+            row[f"solve_{columns}"] = took(factors.solve, slots, right)
+        rows.append(row)
+    return rows
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Time each number of worlds for each cage."""
     parser = flags(__doc__, quick="250 nodes, 4 worlds, 3 steps", seed="of the pawn's Gaussians")
@@ -142,6 +177,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--alone", type=int, default=3, help="worlds that are run alone, too (3)")
     parser.add_argument("--panel", type=int, default=96, help="columns that are factored at a time (96)")
     parser.add_argument("--chunk-bytes", type=int, default=2**31, help="matrices that are factored at a time (2^31)")
+    parser.add_argument("--matrices", type=int, help="dense matrices that are factored in several ways")
     options = parser.parse_args(arguments)
     if options.quick:
         options.nodes, options.worlds, options.steps = options.nodes[:1], [4], 3
@@ -163,7 +199,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
             figures = [row[name] for name in ("nodes", "worlds", "rate", "halved", "gib", "apart")]
             table.row(*figures, *row["stages"].values())
             record(options, rows, **summary(rows, options.device))
-    report(options, rows, **summary(rows, options.device), draw=lambda figure: draw(figure, rows))
+    compared: list[Row] = []
+    for size in dict.fromkeys(3 * row["nodes"] for row in rows) if options.matrices else ():
+        compared += matrices(size, options.matrices, torch.device(options.device))
+    for row in compared:
+        print("  ".join(f"{name} {value:.4g}" if value is not None else "torch's own" for name, value in row.items()))
+    report(options, rows, matrices=compared, **summary(rows, options.device), draw=lambda figure: draw(figure, rows))
 
 
 def summary(rows: list[Row], device: str) -> dict[str, Any]:

@@ -13,8 +13,8 @@ from egs_warp.contact.detection import ContactGeometry
 from egs_warp.contact.points import ContactPoints
 from egs_warp.errors import ArgumentError
 from egs_warp.fem.worlds import Worlds, launch_on, shared, tiled
+from egs_warp.kernels.contact import batch_contacts as kernels
 from egs_warp.kernels.contact import coulomb
-from egs_warp.kernels.contact import many as kernels
 from egs_warp.kernels.contact.gaps import point_gaps_kernel
 from egs_warp.precision import Mat33, Vec3, Vec4, real
 

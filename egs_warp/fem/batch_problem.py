@@ -60,8 +60,9 @@ class BatchProblem(Worlds):
     """(c, T, 3, 3)."""
     turns: torch.Tensor
     """(c, 3N, 3)."""
-    inertia: torch.Tensor
-    """(c, 3, 3) kg m^2."""
+    turning_rates: torch.Tensor
+    """(c, 3, 3) 1/(kg m^2), the inverse of the inertia; no numbers where there is none, in place of an error for all
+    worlds."""
 
     @classmethod
     def at(
@@ -83,7 +84,8 @@ class BatchProblem(Worlds):
         turns = turns.flatten(1, 2)
         inertia = (turns * common.mass.repeat_interleave(3)[:, None]).mT @ turns
         gradients = common.elasticity.deformation_gradients(positions)
-        return cls(common, dt, drag, slots, positions, velocities, gradients, turns, inertia)
+        rates = torch.linalg.inv_ex(inertia).inverse
+        return cls(common, dt, drag, slots, positions, velocities, gradients, turns, rates)
 
     @property
     def momenta(self) -> torch.Tensor:
@@ -111,7 +113,7 @@ class BatchProblem(Worlds):
     def start(self) -> torch.Tensor:
         """(c, N, 3) m/s to solve the step from: the body goes on rigidly."""
         arms = self.positions - self.common.centre(self.positions)
-        spin = _solved(self.inertia, self.momenta @ self.velocities.flatten(1)[:, :, None])[:, :, 0]
+        spin = (self.turning_rates @ (self.momenta @ self.velocities.flatten(1)[:, :, None]))[:, :, 0]
         turned = _turned(self.dt * spin, arms)
         return self.common.centre(self.velocities) + (turned - arms) / self.dt
 
@@ -123,7 +125,7 @@ class BatchProblem(Worlds):
     def spin(self, internal_gradient: torch.Tensor) -> torch.Tensor:
         """(c, 3) rad/s that the step gives back."""
         torque = self.turns.mT @ internal_gradient.flatten(1)[:, :, None]
-        return self.dt * _solved(self.inertia, torque)[:, :, 0]
+        return self.dt * (self.turning_rates @ torque)[:, :, 0]
 
     def residual(self, velocities: torch.Tensor, tensions: torch.Tensor | None) -> torch.Tensor:
         """(c, N, 3) N s."""
@@ -186,11 +188,6 @@ def inverse_of(
         plain = factors.solve(problem.slots, impulses)
     missing = problem.turns.mT @ impulses - problem.inertia_ratio * (momenta @ plain)
     return plain + turning.turned @ (turning.inverse @ missing), turning
-
-
-def _solved(matrices: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-    """What no number solves has none, in place of an error for all worlds."""
-    return torch.linalg.solve_ex(matrices, right).result
 
 
 def _turned(vectors: torch.Tensor, arms: torch.Tensor) -> torch.Tensor:

@@ -6,6 +6,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+import torch
 
 from egs_warp.assets import pawn
 from egs_warp.pipelines.creature import make_creature
@@ -49,3 +50,9 @@ def test_a_row_tells_the_rate_where_the_time_goes_and_how_far_apart(many_worlds:
     assert found["worlds"] == 3 and found["steps"] == 2 and found["rate"] > 0.0 and found["halved"] == 0
     assert set(found["stages"]) == {*many_worlds.STAGES, "rest"} and min(found["stages"].values()) > 0.0
     assert found["apart"] < 1e-12
+
+
+def test_matrices_are_factored_in_every_way(many_worlds: ModuleType) -> None:
+    rows = many_worlds.matrices(40, 2, torch.device("cpu"))
+    assert [row["panel"] for row in rows] == [None, *many_worlds.PANELS]
+    assert min(row["factor"] for row in rows) > 0.0 and all(row["solve_96"] > 0.0 for row in rows[1:])

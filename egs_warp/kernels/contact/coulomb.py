@@ -6,6 +6,7 @@ Each problem has a block of threads to itself on a GPU, one thread on a CPU; wha
 
 import warp as wp
 
+from egs_warp.kernels.lanes import wait_for_lanes
 from egs_warp.precision import Vec3, Vec4, real
 
 wp.set_module_options({"enable_backward": False})
@@ -75,16 +76,6 @@ class Newton:
     """(3n,) in which of their columns each row has its pivot."""
     matrix: wp.array2d[Vec4]
     """(3n, >= (3n + 1) / 4) their linear equations, right sides last, columns by fours: taken at once."""
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __syncthreads();
-#endif
-""")
-def wait_for_lanes():
-    """Until all lanes of a problem are here, and see what each has written."""
-    ...
 
 
 @wp.func
