@@ -14,10 +14,12 @@ import numpy as np
 import pytest
 
 from egs_warp.errors import UserError
-from egs_warp.locomotion import solvers
+from egs_warp.locomotion import splitting
 from egs_warp.locomotion.solvers import QpSolver, QpStatus, quadratic_program
 
-SOLVERS = pytest.mark.parametrize(("solver", "accuracy"), [(QpSolver.OSQP, 1e-4), (QpSolver.DAQP, 1e-6)])
+SOLVERS = pytest.mark.parametrize(
+    ("solver", "accuracy"), [(QpSolver.OSQP, 1e-4), (QpSolver.ADMM, 1e-4), (QpSolver.DAQP, 1e-6)]
+)
 
 
 def random_program(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -68,7 +70,7 @@ def test_a_program_beside_one_that_is_solved_needs_no_iterations(monkeypatch: py
         lower, upper = np.full(30, -0.1), np.full(30, 0.2)
         asked = quadratic_program(P, q, A).solve(lower, upper)
         with monkeypatch.context() as patch:
-            patch.setattr(solvers, "_answer", None)
+            patch.setattr(splitting, "_answer", None)
             beside = quadratic_program(P, q, A).solve(lower, upper, beside=True)
             rows, below = np.vstack([A, A[:1]]), np.append(lower, 0.3)
             none = quadratic_program(P, q, rows).solve(below, np.append(upper, 1.0), beside=True)
