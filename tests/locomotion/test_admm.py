@@ -104,6 +104,17 @@ def test_bounds_that_no_point_satisfies_are_told_apart_and_forgotten(device: str
         assert np.abs(after.x - fresh.x).max() <= 1e-6 * max(1.0, np.abs(fresh.x).max())
 
 
+def test_a_certificate_is_taken_as_osqp_takes_it(device: str) -> None:
+    """Rows that nearly repeat each other, whose multipliers grow together for long: a contradiction to OSQP where
+    their bounds cross, by however little, and no other."""
+    for crossed, ending in ((-5e-5, Ending.SOLVED), (5e-5, Ending.INFEASIBLE)):
+        program = Dense(np.eye(2), np.array([0.0, 100.0]), np.array([[1.0, 0.0], [1.0, 3e-5]]))
+        bounds = np.array([-np.inf, 1.0 + crossed]), np.array([1.0, np.inf])
+        asked = by_osqp(program, *bounds, accuracy=1e-8, iterations=300)
+        made = by_kernels(program, *bounds, device=device, accuracy=1e-8, iterations=300)
+        assert made.ending is asked.ending is ending
+
+
 def test_endings_are_those_of_osqp(device: str) -> None:
     """Residuals within the accuracy, within ten times that at the last iteration, and further off."""
     endings = []

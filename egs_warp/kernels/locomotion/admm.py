@@ -416,7 +416,7 @@ def contradicted(lane: int, accuracy: real, own: Scaled):
     for j in range(lane, own.variables, wp.block_dim()):
         left = wp.max(left, wp.abs(product(own.columns, own.rows, j, own.push, own.row_count)) / own.stretch[j])
     left = largest_of_block(left)
-    return norm > _NOTHING and support <= accuracy * norm and left <= accuracy * norm
+    return norm > _NOTHING and support < real(0.0) and left <= accuracy * norm
 
 
 @wp.kernel(grid_stride=False)
