@@ -1,10 +1,10 @@
-"""OSQP and DAQP on the engine's quadratic programs, over the number of contacts.
+"""OSQP, its iterations as kernels and DAQP on the engine's quadratic programs, over the number of contacts.
 
 python benchmarks/qp_solvers.py [--quick] [--device cpu] [--seed 0] [--body pawn] [--json PATH] [--plot PATH]
 
 The programs are steps of an animation (Eq. 13) with 40 muscle groups, 4 friction directions and 1 to 32 contacts.
 ``first`` is set-up and solve of the program with complementarity, ``again`` a re-solve for other contact states by a
-change of bounds alone, ``search`` the engine's whole search of a step, by pieces over the activations alone. Both
+change of bounds alone, ``search`` the engine's whole search of a step, by pieces over the activations alone. All
 solvers get the same programs in turn. ``breach`` is the worst violation of a
 bound (forces in body weights, speeds in sqrt(g H)); ``objective`` is relative to DAQP's. No aim is named for this
 benchmark.
@@ -34,8 +34,8 @@ DIRECTIONS = 4
 QP_LIMIT = LocomotionSettings.qp_limit
 
 
-def frame_figures(frame: Frame, solver: QpSolver) -> Row:
-    """Figures of one program."""
+def frame_figures(frame: Frame, solver: QpSolver, device: str) -> Row:
+    """Figures of one program; ``device`` is that of kernels."""
     program = ContactProgram.of(frame.pieces, DIRECTIONS)
     y = contact_under(program, frame.foreseen.activations)
     separate = np.full(program.layout.contacts, SEPARATE)
@@ -44,7 +44,7 @@ def frame_figures(frame: Frame, solver: QpSolver) -> Row:
     changed = separate if other is None else states_of_pairs(program.layout, *program.pairs(other))
 
     def first() -> tuple[Any, QpSolution]:
-        qp = quadratic_program(program.P, program.q, program.A, solver=solver)
+        qp = quadratic_program(program.P, program.q, program.A, solver=solver, device=device)
         return qp, qp.solve(*program.bounds(states))
 
     (qp, solution), first_time = timed(first)
@@ -57,6 +57,7 @@ def frame_figures(frame: Frame, solver: QpSolver) -> Row:
         directions=DIRECTIONS,
         qp_limit=QP_LIMIT,
         solver=solver,
+        device=device,
     )
     breach = 0.0
     for result, chosen in ((solution, states), (again, changed)):
@@ -107,7 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         figures: dict[QpSolver, list[Row]] = {solver: [] for solver in QpSolver}
         for frame in made:
             for solver in QpSolver:
-                figures[solver].append(frame_figures(frame, solver))
+                figures[solver].append(frame_figures(frame, solver, options.device))
         reference = np.array([row["objective"] for row in figures[QpSolver.DAQP]])
         for solver, measured in figures.items():
             column = {name: np.array([row[name] for row in measured]) for name in measured[0]}
@@ -137,7 +138,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def draw(figure: Figure, rows: list[Row]) -> None:
     """Milliseconds, and the worst violation of a bound, over the number of contacts."""
     left, right = figure.subplots(1, 2)
-    for solver, colour in ((QpSolver.OSQP, "tab:orange"), (QpSolver.DAQP, "tab:blue")):
+    for solver, colour in zip(QpSolver, ("tab:orange", "tab:green", "tab:blue"), strict=True):
         own = [row for row in rows if row["solver"] == solver.value]
         contacts = [row["contacts"] for row in own]
         left.plot(contacts, [row["again"] for row in own], "o-", color=colour, label=f"{solver.value}, re-solve")

@@ -22,6 +22,7 @@ from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.inpainting.inpainters import OpenCvMethod
 from egs_warp.io import write_ply
 from egs_warp.io.writing import WRITERS
+from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.pipelines.render_run import Show
 from egs_warp.pipelines.shot import CameraMove
 from egs_warp.segmentation.clearance import Clearing
@@ -194,6 +195,7 @@ def test_choices_of_flags_are_those_of_the_library() -> None:
         return set(action.choices or ())
 
     assert choices("convert", "--to") == set(WRITERS) == choices("export", "--to") - {"usd", "bundle"}
+    assert choices("animate", "--qp") == choices("live", "--qp") == {solver.value for solver in QpSolver}
     assert choices("render", "--show") == {show.value for show in Show}
     assert choices("segment", "--straddling") == {method.value for method in Clearing}
     assert {"patch", TRANSPARENT, *CameraMove, *(method.value for method in OpenCvMethod)} == set(_WORDS)

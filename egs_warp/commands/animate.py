@@ -11,6 +11,7 @@ from egs_warp.commands.config import NAME, add_config_flag, changed_capture, wri
 from egs_warp.commands.flags import (
     Commands,
     add_inpainter_flags,
+    add_qp_flag,
     chosen_inpainter,
     guessed_up,
     named_path,
@@ -49,6 +50,7 @@ def add_parser(commands: Commands) -> None:
     add_overwrite_flag(animate, "--out")
     add_config_flag(animate)
     animate.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
+    add_qp_flag(animate)
     animate.add_argument("--seed", type=int, help="recorded in the report; a jump has nothing random (0)")
     motion = animate.add_argument_group("motion")
     motion.add_argument(
@@ -248,6 +250,7 @@ def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
     """
     from egs_warp.contact.terrain import read_terrain
     from egs_warp.io.text import parse_json, read_text
+    from egs_warp.locomotion.settings import LocomotionSettings
     from egs_warp.motions.push import read_pushes
     from egs_warp.motions.script import motion
     from egs_warp.pipelines.animate import AnimateOptions
@@ -272,6 +275,7 @@ def _asked(chosen: argparse.Namespace) -> dict[str, Any]:
         "gravity_up": parse_direction("gravity-up", chosen.gravity_up) if chosen.gravity_up is not None else None,
         "muscles_file": chosen.muscles,
         "solids": read_terrain(chosen.terrain) if chosen.terrain else (),
+        "settings": LocomotionSettings(qp_solver=chosen.qp),
         "options": options,
         "source": Path(chosen.capture).name,
     }

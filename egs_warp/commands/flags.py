@@ -21,6 +21,8 @@ Commands: TypeAlias = "argparse._SubParsersAction[Any]"
 
 SPLAT_FILES = ("ply", "compressed-ply", "spz", "spz4", "sog", "splat", "glb")
 """Names of ``egs_warp.io.writing.WRITERS``, which is slow to import."""
+QP_SOLVERS = ("osqp", "admm", "daqp")
+"""Names of ``egs_warp.locomotion.solvers.QpSolver``, which is slow to import."""
 _AXES = {"x": 0, "y": 1, "z": 2}
 _FLAGS = {"muscles_file": "--muscles", "solids": "--terrain"}
 """Of arguments whose flags are called otherwise."""
@@ -44,6 +46,16 @@ def seed(text: str) -> int:
     if not 0 <= number < 1 << 32:
         raise argparse.ArgumentTypeError(f"{text} is not from 0 to {(1 << 32) - 1}")
     return number
+
+
+def add_qp_flag(parser: argparse._ActionsContainer) -> None:
+    """Add the flag that names the ``qp_solver`` of ``LocomotionSettings``."""
+    parser.add_argument(
+        "--qp",
+        choices=QP_SOLVERS,
+        help="who solves the QPs of a step: osqp, on the host; admm, its iterations on --device; daqp, if installed"
+        " (osqp on cpu, admm on cuda:0)",
+    )
 
 
 def add_inpainter_flags(parser: argparse._ActionsContainer, *, default: str | None) -> None:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from egs_warp.commands.flags import Commands, guessed_up, named_path, parse_direction, parse_up
+from egs_warp.commands.flags import Commands, add_qp_flag, guessed_up, named_path, parse_direction, parse_up
 from egs_warp.commands.scene_flags import say, start
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ def add_parser(commands: Commands) -> None:
         "--out", type=named_path, default=Path("out/live"), help="folder for what is recorded: take-1, ... (out/live)"
     )
     live.add_argument("--device", default="cpu", help="cpu (default) or cuda:0")
+    add_qp_flag(live)
     body = live.add_argument_group("body and ground")
     body.add_argument("--up", help="axis that points up: x, y, z or with a minus, as --up=-y; else it is guessed")
     body.add_argument(
@@ -85,6 +86,7 @@ def _session(chosen: argparse.Namespace) -> Session:
     from egs_warp.io import read_capture
     from egs_warp.io.run_folder import check_out
     from egs_warp.io.text import parse_json, read_text
+    from egs_warp.locomotion.settings import LocomotionSettings
     from egs_warp.meshing.cage import check_nodes
     from egs_warp.pipelines.animate import AnimateOptions
     from egs_warp.pipelines.creature import make_creature
@@ -115,6 +117,7 @@ def _session(chosen: argparse.Namespace) -> Session:
             friction=options.friction,
             front=front,
             muscles_file=chosen.muscles,
+            settings=LocomotionSettings(qp_solver=chosen.qp),
             nodes=chosen.nodes,
             progress=begins,
         )

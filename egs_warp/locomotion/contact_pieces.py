@@ -12,6 +12,7 @@ import numpy as np
 import scipy.linalg as dense
 
 from egs_warp.contact.coulomb import coulomb_forces
+from egs_warp.launching import Device
 from egs_warp.locomotion.solvers import QpSolver, quadratic_program
 
 _FACES = 8
@@ -129,20 +130,26 @@ class PieceSearch:
 
 
 def search_pieces(
-    program: ContactPieces, start: np.ndarray, modes: ContactModes, *, qp_limit: int, solver: QpSolver | str
+    program: ContactPieces,
+    start: np.ndarray,
+    modes: ContactModes,
+    *,
+    qp_limit: int,
+    solver: QpSolver | str,
+    device: Device = None,
 ) -> PieceSearch:
     """From the piece of ``modes``, which holds ``start`` (m + 3n,), onward as long as the objective falls.
 
     Neighbouring pieces share the point between them, so no step is lost on an infeasible one. What slides in ``modes``
     is held at first: feet that slide apart under a load each resist only where they came from, and no way leads from
-    there to a common push.
+    there to a common push. ``solver`` and ``device``: see ``quadratic_program``.
     """
     best: PieceSolution | None = None
     count = infeasible = 0
     sliding, modes = modes, ContactModes(np.where(modes.kind == SLIDE, STICK, modes.kind), modes.slip)
     while count < qp_limit:
         count += 1
-        solution = solve_piece(program, start, modes, solver, beside=best is not None)
+        solution = solve_piece(program, start, modes, solver, device=device, beside=best is not None)
         if solution is None:
             infeasible += 1
             if best is not None or infeasible > 1 or (sliding.kind != SLIDE).all():
@@ -163,7 +170,9 @@ def search_pieces(
     return PieceSearch(best.x if best else None, best.objective if best else float("inf"), count, infeasible)
 
 
-def solve_relaxed(program: ContactPieces, solver: QpSolver | str) -> tuple[np.ndarray, float] | None:
+def solve_relaxed(
+    program: ContactPieces, solver: QpSolver | str, *, device: Device = None
+) -> tuple[np.ndarray, float] | None:
     """The activations (m,) and the objective of the optimum with forces that need not be what contact answers: within
     the cone, but also where nothing touches. No piece has a lower objective. None without a solution.
     """
@@ -177,14 +186,20 @@ def solve_relaxed(program: ContactPieces, solver: QpSolver | str) -> tuple[np.nd
     lower = np.concatenate([program.lower, np.zeros(n * (1 + _FACES)), -program.offset[::3]])
     upper = np.concatenate([program.upper, np.full(len(lower) - m, np.inf)])
     P = program.P + _SINGULAR * program.P.diagonal().mean() * np.eye(len(program.P))
-    found = quadratic_program(P, program.q, A, solver=solver).solve(lower, upper)
+    found = quadratic_program(P, program.q, A, solver=solver, device=device).solve(lower, upper)
     if not found.usable:
         return None
     return np.clip(found.x[:m], program.lower, program.upper), found.objective + program.constant
 
 
 def solve_piece(
-    program: ContactPieces, start: np.ndarray, modes: ContactModes, solver: QpSolver | str, *, beside: bool = False
+    program: ContactPieces,
+    start: np.ndarray,
+    modes: ContactModes,
+    solver: QpSolver | str,
+    *,
+    device: Device = None,
+    beside: bool = False,
 ) -> PieceSolution | None:
     """Optimum of the activations in the piece of ``modes``; what ``start`` breaks of its bounds, up to ``_BROKEN``, may
     stay broken as much. None without a solution. ``beside`` where another piece of the step is solved already.
@@ -197,7 +212,7 @@ def solve_piece(
     q = program.q[:m] + slope.T @ program.q[m:] + PZ[m:].T @ offset
     A, b, contact, onward = _bounds(program, modes, offset, slope)
     lower = np.minimum(-b, np.maximum(A @ start[:m], -b - _BROKEN)) if len(A) else np.zeros(0)
-    qp = quadratic_program(0.5 * (P + P.T), q, np.vstack([np.eye(m), A]), solver=solver)
+    qp = quadratic_program(0.5 * (P + P.T), q, np.vstack([np.eye(m), A]), solver=solver, device=device)
     found = qp.solve(
         np.concatenate([program.lower, lower]),
         np.concatenate([program.upper, np.full(len(lower), np.inf)]),

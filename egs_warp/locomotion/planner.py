@@ -99,7 +99,8 @@ class StepPlanner:
             program.foreseen,
             directions=settings.directions,
             qp_limit=settings.qp_limit,
-            solver=settings.qp_solver,
+            solver=settings.qp_solver_on(self.body.assembly.device),
+            device=self.body.assembly.device,
         )
         clock.lap("qp")
         if found.x is None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import warp as wp
+
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.strategies import Strategy
 
@@ -18,7 +20,8 @@ class LocomotionSettings:
     push_out_cap: float = 0.05
     qp_limit: int = 12
     """QPs a step at most; in doubt ``strategies.PATIENCE`` times as many for all strategies but ``pieces``."""
-    qp_solver: QpSolver | str = QpSolver.OSQP
+    qp_solver: QpSolver | str | None = None
+    """None is OSQP, whose iterations are kernels where the body lies on a GPU."""
     strategy: Strategy | str = Strategy.PIECES
     directions: int = 4
     """n_d, edges of the friction pyramid of all strategies but ``pieces``, which has the cone."""
@@ -33,5 +36,12 @@ class LocomotionSettings:
 
     def __post_init__(self) -> None:
         # Names that are not known are refused here, not in the first step.
-        QpSolver(self.qp_solver)
+        if self.qp_solver is not None:
+            QpSolver(self.qp_solver)
         Strategy(self.strategy)
+
+    def qp_solver_on(self, device: wp.Device) -> QpSolver:
+        """Who solves the QPs of a body that lies on ``device``."""
+        if self.qp_solver is None:
+            return QpSolver.ADMM if device.is_cuda else QpSolver.OSQP
+        return QpSolver(self.qp_solver)

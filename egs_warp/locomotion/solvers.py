@@ -1,4 +1,4 @@
-"""Quadratic programs whose bounds change; the one place that imports OSQP and DAQP."""
+"""Quadratic programs whose bounds change; the one place that imports DAQP."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from enum import Enum
 from typing import Any, Protocol
 
 import numpy as np
-import osqp
-import scipy.sparse as sparse
 
 from egs_warp.errors import UserError
+from egs_warp.launching import Device
 from egs_warp.locomotion.active_set import ReducedRows, optimum_near
+from egs_warp.locomotion.admm import Ending
+from egs_warp.locomotion.splitting import AdmmSplitting, Iterations, OsqpSplitting, Splitting
 
 LARGEST_BREACH = 3e-3
 """By which a point of OSQP's iteration limit may leave its bounds and still be used."""
-_CODES: Any = osqp.SolverStatus
 _ITERATIONS = 50
-"""Of OSQP, before the rows that it holds to be active lead to the optimum."""
+"""Of a splitting, before the rows that it holds to be active lead to the optimum."""
 _MOST_ITERATIONS = 4000
 _ROOM = 0.3
 """Of the accuracy, by which bounds are moved apart."""
@@ -35,11 +35,24 @@ class QpStatus(Enum):
     FAILED = "the solver gave up; scale the problem"
 
 
+_STATUS = {
+    Ending.SOLVED: QpStatus.SOLVED,
+    Ending.INEXACT: QpStatus.INEXACT,
+    Ending.LIMIT: QpStatus.ITERATION_LIMIT,
+    Ending.INFEASIBLE: QpStatus.INFEASIBLE,
+    Ending.DOUBTFUL: QpStatus.INFEASIBLE,
+    Ending.FAILED: QpStatus.FAILED,
+}
+"""Of a splitting that had all of its iterations."""
+
+
 class QpSolver(Enum):
     """Who solves; chosen by name."""
 
     OSQP = "osqp"
     """Operator splitting: to an accuracy, warm-started, never stuck."""
+    ADMM = "admm"
+    """OSQP's operator splitting as kernels."""
     DAQP = "daqp"
     """Dual active set: to rounding."""
 
@@ -77,25 +90,42 @@ class QuadraticProgram(Protocol):
 
 
 def quadratic_program(
-    P: np.ndarray, q: np.ndarray, A: np.ndarray, *, solver: QpSolver | str = QpSolver.OSQP, accuracy: float = 3e-5
+    P: np.ndarray,
+    q: np.ndarray,
+    A: np.ndarray,
+    *,
+    solver: QpSolver | str = QpSolver.OSQP,
+    accuracy: float = 3e-5,
+    device: Device = None,
 ) -> QuadraticProgram:
-    """The program with P (n, n), q (n,) and A (m, n) for ``solver`` (or its name); ``accuracy`` is that of OSQP."""
-    return OsqpProgram(P, q, A, accuracy=accuracy) if QpSolver(solver) is QpSolver.OSQP else DaqpProgram(P, q, A)
+    """The program with P (n, n), q (n,) and A (m, n) for ``solver`` (or its name); ``accuracy`` is that of operator
+    splitting, ``device`` where it runs as kernels."""
+    solver = QpSolver(solver)
+    if solver is QpSolver.DAQP:
+        return DaqpProgram(P, q, A)
+    if solver is QpSolver.ADMM:
+        splitting = AdmmSplitting(P, q, accuracy=accuracy, device=device)
+    else:
+        splitting = OsqpSplitting(P, q, accuracy=accuracy)
+    return SplittingProgram(P, q, A, splitting, accuracy=accuracy)
 
 
-class OsqpProgram:
-    """A ``QuadraticProgram`` for OSQP: a few iterations on the rows that matter tell which of them hold the optimum,
-    from where ``active_set`` finds it to rounding. Where rounding leads that astray, OSQP goes on with all rows, to its
-    own ``accuracy``. A program beside one that is solved needs no iterations: the rows that its minimum without bounds
-    breaks are a guess that costs as little.
+class SplittingProgram:
+    """A ``QuadraticProgram`` by OSQP's operator splitting: a few iterations on the rows that matter tell which of them
+    hold the optimum, from where ``active_set`` finds it to rounding. Where rounding leads that astray, they go on with
+    all rows, to the splitting's own accuracy. A program beside one that is solved needs no iterations: the rows that
+    its minimum without bounds breaks are a guess that costs as little.
     """
 
-    def __init__(self, P: np.ndarray, q: np.ndarray, A: np.ndarray, *, accuracy: float = 3e-5) -> None:
+    def __init__(
+        self, P: np.ndarray, q: np.ndarray, A: np.ndarray, splitting: Splitting, *, accuracy: float = 3e-5
+    ) -> None:
         self._P, self._q, self._A = P, q, A
-        self._accuracy = accuracy
+        self._splitting = splitting
+        # What has next to no room between its bounds is as good as without any: room to the accuracy that is asked.
+        self._room = _ROOM * accuracy
         self._rows = ReducedRows.of(P, q, A)
-        self._upper_P: sparse.csc_matrix | None = None
-        self._whole: osqp.OSQP | None = None
+        self._whole: Iterations | None = None
         self._start: np.ndarray | None = None
 
     def solve(
@@ -107,34 +137,34 @@ class OsqpProgram:
             # Rows that are held, as those of contact states are, repeat each other: met to an accuracy, not exactly.
             return self._by_iterations(lower, upper, start)
         rows = self._rows
-        # What has next to no room between its bounds is as good as without any: room to the accuracy that is asked.
-        room = _ROOM * self._accuracy
-        lower, upper = lower - room, upper + room
+        lower, upper = lower - self._room, upper + self._room
         chosen = (rows.free < lower) | (rows.free > upper)
         if not chosen.any():
             # As in flight: there is nothing to iterate on.
             return self._exact(rows.minimum, np.zeros(len(lower)))
         if beside:
-            found = self._finished(lower, upper, rows.free < lower, rows.free > upper)
-            return found or self._by_iterations(lower, upper, start)
+            return self._from_the_minimum(lower, upper, start)
         if start is not None:
             at = self._A @ start
             chosen |= (at < lower + _NEAR) | (at > upper - _NEAR)
         index = np.flatnonzero(chosen)
-        solver = self._solver(self._A[index], lower[index], upper[index], _ITERATIONS)
-        if start is not None:
-            solver.warm_start(x=start)
-        result = _answer(solver)
-        if result.info.status_val == _CODES.OSQP_PRIMAL_INFEASIBLE:
+        made = self._splitting.on(self._A[index], _ITERATIONS).run(lower[index], upper[index], start)
+        if made.ending is Ending.INFEASIBLE:
             return _solution(QpStatus.INFEASIBLE, self._P, self._q, None, None, len(lower))
-        if not np.isfinite(result.x).all() or not np.isfinite(result.y).all():
-            return self._by_iterations(lower, upper, start)
+        if made.ending not in (Ending.SOLVED, Ending.INEXACT, Ending.LIMIT) or not np.isfinite(made.x).all():
+            # There is no point: OSQP leaves 2e9 where it doubts that there is any.
+            return self._from_the_minimum(lower, upper, start)
         multipliers = np.zeros(len(lower))
-        multipliers[index] = result.y
-        at = self._A @ result.x
+        multipliers[index] = made.multipliers
+        at = self._A @ made.x
         low = at - lower < -multipliers
         found = self._finished(lower, upper, low, (upper - at < multipliers) & ~low)
-        return found or self._by_iterations(lower, upper, result.x)
+        return found or self._by_iterations(lower, upper, made.x)
+
+    def _from_the_minimum(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> QpSolution:
+        """From the rows that the minimum without bounds breaks."""
+        free = self._rows.free
+        return self._finished(lower, upper, free < lower, free > upper) or self._by_iterations(lower, upper, start)
 
     def _finished(self, lower: np.ndarray, upper: np.ndarray, low: np.ndarray, high: np.ndarray) -> QpSolution | None:
         """The optimum, from a guess of the rows that hold it at which bound; None where rounding leads astray."""
@@ -149,60 +179,19 @@ class OsqpProgram:
         self._start = x
         return _solution(QpStatus.SOLVED, self._P, self._q, x, multipliers, len(multipliers))
 
-    def _solver(self, A: np.ndarray, lower: np.ndarray, upper: np.ndarray, iterations: int) -> osqp.OSQP:
-        if self._upper_P is None:
-            self._upper_P = sparse.csc_matrix(np.triu(self._P))
-        solver = osqp.OSQP(algebra="builtin")
-        solver.setup(
-            P=self._upper_P,
-            q=self._q,
-            A=sparse.csc_matrix(A),
-            l=lower,
-            u=upper,
-            verbose=False,
-            eps_abs=self._accuracy,
-            eps_rel=self._accuracy,
-            max_iter=iterations,
-            scaling=4,
-            polishing=False,  # it fails on redundant rows and took half of the time
-            warm_starting=True,
-            adaptive_rho=True,
-            adaptive_rho_interval=50,
-            check_termination=25,
-        )
-        return solver
-
     def _by_iterations(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> QpSolution:
-        """With all rows, set up once: OSQP's own accuracy."""
+        """With all rows, set up once: the splitting's own accuracy."""
         if self._whole is None:
-            self._whole = self._solver(self._A, lower, upper, _MOST_ITERATIONS)
-        else:
-            self._whole.update(l=lower, u=upper)
-        if start is not None:
-            self._whole.warm_start(x=start)
-        result = _answer(self._whole)
-        status = {
-            _CODES.OSQP_SOLVED: QpStatus.SOLVED,
-            _CODES.OSQP_SOLVED_INACCURATE: QpStatus.INEXACT,
-            _CODES.OSQP_MAX_ITER_REACHED: QpStatus.ITERATION_LIMIT,
-            _CODES.OSQP_PRIMAL_INFEASIBLE: QpStatus.INFEASIBLE,
-            _CODES.OSQP_PRIMAL_INFEASIBLE_INACCURATE: QpStatus.INFEASIBLE,
-        }.get(result.info.status_val, QpStatus.FAILED)
+            self._whole = self._splitting.on(self._A, _MOST_ITERATIONS)
+        made = self._whole.run(lower, upper, start)
+        status = _STATUS[made.ending]
         if status is QpStatus.ITERATION_LIMIT:
-            rows = self._A @ result.x
+            rows = self._A @ made.x
             broken = max(float((lower - rows).max()), float((rows - upper).max()))
             status = status if broken <= LARGEST_BREACH else QpStatus.FAILED
-        found = _solution(status, self._P, self._q, result.x, result.y, len(lower))
+        found = _solution(status, self._P, self._q, made.x, made.multipliers, len(lower))
         self._start = found.x if found.usable else None
         return found
-
-
-def _answer(solver: osqp.OSQP) -> Any:
-    result = solver.solve(raise_error=False)
-    if result.info.status_val == _CODES.OSQP_SIGINT:
-        # OSQP takes Ctrl-C for itself while it runs; the program would go on with what it had found by then.
-        raise KeyboardInterrupt
-    return result
 
 
 class DaqpProgram:

@@ -12,6 +12,7 @@ from enum import Enum
 import numpy as np
 
 from egs_warp.errors import UserError
+from egs_warp.launching import Device
 from egs_warp.locomotion.branch_and_bound import exact_states
 from egs_warp.locomotion.complementarity import (
     SEPARATE,
@@ -186,40 +187,50 @@ def search_program(
     directions: int,
     qp_limit: int,
     solver: QpSolver | str = QpSolver.OSQP,
+    device: Device = None,
 ) -> PieceSearch:
     """Activations and contact forces of a step's program by ``strategy`` (or its name), with at most ``qp_limit`` QPs
     (``PATIENCE`` times as many in doubt); all but ``PIECES`` have a friction pyramid of ``directions`` edges.
+    ``solver`` and ``device``: see ``quadratic_program``.
     """
     strategy, friction = Strategy(strategy), program.friction
     if strategy is Strategy.PIECES:
         start = np.concatenate([foreseen.activations, foreseen.forces.ravel()])
         found = search_pieces(
-            program, start, ContactModes.of(foreseen.forces, friction), qp_limit=qp_limit, solver=solver
+            program, start, ContactModes.of(foreseen.forces, friction), qp_limit=qp_limit, solver=solver, device=device
         )
         if found.objective < COSTLY or program.contacts == 0:
             return found
-        return _searched_elsewhere(program, found, foreseen.forces, qp_limit=qp_limit, solver=solver)
+        return _searched_elsewhere(program, found, foreseen.forces, qp_limit=qp_limit, solver=solver, device=device)
     paired = ContactProgram.of(program, directions)
     predicted = states_from_prediction(
         foreseen.forces[:, 0], foreseen.forces[:, 1:], foreseen.velocities[:, 1:], friction, directions
     )
-    found = find_states(paired, strategy, predicted, foreseen.activations, qp_limit=qp_limit, solver=solver)
+    found = find_states(
+        paired, strategy, predicted, foreseen.activations, qp_limit=qp_limit, solver=solver, device=device
+    )
     x = None if found.y is None else paired.forces_of(found.y)
     return PieceSearch(x, found.objective, found.qp_count, found.infeasible)
 
 
 def _searched_elsewhere(
-    program: ContactPieces, found: PieceSearch, forces: np.ndarray, *, qp_limit: int, solver: QpSolver | str
+    program: ContactPieces,
+    found: PieceSearch,
+    forces: np.ndarray,
+    *,
+    qp_limit: int,
+    solver: QpSolver | str,
+    device: Device,
 ) -> PieceSearch:
     """The better of ``found`` and of a search from where the optimum without complementarity would end up under true
     contact; ``forces`` (n, 3) are a guess."""
-    relaxed = solve_relaxed(program, solver)
+    relaxed = solve_relaxed(program, solver, device=device)
     found = replace(found, qp_count=found.qp_count + 1)
     if relaxed is None or found.objective <= DOUBTFUL * relaxed[1]:
         return found
     start = program.under(relaxed[0], forces)
     modes = ContactModes.of(start[program.activations :].reshape(-1, 3), program.friction)
-    other = search_pieces(program, start, modes, qp_limit=qp_limit, solver=solver)
+    other = search_pieces(program, start, modes, qp_limit=qp_limit, solver=solver, device=device)
     best = min(found, other, key=lambda search: search.objective)
     return replace(best, qp_count=found.qp_count + other.qp_count, infeasible=found.infeasible + other.infeasible)
 
@@ -232,12 +243,13 @@ def find_states(
     *,
     qp_limit: int,
     solver: QpSolver | str = QpSolver.OSQP,
+    device: Device = None,
 ) -> SearchResult:
     """Contact states and the optimum for them by ``strategy`` (or its name), which is not ``PIECES``.
 
     ``predicted`` (n,) states of stage 1 (Eq. 12); ``activations`` (M,) of the last step, in their bounds. Where a
     strategy's own first states have no solution, it starts from those that follow from ``activations``, which always
-    have one.
+    have one. ``solver`` and ``device``: see ``quadratic_program``.
     """
     strategy = Strategy(strategy)
     if strategy is Strategy.EXACT:
@@ -245,7 +257,7 @@ def find_states(
         if found is None:
             return SearchResult(None, True, predicted, float("inf"), 0, 0)
         return SearchResult(found.y, False, found.states, found.objective, found.qp_count, 0)
-    qp = quadratic_program(program.P, program.q, program.A, solver=solver)
+    qp = quadratic_program(program.P, program.q, program.A, solver=solver, device=device)
     search = _Search(program, qp, qp_limit)
     if strategy is Strategy.RELAXED:
         _start_relaxed(search, predicted, activations)

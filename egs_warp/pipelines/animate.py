@@ -18,6 +18,7 @@ from egs_warp.io.run_folder import RunFolder, run_folder
 from egs_warp.io.video import ffmpeg_program
 from egs_warp.locomotion.ledger import ledger
 from egs_warp.locomotion.settings import LocomotionSettings
+from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.motions.push import read_pushes
 from egs_warp.motions.request import LARGEST_TARGET, LARGEST_TURN
 from egs_warp.motions.script import motion as script
@@ -104,6 +105,8 @@ class Asked:
     style: str | None
     muscles: str | None
     """Name of the file."""
+    qp: str | None
+    """Name of the QP solver."""
     solids: int
 
     def to_json(self) -> dict[str, Any]:
@@ -221,6 +224,7 @@ def animate(
             beats=beats,
             style=style,
             muscles=None if muscles_file is None else Path(muscles_file).name,
+            qp=None if settings is None or settings.qp_solver is None else QpSolver(settings.qp_solver).value,
             solids=len(solids),
         )
         simulation = performance.simulation

@@ -17,6 +17,7 @@ from egs_warp.commands import COMMANDS
 from egs_warp.commands.config import with_config, write_config
 from egs_warp.errors import UserError
 from egs_warp.io import write_ply
+from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.finished_run import FinishedRun
 
 
@@ -46,15 +47,18 @@ def test_a_run_from_its_file_has_the_same_bits(tmp_path: Path, capsys: pytest.Ca
 def test_a_run_that_is_interrupted_has_its_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is there as soon as a step of the simulation is; bad input that shows before leaves nothing."""
     write_ply(tmp_path / "pawn.ply", pawn(gaussian_count=4000).cloud)
-    flags = ["animate", str(tmp_path / "pawn.ply"), "--up", "z", "--friction", "0.7", "--out", str(tmp_path / "a")]
+    flags = ["animate", str(tmp_path / "pawn.ply"), "--up", "z", "--friction", "0.7", "--qp", "daqp"]
+    flags += ["--out", str(tmp_path / "a")]
 
-    def interrupted(*_: object, parts: Callable[[], Path], **__: object) -> None:
+    def interrupted(creature: Creature, *_: object, parts: Callable[[], Path], **__: object) -> None:
+        assert creature.stepper.settings.qp_solver == "daqp" and creature.geometry.friction == 0.7
         parts().mkdir()
         raise KeyboardInterrupt
 
     monkeypatch.setattr("egs_warp.pipelines.animate.simulate", interrupted)
     assert cli.main(flags) == 130
-    assert yaml.safe_load((tmp_path / "a" / "run.yaml").read_text())["friction"] == 0.7
+    kept = yaml.safe_load((tmp_path / "a" / "run.yaml").read_text())
+    assert (kept["friction"], kept["qp"]) == (0.7, "daqp")
 
     def refused(*_: object, **__: object) -> None:
         raise UserError("jump: this body cannot")

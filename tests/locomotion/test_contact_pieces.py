@@ -57,7 +57,7 @@ def started(program: ContactPieces) -> tuple[np.ndarray, ContactModes]:
     return start, ContactModes.of(start[2:].reshape(-1, 3), FRICTION)
 
 
-@pytest.mark.parametrize("solver", [QpSolver.OSQP, QpSolver.DAQP])
+@pytest.mark.parametrize("solver", list(QpSolver))
 def test_the_search_ends_where_no_activations_near_by_do_better(solver: QpSolver) -> None:
     """Against exact contact for activations all round the end, and far better than the start.
 

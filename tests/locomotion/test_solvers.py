@@ -14,10 +14,14 @@ import numpy as np
 import pytest
 
 from egs_warp.errors import UserError
-from egs_warp.locomotion import solvers
-from egs_warp.locomotion.solvers import QpSolver, QpStatus, quadratic_program
+from egs_warp.locomotion import splitting
+from egs_warp.locomotion.active_set import Optimum, ReducedRows, optimum_near
+from egs_warp.locomotion.admm import Ending, Iterate
+from egs_warp.locomotion.solvers import QpSolver, QpStatus, SplittingProgram, quadratic_program
 
-SOLVERS = pytest.mark.parametrize(("solver", "accuracy"), [(QpSolver.OSQP, 1e-4), (QpSolver.DAQP, 1e-6)])
+SOLVERS = pytest.mark.parametrize(
+    ("solver", "accuracy"), [(QpSolver.OSQP, 1e-4), (QpSolver.ADMM, 1e-4), (QpSolver.DAQP, 1e-6)]
+)
 
 
 def random_program(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -68,7 +72,7 @@ def test_a_program_beside_one_that_is_solved_needs_no_iterations(monkeypatch: py
         lower, upper = np.full(30, -0.1), np.full(30, 0.2)
         asked = quadratic_program(P, q, A).solve(lower, upper)
         with monkeypatch.context() as patch:
-            patch.setattr(solvers, "_answer", None)
+            patch.setattr(splitting, "_answer", None)
             beside = quadratic_program(P, q, A).solve(lower, upper, beside=True)
             rows, below = np.vstack([A, A[:1]]), np.append(lower, 0.3)
             none = quadratic_program(P, q, rows).solve(below, np.append(upper, 1.0), beside=True)
@@ -76,6 +80,35 @@ def test_a_program_beside_one_that_is_solved_needs_no_iterations(monkeypatch: py
         assert (np.abs(asked.multipliers) > 1e-6).sum() > 5
         assert np.abs(asked.multipliers - beside.multipliers).max() < 1e-7
         assert none.status is QpStatus.INFEASIBLE
+
+
+class Doubting:
+    """A splitting whose iterations end with a loose certificate, as OSQP leaves them."""
+
+    def on(self, A: np.ndarray, iterations: int) -> Doubting:
+        return self
+
+    def run(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> Iterate:
+        return Iterate(Ending.DOUBTFUL, np.full(20, 2.143e9), np.zeros(len(lower)), 50)
+
+
+def test_what_iterations_leave_in_doubt_is_no_guess(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The search for the optimum then begins with the rows that the minimum without bounds breaks."""
+    P, q, A = random_program(5)
+    lower, upper = np.full(30, -0.1), np.full(30, 0.2)
+    guesses = []
+
+    def noted(rows: ReducedRows, *rest: np.ndarray) -> Optimum | None:
+        guesses.append(rest[2:])
+        return optimum_near(rows, *rest)
+
+    asked = quadratic_program(P, q, A).solve(lower, upper)
+    monkeypatch.setattr("egs_warp.locomotion.solvers.optimum_near", noted)
+    doubted = SplittingProgram(P, q, A, Doubting()).solve(lower, upper)
+    ((low, high),) = guesses
+    free = A @ np.linalg.solve(P, -q)
+    assert np.array_equal(low, free < lower - 1e-5) and np.array_equal(high, free > upper + 1e-5)
+    assert doubted.status is QpStatus.SOLVED and np.abs(doubted.x - asked.x).max() < 1e-9
 
 
 @SOLVERS

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+import warp as wp
 
 from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.errors import UserError
@@ -58,9 +61,9 @@ def test_relaxed_against_brute_force(solver: QpSolver) -> None:
         best = min(value for value, _ in optimum_of_each(program).values())
         found = search(program, Strategy.RELAXED, solver=solver)
         assert found.y is not None and not found.relaxed
-        assert is_complementary(program, found.y, 2e-2 if solver is QpSolver.OSQP else 1e-5)
+        assert is_complementary(program, found.y, 1e-5 if solver is QpSolver.DAQP else 2e-2)
         assert found.objective == pytest.approx(program.objective(found.y))
-        assert found.objective > best - (1e-2 if solver is QpSolver.OSQP else 1e-5) * (1.0 + abs(best))
+        assert found.objective > best - (1e-5 if solver is QpSolver.DAQP else 1e-2) * (1.0 + abs(best))
         near += found.objective <= 1.02 * best + 1e-6
         counts.append(found.qp_count)
     assert near >= 47 and np.mean(counts) <= 5.0
@@ -124,7 +127,7 @@ def degenerate_frames() -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", list(degenerate_frames()))
-@pytest.mark.parametrize("solver", list(QpSolver))
+@pytest.mark.parametrize("solver", [QpSolver.OSQP, QpSolver.DAQP, pytest.param(QpSolver.ADMM, marks=pytest.mark.slow)])
 def test_degenerate_contact_sets_never_lose_a_frame(name: str, solver: QpSolver) -> None:
     """Every contact in one line, duplicates, one point, 40 points on a rigid base:
     a finite answer that obeys every pair.
@@ -135,7 +138,7 @@ def test_degenerate_contact_sets_never_lose_a_frame(name: str, solver: QpSolver)
         found = search(program, Strategy.RELAXED, limit=4, solver=solver)
         assert found.y is not None and np.isfinite(found.y).all()
         assert found.objective == pytest.approx(program.objective(found.y)) and not found.relaxed
-        assert is_complementary(program, found.y, 2e-2 if solver is QpSolver.OSQP else 1e-5)
+        assert is_complementary(program, found.y, 1e-5 if solver is QpSolver.DAQP else 2e-2)
 
 
 def test_states_that_contradict_each_other_are_replaced() -> None:
@@ -186,7 +189,12 @@ def test_strategies_and_solvers_are_chosen_by_name() -> None:
     assert found[0].objective == found[1].objective and found[0].qp_count == found[1].qp_count > 2
     settings = LocomotionSettings(strategy="static", qp_solver="daqp")
     assert Strategy(settings.strategy) is Strategy.STATIC and QpSolver(settings.qp_solver) is QpSolver.DAQP
+    assert settings.qp_solver_on(wp.get_device("cpu")) is QpSolver.DAQP
+    gpu: Any = SimpleNamespace(is_cuda=True)
+    assert LocomotionSettings().qp_solver_on(gpu) is QpSolver.ADMM
+    assert LocomotionSettings(qp_solver="osqp").qp_solver_on(gpu) is QpSolver.OSQP
+    assert LocomotionSettings().qp_solver_on(wp.get_device("cpu")) is QpSolver.OSQP
     with pytest.raises(UserError, match="strategy 'nonsense' is not known; give one of pieces, paper, static, qpcc"):
         LocomotionSettings(strategy="nonsense")
-    with pytest.raises(UserError, match="QP solver 'nonsense' is not known; give one of osqp, daqp"):
+    with pytest.raises(UserError, match="QP solver 'nonsense' is not known; give one of osqp, admm, daqp"):
         LocomotionSettings(qp_solver="nonsense")

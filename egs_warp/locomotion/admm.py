@@ -1,0 +1,145 @@
+"""OSQP's operator splitting on many quadratic programs at once, as kernels.
+
+See ``egs_warp.kernels.locomotion.admm``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+import warp as wp
+
+from egs_warp.kernels.locomotion import admm as kernels
+from egs_warp.launching import Device, empty_together
+from egs_warp.precision import real
+
+_RHO = 0.1
+"""Of a program's first iterations."""
+
+
+class Ending(Enum):
+    """How iterations end."""
+
+    SOLVED = kernels.SOLVED
+    """Residuals are within the accuracy."""
+    INEXACT = kernels.INEXACT
+    """They are within ten times that at the last iteration."""
+    LIMIT = kernels.LIMIT
+    """They are not."""
+    INFEASIBLE = kernels.INFEASIBLE
+    """There is a certificate that no point satisfies the bounds."""
+    DOUBTFUL = kernels.DOUBTFUL
+    """There is one within ten times its accuracy at the last iteration."""
+    FAILED = -1
+    """Nothing is known."""
+
+
+@dataclass(frozen=True)
+class Dense:
+    """min 1/2 x^T P x + q^T x over rows A; their bounds come later."""
+
+    P: np.ndarray
+    """(n, n) symmetric and positive semidefinite."""
+    q: np.ndarray
+    """(n,)."""
+    A: np.ndarray
+    """(m, n)."""
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """Where the iterations on a program have ended."""
+
+    ending: Ending
+    x: np.ndarray
+    """(n,)."""
+    multipliers: np.ndarray
+    """(m,) positive where the upper bound pushes."""
+    iterations: int
+
+
+class AdmmPrograms:
+    """k programs, whose sizes may differ, that are iterated on side by side. Each begins where its last iterations
+    have ended, with the rho that they have found."""
+
+    def __init__(self, programs: Sequence[Dense], *, device: Device, scaling: int = 4, adapt: int = 50) -> None:
+        """``scaling`` passes equilibrate, rho may change every ``adapt`` iterations, a multiple of
+        ``kernels.CHECK``."""
+        self._device = wp.get_device(device)
+        self._scaling, self._adapt = scaling, adapt
+        self._sizes = [one.A.shape for one in programs]
+        k, m, n = len(programs), *(max(sizes) for sizes in zip(*self._sizes, strict=True))
+        self._programs = kernels.Programs()
+        self._programs.P = self._on_device(_padded([one.P for one in programs], (k, n, n)))
+        self._programs.q = self._on_device(_padded([one.q for one in programs], (k, n)))
+        self._programs.A = self._on_device(_padded([one.A for one in programs], (k, m, n)))
+        self._programs.rows, self._programs.variables = (
+            wp.array([size[side] for size in self._sizes], dtype=int, device=self._device) for side in (0, 1)
+        )
+        self._x, self._y, self._rho = np.zeros((k, n)), np.zeros((k, m)), np.full(k, _RHO)
+
+    def solve(
+        self,
+        lower: Sequence[np.ndarray],
+        upper: Sequence[np.ndarray],
+        starts: Sequence[np.ndarray | None],
+        *,
+        accuracy: float,
+        iterations: int,
+    ) -> list[Iterate]:
+        """With each program's bounds l <= A x <= u (m,), from its start (n,) if there is one; at most ``iterations``
+        each, to ``accuracy``, absolute and relative."""
+        k, n = self._x.shape
+        m = self._y.shape[1]
+        for x, start in zip(self._x, starts, strict=True):
+            if start is not None:
+                x[: len(start)] = start
+        self._programs.lower = self._on_device(_padded(lower, (k, m)))
+        self._programs.upper = self._on_device(_padded(upper, (k, m)))
+        iterates, memory = kernels.Iterates(), kernels.Memory()
+        iterates.x, iterates.y, iterates.rho = map(self._on_device, (self._x, self._y, self._rho))
+        square, table = ((k, n, n), real), ((k, m, n), real)
+        (memory.P, memory.inverse, memory.rows, memory.columns, memory.by_variable, memory.by_row, ended, taken) = (
+            empty_together(
+                self._device,
+                *(square, square, table, ((k, n, m), real), ((k, kernels.BY_VARIABLE, n), real)),
+                *(((k, kernels.BY_ROW, m), real), (k, int), (k, int)),
+            )
+        )
+        block = 1 if self._device.is_cpu else kernels.BLOCK
+        wp.launch(
+            kernels.admm_kernel,
+            k * block,
+            inputs=[self._programs, accuracy, iterations, self._scaling, self._adapt, memory, iterates],
+            outputs=[ended, taken],
+            device=self._device,
+            block_dim=block,
+        )
+        self._x, self._y, self._rho = iterates.x.numpy(), iterates.y.numpy(), iterates.rho.numpy()
+        how, count = ended.numpy(), taken.numpy()
+        ends = []
+        for i, (rows, columns) in enumerate(self._sizes):
+            ending, x, y = Ending(int(how[i])), self._x[i, :columns].copy(), self._y[i, :rows].copy()
+            if not np.isfinite(x).all() or not np.isfinite(y).all():
+                ending = Ending.FAILED
+            if ending in (Ending.INFEASIBLE, Ending.DOUBTFUL, Ending.FAILED):
+                # What was driven apart is no place to begin.
+                self._x[i], self._y[i], self._rho[i] = 0.0, 0.0, _RHO
+            ends.append(Iterate(ending, x, y, int(count[i])))
+        return ends
+
+    def _on_device(self, values: np.ndarray) -> wp.array:
+        return wp.array(values, dtype=real, device=self._device, copy=False)
+
+
+def _padded(values: Sequence[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
+    """Arrays (``shape``) with zeros after what is shorter."""
+    if len(values) == 1:
+        return np.ascontiguousarray(values[0], dtype=np.float64)[None]
+    padded = np.zeros(shape)
+    for row, one in zip(padded, values, strict=True):
+        row[tuple(map(slice, one.shape))] = one
+    return padded

@@ -1,0 +1,125 @@
+"""Who iterates by OSQP's operator splitting: OSQP on the host, or kernels; the one place that imports OSQP."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+import osqp
+import scipy.sparse as sparse
+
+from egs_warp.launching import Device
+from egs_warp.locomotion.admm import AdmmPrograms, Dense, Ending, Iterate
+
+SCALING = 4
+"""Passes of the equilibration."""
+ADAPT = 50
+"""Iterations after which rho may change: by the clock, two runs would differ."""
+_CODES: Any = osqp.SolverStatus
+
+
+class Iterations(Protocol):
+    """On one program, set up once."""
+
+    def run(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> Iterate:
+        """With these bounds (m,), from ``start`` (n,), else from where they last ended."""
+        ...
+
+
+class Splitting(Protocol):
+    """Who iterates on programs with the same P and q."""
+
+    def on(self, A: np.ndarray, iterations: int) -> Iterations:
+        """With rows A (m, n), at most ``iterations`` each time."""
+        ...
+
+
+class OsqpSplitting:
+    """A ``Splitting`` by OSQP."""
+
+    def __init__(self, P: np.ndarray, q: np.ndarray, *, accuracy: float) -> None:
+        self._P, self._q, self._accuracy = P, q, accuracy
+
+    @cached_property
+    def _upper_half(self) -> sparse.csc_matrix:
+        return sparse.csc_matrix(np.triu(self._P))
+
+    def on(self, A: np.ndarray, iterations: int) -> OsqpIterations:
+        """See ``Splitting``."""
+        given: dict[str, Any] = {"P": self._upper_half, "q": self._q, "A": sparse.csc_matrix(A), "max_iter": iterations}
+        return OsqpIterations({**given, "eps_abs": self._accuracy, "eps_rel": self._accuracy})
+
+
+class OsqpIterations:
+    """``Iterations`` by OSQP."""
+
+    def __init__(self, given: dict[str, Any]) -> None:
+        """``given``: what ``osqp.OSQP.setup`` takes besides the bounds and what is the same in all programs."""
+        self._given = given
+        self._solver: osqp.OSQP | None = None
+
+    def run(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> Iterate:
+        """See ``Iterations``."""
+        if self._solver is None:
+            self._solver = osqp.OSQP(algebra="builtin")
+            self._solver.setup(
+                **self._given,
+                l=lower,
+                u=upper,
+                verbose=False,
+                scaling=SCALING,
+                polishing=False,  # it fails on redundant rows and took half of the time
+                warm_starting=True,
+                adaptive_rho=True,
+                adaptive_rho_interval=ADAPT,
+                check_termination=25,
+            )
+        else:
+            self._solver.update(l=lower, u=upper)
+        if start is not None:
+            self._solver.warm_start(x=start)
+        result = _answer(self._solver)
+        ending = {
+            _CODES.OSQP_SOLVED: Ending.SOLVED,
+            _CODES.OSQP_SOLVED_INACCURATE: Ending.INEXACT,
+            _CODES.OSQP_MAX_ITER_REACHED: Ending.LIMIT,
+            _CODES.OSQP_PRIMAL_INFEASIBLE: Ending.INFEASIBLE,
+            _CODES.OSQP_PRIMAL_INFEASIBLE_INACCURATE: Ending.DOUBTFUL,
+        }.get(result.info.status_val, Ending.FAILED)
+        return Iterate(ending, result.x, result.y, result.info.iter)
+
+
+def _answer(solver: osqp.OSQP) -> Any:
+    result = solver.solve(raise_error=False)
+    if result.info.status_val == _CODES.OSQP_SIGINT:
+        # OSQP takes Ctrl-C for itself while it runs; the program would go on with what it had found by then.
+        raise KeyboardInterrupt
+    return result
+
+
+class AdmmSplitting:
+    """A ``Splitting`` by kernels."""
+
+    def __init__(self, P: np.ndarray, q: np.ndarray, *, accuracy: float, device: Device) -> None:
+        self._P, self._q, self._accuracy, self._device = P, q, accuracy, device
+
+    def on(self, A: np.ndarray, iterations: int) -> AdmmIterations:
+        """See ``Splitting``."""
+        programs = AdmmPrograms([Dense(self._P, self._q, A)], device=self._device, scaling=SCALING, adapt=ADAPT)
+        return AdmmIterations(programs, self._accuracy, iterations)
+
+
+@dataclass(frozen=True)
+class AdmmIterations:
+    """``Iterations`` by kernels."""
+
+    programs: AdmmPrograms
+    accuracy: float
+    iterations: int
+
+    def run(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> Iterate:
+        """See ``Iterations``."""
+        (end,) = self.programs.solve([lower], [upper], [start], accuracy=self.accuracy, iterations=self.iterations)
+        return end

@@ -1,0 +1,62 @@
+"""The comparison of OSQP's iterations as kernels with OSQP, on programs of a coarse body's steps."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from egs_warp.assets import pawn
+from egs_warp.locomotion.admm import Dense
+from tests.support.scripts import BENCHMARKS, module_of
+
+
+@pytest.fixture(scope="module")
+def benchmark() -> ModuleType:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(BENCHMARKS))
+        return module_of("qp_kernels")
+
+
+@pytest.fixture(scope="module")
+def programs(benchmark: ModuleType) -> list[Any]:
+    """Of the first steps of a jump."""
+    return benchmark.recorded(pawn, 60, "jump", most=14, seed=0)
+
+
+def test_recorded_programs_end_as_osqp_ends_on_them(benchmark: ModuleType, programs: list[Any], device: str) -> None:
+    """|x - x'| at most 1e-6 of the largest |x| and the same status, by iterations alone; after 50 iterations; and as
+    the engine solves them."""
+    assert len(programs) == 14 and any(one.beside for one in programs) and not all(one.beside for one in programs)
+    everything, alone = benchmark.full(programs, device)
+    assert everything["programs"] == everything["solved"] == alone["programs"] == 14 and alone["motion"] == "pawn jump"
+    assert not everything["unlike"] and 0.0 < everything["worst"] <= 1e-6
+    assert everything["osqp_iterations"] == pytest.approx(everything["iterations"], rel=0.02)
+    for row in (benchmark.few(programs, device), benchmark.whole(programs, device)):
+        assert not row["unlike"] and row["worst"] <= 1e-6
+
+
+def test_what_is_not_unique_is_compared_by_its_value(benchmark: ModuleType) -> None:
+    """min (x1 + x2 - 1)^2: every point of a line is an optimum; its rows tell points apart."""
+    P, q = 2.0 * np.ones((2, 2)), np.full(2, -2.0)
+    bounds = np.array([0.0]), np.array([np.inf])
+    one = benchmark.Recorded("", Dense(P, q, np.array([[1.0, 1.0]])), *bounds, None, False)
+    assert one.flat
+    assert benchmark.missed(one, np.array([1.0, 0.0]), np.array([0.0, 1.0])) == 0.0
+    assert benchmark.missed(one, np.array([1.0, 1.0]), np.array([0.0, 1.0])) == pytest.approx(1.0)
+    sharp = benchmark.Recorded("", Dense(np.eye(2), q, np.eye(2)), *bounds, None, False)
+    assert not sharp.flat and benchmark.missed(sharp, np.array([1.0, 0.0]), np.array([1.0, 1e-3])) == 1e-3
+
+
+def test_aims(benchmark: ModuleType) -> None:
+    row = {"kind": "full", "motion": "all", "programs": 1000, "unlike": [], "worst": 1e-7}
+    assert benchmark.aims([row], "cuda:0")[0] == {"gpu_equal": True, "cpu_equal": None, "thousand": True}
+    assert benchmark.aims([row], "cpu")[1] == {"gpu_equal": "the kernels ran on cpu"}
+    for wrong in ({"worst": 2e-6}, {"unlike": ["3: SOLVED LIMIT"]}):
+        assert benchmark.aims([row | wrong | {"programs": 999}], "cpu")[0] == {
+            "cpu_equal": False,
+            "gpu_equal": None,
+            "thousand": False,
+        }
