@@ -5,11 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import torch
-import warp as wp
-
-from egs_warp.fem.worlds import launch_on
-from egs_warp.kernels.fem import batch_factors as kernels
-from egs_warp.precision import real
 
 PANEL = 96
 """Columns that are factored at a time."""
@@ -18,11 +13,11 @@ CHUNK_BYTES = 2**31
 
 
 class BatchFactors:
-    """A factor L of S = L L^T for each of B worlds, in slots, which are ascending in what follows.
+    """A factor L of S = L L^T for each of B worlds, in slots.
 
     A left-looking factorisation by panels: a product with all columns before, the panel's own small factor, and a
-    product with its inverse, which is kept: so solving takes nothing but products either, and the factors of panels
-    themselves are not needed any more. CUDA's own batched factorisation is made for small matrices.
+    product with its inverse, which is kept: so solving takes nothing but products either. CUDA's own batched
+    factorisation is made for small matrices. ``slots`` in what follows are ascending.
     """
 
     def __init__(
@@ -48,9 +43,12 @@ class BatchFactors:
             columns, before = matrices[:, start:, start:stop], matrices[:, start:, :start]
             if start > 0:
                 columns.baddbmm_(before, before[:, : stop - start].mT, alpha=-1.0)
-            inverse, factored = _inverse_factors(columns[:, : stop - start])
-            fine &= factored
+            own, wrong = torch.linalg.cholesky_ex(columns[:, : stop - start])
+            fine &= (wrong == 0) & own.diagonal(dim1=1, dim2=2).isfinite().all(dim=1)
+            identity = torch.eye(stop - start, dtype=own.dtype, device=own.device).expand_as(own)
+            inverse = torch.linalg.solve_triangular(own, identity, upper=False)
             inverses[:, number, : stop - start, : stop - start] = inverse
+            columns[:, : stop - start] = own
             if stop < self.size:
                 columns[:, stop - start :] = columns[:, stop - start :] @ inverse.mT
         self._factors[slots], self._inverses[slots] = matrices, inverses
@@ -81,22 +79,3 @@ class BatchFactors:
                 rows = torch.baddbmm(rows, factors[:, stop:, start:stop].mT, answer[:, stop:], alpha=-1.0)
             answer[:, start:stop] = inverses[:, number, : stop - start, : stop - start].mT @ rows
         return answer
-
-
-def _inverse_factors(panels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """(k, p, p) L^-1 of ``panels`` (k, p, p) = L L^T, of which the lower triangle counts, and (k,) bool, which of them
-    are positive definite."""
-    count, lanes = len(panels), kernels.BLOCK if panels.is_cuda else 1
-    upper, inverses = panels.mT.contiguous(), torch.zeros_like(panels, memory_format=torch.contiguous_format)
-    fine = torch.empty(count, dtype=torch.bool, device=panels.device)
-    if count > 0:
-        outputs = [(inverses, real), (fine, wp.bool)]
-        launch_on(
-            panels.device,
-            kernels.panels_kernel,
-            (count, lanes),
-            inputs=[(upper, real)],
-            outputs=outputs,
-            block_dim=lanes,
-        )
-    return inverses, fine

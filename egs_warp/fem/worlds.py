@@ -76,7 +76,7 @@ def launch_on(
 ) -> None:
     """``kernel`` over tensors on ``device``: each is a pair of a contiguous tensor and the type of the kernel's array,
     or an array of Warp's, or a number."""
-    target = wp.get_device(str(device))
+    target = wp.device_from_torch(device)
     given, made = ([_array(value) for value in values] for values in (inputs, outputs))
     wp.launch(kernel, dim, inputs=given, outputs=made, device=target, block_dim=block_dim)
 

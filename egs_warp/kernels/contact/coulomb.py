@@ -6,7 +6,7 @@ Each problem has a block of threads to itself on a GPU, one thread on a CPU; wha
 
 import warp as wp
 
-from egs_warp.kernels.lanes import wait_for_lanes
+from egs_warp.kernels.block import wait_for_block
 from egs_warp.precision import Vec3, Vec4, real
 
 wp.set_module_options({"enable_backward": False})
@@ -137,7 +137,7 @@ def missed(contacts: Contacts, forces: wp.array[real], scale: real, length: real
             share = radius / pull
         newton.values[n + 1] = f1 - share * first
         newton.values[n + 2] = f2 - share * second
-    wait_for_lanes()
+    wait_for_block()
     most = real(0.0)
     square = real(0.0)
     for i in range(contacts.count):
@@ -147,7 +147,7 @@ def missed(contacts: Contacts, forces: wp.array[real], scale: real, length: real
             most = wp.max(most, wp.abs(speed))
             square += speed * speed
     # The next values are written once all lanes have read these.
-    wait_for_lanes()
+    wait_for_block()
     # A maximum passes over what is no number, a sum does not.
     if not square < real(wp.inf):
         most = real(wp.inf)
@@ -194,7 +194,7 @@ def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, sho
             newton.unknowns[unknowns] = n + 1
             newton.unknowns[unknowns + 1] = n + 2
             unknowns += 2
-    wait_for_lanes()
+    wait_for_block()
     for a in range(newton.lane, unknowns, wp.block_dim()):
         row = newton.unknowns[a]
         i = row / 3
@@ -232,7 +232,7 @@ def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, sho
                 if b == unknowns:
                     four[k] = right
             newton.matrix[a, quad] = four
-    wait_for_lanes()
+    wait_for_block()
     return unknowns
 
 
@@ -259,7 +259,7 @@ def solve_equations(unknowns: int, newton: Newton):
             if candidate > size:
                 size = candidate
                 pivot = a
-        wait_for_lanes()
+        wait_for_block()
         if size > _SINGULAR * largest:
             largest = wp.max(largest, size)
             if pivot != rank:
@@ -267,17 +267,17 @@ def solve_equations(unknowns: int, newton: Newton):
                     kept = newton.matrix[rank, quad]
                     newton.matrix[rank, quad] = newton.matrix[pivot, quad]
                     newton.matrix[pivot, quad] = kept
-            wait_for_lanes()
+            wait_for_block()
             own = entry(newton.matrix, rank, j)
             for a in range(rank + 1 + newton.lane, unknowns, lanes):
                 newton.change[a] = entry(newton.matrix, a, j) / own
-            wait_for_lanes()
+            wait_for_block()
             for a in range(rank + 1 + newton.lane / across, unknowns, lanes / across):
                 factor = newton.change[a]
                 if factor != real(0.0):
                     for quad in range(j / 4 + newton.lane % across, quads, across):
                         newton.matrix[a, quad] = newton.matrix[a, quad] - factor * newton.matrix[rank, quad]
-            wait_for_lanes()
+            wait_for_block()
             newton.pivots[rank] = j
             rank += 1
     # Each lane writes the same here.
@@ -288,7 +288,7 @@ def solve_equations(unknowns: int, newton: Newton):
         for b in range(j + 1, unknowns):
             value -= entry(newton.matrix, row, b) * newton.step[newton.unknowns[b]]
         newton.step[newton.unknowns[j]] = value / entry(newton.matrix, row, j)
-    wait_for_lanes()
+    wait_for_block()
 
 
 @wp.func
@@ -301,7 +301,7 @@ def find_step(contacts: Contacts, forces: wp.array[real], scale: real, short: re
         for c in range(3 * contacts.count):
             speed += contacts.delassus[k, c] * newton.step[c]
         newton.change[k] = speed
-    wait_for_lanes()
+    wait_for_block()
 
 
 @wp.func
@@ -316,7 +316,7 @@ def find_velocities(contacts: Contacts, forces: wp.array[real], newton: Newton):
         newton.velocities[k] = speed
         newton.step[k] = real(0.0)
         newton.change[k] = real(0.0)
-    wait_for_lanes()
+    wait_for_block()
 
 
 @wp.func
@@ -327,7 +327,7 @@ def move(contacts: Contacts, forces: wp.array[real], length: real, newton: Newto
         newton.velocities[k] = newton.velocities[k] + length * newton.change[k]
         newton.step[k] = real(0.0)
         newton.change[k] = real(0.0)
-    wait_for_lanes()
+    wait_for_block()
 
 
 @wp.func
@@ -335,7 +335,7 @@ def keep(contacts: Contacts, source: wp.array[real], target: wp.array[real], new
     """``target`` is ``source`` (3n,) then."""
     for k in range(newton.lane, 3 * contacts.count, wp.block_dim()):
         target[k] = source[k]
-    wait_for_lanes()
+    wait_for_block()
 
 
 @wp.func
@@ -352,7 +352,7 @@ def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp
             steps = iterations
         if newton.lane == 0:
             sweep(contacts, sweeps, forces)
-        wait_for_lanes()
+        wait_for_block()
         find_velocities(contacts, forces, newton)
         for number in range(steps):
             short = _SHORT

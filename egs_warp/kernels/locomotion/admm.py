@@ -9,7 +9,7 @@ factor would have them wait for each unknown. Constants are the defaults that OS
 
 import warp as wp
 
-from egs_warp.kernels.locomotion.block import largest_of_block, sum_of_block, wait_for_block
+from egs_warp.kernels.block import largest_of_block, sum_of_block, wait_for_block
 from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
