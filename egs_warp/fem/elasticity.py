@@ -134,9 +134,12 @@ class ElasticAssembly:
     def maps(self) -> ElasticMaps:
         """What the kernels read of the mesh, for those who lay it out for many bodies."""
         return ElasticMaps(
-            *(each.numpy() for each in (self._rest_inverses, self._volumes)),
-            *(each.numpy() for each in (self._corner_offsets, self._corner_from_slot)),
-            *(each.numpy() for each in (self._contribution_offsets, self._block_from_contribution)),
+            self._rest_inverses.numpy(),
+            self._volumes.numpy(),
+            self._corner_offsets.numpy(),
+            self._corner_from_slot.numpy(),
+            self._contribution_offsets.numpy(),
+            self._block_from_contribution.numpy(),
             self._entry_from_block.numpy(),
         )
 

@@ -21,7 +21,7 @@ from egs_warp.pipelines.ending import State
 from egs_warp.pipelines.job import Job, Told
 from egs_warp.pipelines.ray_crew import HERE, RayCrew
 from egs_warp.pipelines.report import GaussianCounts, Report
-from egs_warp.pipelines.side_by_side import fits, most_worlds, performed
+from egs_warp.pipelines.side_by_side import fits, performed, worth_worlds
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,8 @@ def simulate_many(
     heights of those for 30 steps.
 
     ``worlds``: of the jobs whose activations are given and that nothing pushes, how many are made side by side in this
-    process, on the creature's device; as many as a GPU has room for, up to 1,024, and none on a CPU if None; none if 0.
+    process, on the creature's device. If None, on a GPU as many as it has room for, up to 1,024, where there are two
+    or more for each core of this machine, and else none; none if 0.
     All others go to workers.
 
     ``workers``: how many processes of this machine, as many as it has cores if None; ``"ray"``, or the address of a Ray
@@ -85,7 +86,7 @@ def simulate_many(
         folder.mkdir(parents=True, exist_ok=True)
     outcomes: list[Outcome | None] = [None] * len(jobs)
     counts = _Frames(len(jobs), progress)
-    for task in _over(creature, jobs, workers, most_worlds(creature) if worlds is None else worlds, counts):
+    for task in _over(creature, jobs, workers, worlds, counts):
         report, frames, trajectory = task.value or (None, np.zeros(0, int), None)
         if report is not None:
             report = replace(report, gaussians=GaussianCounts.of(creature))
@@ -103,12 +104,14 @@ def simulate_many(
 
 
 def _over(
-    creature: Creature, jobs: Sequence[Job], workers: int | str | None, worlds: int, counts: _Frames
+    creature: Creature, jobs: Sequence[Job], workers: int | str | None, worlds: int | None, counts: _Frames
 ) -> Iterator[Ended]:
     """The jobs as they end: first those side by side."""
-    if worlds < 0:
+    if worlds is not None and worlds < 0:
         raise ArgumentError("worlds", "give how many are made side by side, at least 0", value=worlds)
-    beside = [number for number, job in enumerate(jobs) if worlds > 0 and fits(job)]
+    beside = [number for number, job in enumerate(jobs) if fits(job)]
+    worlds = worth_worlds(creature, len(beside)) if worlds is None else worlds
+    beside = beside if worlds > 0 else []
     yield from performed(creature, [(number, jobs[number]) for number in beside], worlds=worlds, told=counts.all_told)
     left = sorted(set(range(len(jobs))) - set(beside))
     given = [jobs[number] for number in left]

@@ -12,6 +12,7 @@ import numpy as np
 
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import UNSOLVABLE, UnsolvableStepError
+from egs_warp.launching import available_threads
 from egs_warp.locomotion.rollout import solver_steps
 from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory, StepReport
 from egs_warp.pipelines.creature import Creature, checked_friction
@@ -26,13 +27,16 @@ MOST_WORLDS = 1024
 """Side by side: more are hardly faster, and what they have done lies in memory until they end."""
 _SHARE = 0.4
 """Of the free memory of a GPU that factors of matrices may take."""
+_WORTH = 2
+"""Jobs for each core of the machine from which on they end sooner side by side: on an H100 eight worlds of 253 nodes
+make 101 steps a second, one process 21."""
 
 
-def most_worlds(creature: Creature) -> int:
-    """How many jobs the creature's device has room for side by side; 0 where that is a CPU, torch does not see it, or
-    the ground is not flat."""
+def worth_worlds(creature: Creature, jobs: int) -> int:
+    """How many of so many ``jobs`` to do side by side: as many as the creature's device has room for, and 0 where
+    workers do so few sooner, that device is a CPU, torch does not see it, or the ground is not flat."""
     device = creature.body.assembly.device
-    if not device.is_cuda or creature.geometry.field is not None:
+    if not device.is_cuda or creature.geometry.field is not None or jobs < _WORTH * available_threads():
         return 0
     try:
         import torch
