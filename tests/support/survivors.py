@@ -57,8 +57,8 @@ SURVIVORS: list[Survivor] = [
     ),
     Survivor(
         "contact/coupled_step.py",
-        "_SLOW = 0.5",
-        "_SLOW = -0.5",
+        "SLOW = 0.5",
+        "SLOW = -0.5",
         "a new tangent in every iteration: slower, to the same end",
     ),
     Survivor(
