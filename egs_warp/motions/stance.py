@@ -50,8 +50,6 @@ class Weights:
     """Of the centre of mass, up."""
     spin: float = 600.0
     pose: float = 0.02
-    airborne: float = 2.0
-    """Of the pose in the air, where nothing else can be steered and the feet have to get to their place."""
     landing: float = 0.1
     """Share of ``com``, ``up`` and ``spin`` that is asked for from touch-down on: what is left is to come to rest,
     at no given time."""
