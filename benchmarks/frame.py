@@ -12,7 +12,7 @@ Aims on a CPU: ``cpu_541`` (at most 60 ms in the mean and 5 times that in the wo
 old commit's time), ``cpu_250_realtime`` (16.7 ms). On a GPU elements, contact points and dense factors are on the
 device, the program and what joins them on the host: ``gpu_541`` (8 ms in the mean, 16 in the worst step), ``gpu_1000``
 (14 and 28), ``gpu_frame_60hz`` (a picture is made beside the next step: false where a step of 1,000 nodes takes longer
-than 16.7 ms, else null, for no picture is made here).
+than 16.7 ms, else null: pictures are ``picture.py``'s).
 """
 
 from __future__ import annotations
