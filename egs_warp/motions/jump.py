@@ -65,8 +65,9 @@ SWING, BASE_SWING = 5.0, 1.0
 Told by the pose alone they come down 0.03 body heights short, and a body with little in front of it falls over them. A
 base is stiff: with 5 a monkey's jump takes half as much work again, and lands no better."""
 AIRBORNE, BASE_AIRBORNE = 2.0, 0.3
-"""Weights of the pose in the air, where nothing else can be steered and the feet have to get to their place, on legs
-and on a base: with 2 muscles of a pawn give 0.76 m g H in the air, with 0.3 they give 0.30, and it lands as well."""
+"""Weights of the pose in the air, where nothing else can be steered and the feet have to get to their place: on legs
+and of what turns as it flies, by how wide it makes itself; and on a base, straight ahead: with 2 muscles of a pawn give
+0.76 m g H in the air, with 0.3 they give 0.30, and it lands as well."""
 
 
 class Jump:
@@ -103,7 +104,8 @@ class Jump:
         )
         feet, carriage = carried_on(place)
         on_legs = carriage is OnLegs
-        self._swing, self._airborne = (SWING, AIRBORNE) if on_legs else (BASE_SWING, BASE_AIRBORNE)
+        self._swing = SWING if on_legs else BASE_SWING
+        self._airborne = AIRBORNE if on_legs or self.facing.turn else BASE_AIRBORNE
         base = np.flatnonzero(sole_shares(body, ground, place.standing))
         self._soles = [
             BodyPart.of(body, "sole", sole) for sole in ([foot.sole for foot in feet] if on_legs else [base])
