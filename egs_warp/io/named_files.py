@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from egs_warp.errors import ArgumentError, UserError
-from egs_warp.io.atomic import lock, writable_folder
+from egs_warp.io.atomic import lock, sweep_all, writable_folder
 from egs_warp.io.run_folder import check_out, move_aside
 
 
@@ -31,14 +31,16 @@ def named_files(*paths: Path, overwrite: bool = False) -> Iterator[NamedFiles]:
     aside (``overwrite``).
     """
     check_named_files(*paths, overwrite=overwrite)
-    for folder in dict.fromkeys(path.parent for path in paths):
-        writable_folder(folder)
+    folders = [writable_folder(folder) for folder in dict.fromkeys(path.parent for path in paths)]
     with lock(paths[0].parent / f".egs-{paths[0].name}.lock") as free:
         if not free:
             raise UserError(f"{paths[0]}: another run is writing this file; wait for it, or choose another name")
         # What came between the check and the lock.
         check_named_files(*paths, overwrite=overwrite)
         yield NamedFiles(paths)
+        # What a killed run had left so lately that it might have been a living one's.
+        for folder in folders:
+            sweep_all(folder)
 
 
 def check_named_files(*paths: Path, overwrite: bool = False) -> None:

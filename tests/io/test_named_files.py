@@ -60,3 +60,11 @@ def test_places_are_checked_before_the_work_and_not_made(tmp_path: Path) -> None
         check_named_files(tmp_path / "file" / "a.ply")
     check_named_files(tmp_path / "new" / "a.ply")
     assert sorted(os.listdir(tmp_path)) == ["file", "folder.ply"]
+
+
+def test_what_a_run_that_was_killed_just_now_has_left_is_gone_at_the_end(tmp_path: Path) -> None:
+    """However young: who goes on with a training at once finds its half-written files, and may end as soon."""
+    left = tmp_path / ".egs-0123456789abcdef.npz"
+    left.write_text("half")
+    write(tmp_path / "a.ply", text="1")
+    assert sorted(os.listdir(tmp_path)) == ["a.ply"]
