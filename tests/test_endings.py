@@ -133,7 +133,8 @@ def test_a_closed_pipe_only_silences() -> None:
 def told_by(command: str, *, encoding: str = "utf-8") -> tuple[int, str, str]:
     """Status and output of a command of the shell, in which ``egs-warp`` stands for the program."""
     line = command.replace("egs-warp", f"{sys.executable} -m egs_warp.cli")
-    environment = os.environ | {"PYTHONIOENCODING": encoding}
+    # Unbuffered, as some machines have it, all would be told where it is written.
+    environment = os.environ | {"PYTHONIOENCODING": encoding, "PYTHONUNBUFFERED": ""}
     done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, env=environment, timeout=120)
     return done.returncode, done.stdout, done.stderr
 

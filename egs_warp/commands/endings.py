@@ -53,6 +53,8 @@ def one_line_errors(program: str) -> Iterator[None]:
         try:
             with _unwinding(came):
                 yield
+                # What is still buffered may not find room either.
+                sys.stdout.flush()
         except UserError as error:
             end(1 if _gave_out(error.__cause__) else 2, error.told(flag_of))
         except KeyboardInterrupt as error:
@@ -138,12 +140,12 @@ def _deaf_streams() -> Iterator[None]:
     before = sys.stdout, sys.stderr
     # Python has none where the shell has closed it.
     with open(os.devnull, "w") as nowhere:
-        sys.stdout = _Stream(before[0] or nowhere, BrokenPipeError)
+        sys.stdout = stdout = _Stream(before[0] or nowhere, BrokenPipeError)
         sys.stderr = _Stream(before[1] or nowhere, OSError)
         try:
             yield
-            sys.stdout.flush()
         finally:
+            stdout.settle()
             sys.stdout, sys.stderr = before
 
 
@@ -185,6 +187,13 @@ class _Stream:
         try:
             self._stream.flush()
         except self._lost:
+            self._silence()
+
+    def settle(self) -> None:
+        """Flush; what cannot be written is not tried again when Python ends."""
+        try:
+            self._stream.flush()
+        except OSError:
             self._silence()
 
     def _silence(self) -> None:

@@ -219,8 +219,9 @@ class Processes:
 def serve() -> None:
     """The life of a worker of ``Processes``: messages come in by stdin and go out by what was stdout."""
     out = os.fdopen(os.dup(1), "wb")
-    # Whatever else is printed goes where errors go.
+    # Whatever else is printed goes where errors go, at once: a worker ends without a flush.
     os.dup2(2, 1)
+    sys.stdout = os.fdopen(1, "w", buffering=1, closefd=False)
     script = pickle.load(sys.stdin.buffer)
     if script is not None:
         made = ModuleType("__mp_main__")

@@ -170,7 +170,8 @@ def test_what_a_script_defines_is_found(tmp_path: Path) -> None:
             """
         )
     )
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    # Unbuffered, as some machines have it, nothing could be lost.
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": ""}
     run = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, env=environment, timeout=120)
     assert run.stdout == "[1, 8, 27]\n" and run.stderr.count("heard") == 3, run.stderr
 
