@@ -79,8 +79,8 @@ def test_a_scene_enters_at_most_eight_rooms_on_its_way_to_a_filled_floor(tmp_pat
 
 def test_an_activation_becomes_a_force_in_one_module() -> None:
     """Where the lines of segments are read off the nodes: columns and forces are made of them in the same place, and
-    nowhere else but for many worlds, which tests hold to what each does alone (the ledger, which shares no code with the
-    solver, reads the file of a run)."""
+    nowhere else but for many worlds, which tests hold to what each does alone (the ledger, which shares no code with
+    the solver, reads the file of a run)."""
     readers = set()
     for path in PACKAGE.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
