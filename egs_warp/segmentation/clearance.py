@@ -55,14 +55,14 @@ class Clearing(enum.Enum):
 class ClearingOptions:
     """What may be chosen about the fine-tune."""
 
-    iterations: int = 200
+    iterations: int = 100
     reach: Reach = Reach.ELLIPSOID
     weight: float = 0.3
     """Of L_seg beside the photometric loss; 0.3 and 3 give the same to 0.4 dB."""
-    subdivisions: int = 4
+    subdivisions: int = 5
     """How often, at most, straddling Gaussians are first split in three across the plane: smaller ones come closer to
     it without crossing. 0 is the paper's way."""
-    fine_reach: float = 0.01
+    fine_reach: float = 0.006
     """Of the object's height: those that reach no farther across the plane are not split any more."""
     cut_rest: bool = True
     """Those that still straddle after training are cut at the plane as ``SPLIT`` does it; the paper leaves them."""

@@ -171,9 +171,9 @@ SURVIVORS: list[Survivor] = [
     ),
     Survivor(
         "segmentation/clearance.py",
-        "iterations: int = 200",
-        "iterations: int = 199",
-        "a default: one step of two hundred less",
+        "iterations: int = 100",
+        "iterations: int = 99",
+        "a default: one step of a hundred less",
     ),
     Survivor(
         "segmentation/clearance.py",
