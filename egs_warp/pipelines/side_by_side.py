@@ -105,7 +105,45 @@ def _entered(creature: Creature, number: int, job: Job, _: Tell) -> _Entered:
 def _ended(
     creature: Creature, together: Sequence[_Entered], told: Callable[[dict[int, tuple[int, int]]], object]
 ) -> Iterator[Ended]:
-    """Step all, then tell of each."""
+    """Step all, then tell of each. What there is no room for is done again in halves."""
+    import torch
+
+    run, cramped = None, ""
+    try:
+        run = _run(creature, together, told)
+    except torch.OutOfMemoryError as error:
+        cramped = " ".join(str(error).split())
+    # Past the except, whose traceback holds what there was no more room beside.
+    if run is None and len(together) == 1:
+        why = f"out of GPU memory beside nothing else; give worlds=0 for workers: {cramped}"
+        yield Ended(together[0].number, None, why, 1)
+        return
+    if run is None:
+        torch.cuda.empty_cache()
+        half = len(together) // 2
+        yield from _ended(creature, together[:half], told)
+        yield from _ended(creature, together[half:], told)
+        return
+    for one, its, made, gone in zip(together, run.creatures, run.steps, run.lost, strict=True):
+        kind, value = attempted(partial(_outcome, its, made, gone), one.job, told)
+        yield Ended(one.number, *((value, None) if kind == "done" else (None, value)), 1)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What jobs have done side by side, each with a row."""
+
+    creatures: list[Creature]
+    """On their own ground."""
+    steps: list[list[list[StepReport]]]
+    """See ``_stepped``."""
+    lost: list[bool]
+    """Whether there is no standing on that ground."""
+
+
+def _run(
+    creature: Creature, together: Sequence[_Entered], told: Callable[[dict[int, tuple[int, int]]], object]
+) -> _Run:
     from egs_warp.locomotion.batch import BatchStepper
 
     stepper = BatchStepper(
@@ -124,10 +162,7 @@ def _ended(
         replace(creature, stepper=creature.stepper.with_friction(one.friction), start=start)
         for one, start in zip(together, starts, strict=True)
     ]
-    runs = _stepped(stepper, together, creatures, told)
-    for one, its, made, gone in zip(together, creatures, runs, lost, strict=True):
-        kind, value = attempted(partial(_outcome, its, made, gone), one.job, told)
-        yield Ended(one.number, *((value, None) if kind == "done" else (None, value)), 1)
+    return _Run(creatures, _stepped(stepper, together, creatures, told), lost)
 
 
 def _outcome(creature: Creature, made: list[list[StepReport]], lost: bool, job: Job, _: Tell) -> Told:

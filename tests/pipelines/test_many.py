@@ -6,12 +6,15 @@ import importlib.util
 import pickle
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from egs_warp.assets import pawn
 from egs_warp.errors import ArgumentError, UserError
+from egs_warp.locomotion.batch import BatchState, BatchStepper
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.push import read_pushes
 from egs_warp.motions.script import motion
@@ -156,6 +159,30 @@ def test_side_by_side_each_is_as_alone(creature: Creature, tmp_path: Path) -> No
         assert outcome.report.audit.momentum_residual < 1e-9
         assert outcome.report.asked["activations"] == (job.activations is not None)
     assert steps == [6, 3, 4, 3, 6]
+
+
+def test_what_a_gpu_has_no_room_for_is_done_in_halves(creature: Creature, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Memory for two worlds where four are asked for; then for none, which each of them tells in a line."""
+    room, asked = 2, []
+
+    class Cramped(BatchStepper):
+        def advance(self, state: BatchState, *given: Any) -> Any:
+            asked.append(len(state.worlds))
+            if len(state.worlds) > room:
+                raise torch.OutOfMemoryError("CUDA out of memory.\nTried to allocate 20.00 MiB")
+            return super().advance(state, *given)
+
+    monkeypatch.setattr("egs_warp.locomotion.batch.BatchStepper", Cramped)
+    held = np.zeros((2, creature.muscles.segment_count))
+    jobs = [Job(motion("stand 1"), activations=held + level, get_up=False) for level in (0.0, 1e-3, 2e-3, 3e-3)]
+    made = simulate_many(creature, jobs, worlds=4)
+    assert asked == [4, 2, 2, 2, 2] and [one.error for one in made] == [None] * 4
+    np.testing.assert_array_equal([one.trajectory.activations[0, 0] for one in made], [0.0, 1e-3, 2e-3, 3e-3])
+    room = 0
+    assert [one.error for one in simulate_many(creature, jobs[:2], worlds=2)] == [
+        "out of GPU memory beside nothing else; give worlds=0 for workers: CUDA out of memory. Tried to allocate"
+        " 20.00 MiB"
+    ] * 2
 
 
 def test_how_many_worlds_is_at_least_none(creature: Creature) -> None:
