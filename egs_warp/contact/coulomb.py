@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from egs_warp.kernels.contact import coulomb as kernels
+from egs_warp.kernels.contact.coulomb_equations import Contacts
 from egs_warp.launching import empty_together
 from egs_warp.precision import Vec4, real
 
@@ -53,7 +54,7 @@ def coulomb_forces(
 
 def contacts_of(delassus: np.ndarray, free_velocity: np.ndarray, shift: np.ndarray, friction: float) -> Any:
     """The kernels' ``Contacts``, where they lie in the arrays: see ``coulomb_forces``."""
-    contacts = kernels.Contacts()
+    contacts = Contacts()
     contacts.count, contacts.friction = len(shift), friction
     contacts.delassus, contacts.free, contacts.shifts = _shared(delassus), _shared(free_velocity), _shared(shift)
     return contacts

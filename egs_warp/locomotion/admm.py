@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from egs_warp.kernels.locomotion import admm as kernels
+from egs_warp.kernels.locomotion import scaled_programs as scaled
 from egs_warp.launching import Device, empty_together
 from egs_warp.precision import real
 
@@ -72,7 +73,7 @@ class AdmmPrograms:
         self._scaling, self._adapt = scaling, adapt
         self._sizes = [one.A.shape for one in programs]
         k, m, n = len(programs), *(max(sizes) for sizes in zip(*self._sizes, strict=True))
-        self._programs = kernels.Programs()
+        self._programs = scaled.Programs()
         self._programs.P = self._on_device(_padded([one.P for one in programs], (k, n, n)))
         self._programs.q = self._on_device(_padded([one.q for one in programs], (k, n)))
         self._programs.A = self._on_device(_padded([one.A for one in programs], (k, m, n)))
@@ -99,14 +100,14 @@ class AdmmPrograms:
                 x[: len(start)] = start
         self._programs.lower = self._on_device(_padded(lower, (k, m)))
         self._programs.upper = self._on_device(_padded(upper, (k, m)))
-        iterates, memory = kernels.Iterates(), kernels.Memory()
+        iterates, memory = scaled.Iterates(), scaled.Memory()
         iterates.x, iterates.y, iterates.rho = map(self._on_device, (self._x, self._y, self._rho))
         square, table = ((k, n, n), real), ((k, m, n), real)
         (memory.P, memory.inverse, memory.rows, memory.columns, memory.by_variable, memory.by_row, ended, taken) = (
             empty_together(
                 self._device,
-                *(square, square, table, ((k, n, m), real), ((k, kernels.BY_VARIABLE, n), real)),
-                *(((k, kernels.BY_ROW, m), real), (k, int), (k, int)),
+                *(square, square, table, ((k, n, m), real), ((k, scaled.BY_VARIABLE, n), real)),
+                *(((k, scaled.BY_ROW, m), real), (k, int), (k, int)),
             )
         )
         block = 1 if self._device.is_cpu else kernels.BLOCK
