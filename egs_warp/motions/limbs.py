@@ -28,6 +28,8 @@ _APART = 0.08
 """Body heights over which a limb is apart from all others; what is shorter is a toe."""
 _JOINED = 0.1
 """Body heights, or a mean edge of the mesh if that is more: limbs joined on the ground by more are one base."""
+_BAR = 0.5
+"""Body heights of air between two limbs: what joins them across more, however thin, is no flaw of a capture."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class Sections:
     centres: np.ndarray
     """(S, 3) metres, about."""
     volumes: np.ndarray
-    """(S,) in any unit."""
+    """(S,) m^3."""
     joints: np.ndarray
     """(., 2) int: touching sections on consecutive levels, the lower one first."""
     section_from_node: np.ndarray
@@ -97,7 +99,7 @@ class Sections:
             solid.spacing,
             levels,
             _centres(section, points, np.ones(len(points)), count),
-            np.bincount(section, minlength=count).astype(float),
+            solid.spacing**3 * np.bincount(section, minlength=count),
             _distinct(section[np.concatenate(upwards)], count),
             section[np.asarray(KDTree(points).query(mesh.nodes)[1])],
             _JOINED * float(np.ptp(mesh.nodes[:, 2])),
@@ -210,6 +212,7 @@ class _Graph:
         self._near = int(np.ceil(_NEAR_GROUND * size))
         self._shortest = max(2, round(_APART * size))
         self._melt = int(np.ceil(sections.melt / sections.thickness))
+        self._bar = _BAR * self.height
 
     def crossings(self) -> list[list[int]]:
         """For each level with more than one, its sections that lead down to the ground and together carry the body."""
@@ -279,15 +282,25 @@ class _Graph:
         return gone, own, last, met
 
     def bases(self, limbs: Sequence[_Limb]) -> np.ndarray:
-        """(limbs,) the number of each limb's foot: those that are joined by much have one."""
+        """(limbs,) the number of each limb's foot: those that are joined by much have one, and those that a bar joins
+        where no other limb stands between them."""
+        if not limbs:
+            return np.zeros(0, int)
         under = [self._ground_under(limb) for limb in limbs]
-        pairs = [
-            (a, b)
-            for a in range(len(limbs))
-            for b in range(a)
-            if under[a] & under[b] and min(limbs[a].bottom, limbs[b].bottom) > self._melt
-        ]
-        return _components(len(limbs), np.array(pairs, int).reshape(-1, 2))[1] if limbs else np.zeros(0, int)
+        joined = [(a, b) for a in range(len(limbs)) for b in range(a) if under[a] & under[b]]
+        thick = [(a, b) for a, b in joined if min(limbs[a].bottom, limbs[b].bottom) > self._melt]
+        near = [(a, b) for a, b in joined if self._air(limbs[a], limbs[b]) <= self._bar]
+        _, side = _components(len(limbs), np.array(near, int).reshape(-1, 2))
+        bars = [(a, b) for a, b in joined if side[a] != side[b]]
+        return _components(len(limbs), np.array(thick + bars, int).reshape(-1, 2))[1]
+
+    def _air(self, one: _Limb, other: _Limb) -> float:
+        """Metres between the lowest own sections of two limbs, each taken for a square."""
+        at, volumes = self.sections.centres[:, :2], self.sections.volumes
+        ends = [list(limb.lowest) for limb in (one, other)]
+        first, second = (np.average(at[end], axis=0, weights=volumes[end]) for end in ends)
+        sides = [np.sqrt(volumes[end].sum() / self.sections.thickness) for end in ends]
+        return float(np.linalg.norm(second - first) - 0.5 * sum(sides))
 
     def _ground_under(self, limb: _Limb) -> set[int]:
         """The last sections that what is under the limb leads down to."""
