@@ -1,0 +1,184 @@
+"""The equations of many worlds side by side are those of each alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from egs_warp.fem.batch_problem import BatchBody, BatchProblem, inverse_of
+from egs_warp.fem.body import BodyState, SoftBody, make_body
+from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.step_problem import StepProblem, Tangent
+from egs_warp.geometry.plane import Plane
+from egs_warp.muscles.muscle_set import MuscleSet, automatic_muscles
+from egs_warp.muscles.tension import MuscleTension
+from tests.fem.test_step_problem import bent_state, spinning_state
+from tests.support.meshes import block_mesh
+
+FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+DT, DRAG = 1 / 60, 0.7
+
+
+@pytest.fixture(scope="module")
+def body() -> SoftBody:
+    return make_body(block_mesh(), FLOOR, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def muscles(body: SoftBody) -> MuscleSet:
+    return automatic_muscles(body.mesh, FLOOR.normal, body_weight=body.weight, height=body.height)
+
+
+@pytest.fixture(scope="module")
+def activations(muscles: MuscleSet) -> np.ndarray:
+    """(3, M) metres: pulls and a few pushes, some of them too weak to count."""
+    share = np.random.default_rng(5).uniform(-0.05, 0.3, (3, muscles.segment_count))
+    share[:, ::7] *= 1e-5
+    return share * muscles.bounds
+
+
+@pytest.fixture(scope="module")
+def states(body: SoftBody) -> list[BodyState]:
+    return [spinning_state(body), bent_state(body, seed=1), BodyState(body.mesh.nodes, 0.0 * body.mesh.nodes)]
+
+
+@pytest.fixture(scope="module")
+def alone(body: SoftBody, states: list[BodyState]) -> list[StepProblem]:
+    return [StepProblem(body, state, DT, DRAG) for state in states]
+
+
+@pytest.fixture(scope="module")
+def beside(body: SoftBody, muscles: MuscleSet, states: list[BodyState]) -> BatchProblem:
+    """The same worlds in slots 0, 1 and 3 of four."""
+    return problem_of(BatchBody(body, muscles, 4, panel=32), states)
+
+
+def problem_of(common: BatchBody, states: list[BodyState], *, dt: float = DT, drag: float = DRAG) -> BatchProblem:
+    positions, velocities = (
+        torch.from_numpy(np.stack([getattr(state, name) for state in states])) for name in ("positions", "velocities")
+    )
+    return BatchProblem.at(common, torch.tensor([0, 1, 3])[: len(states)], positions, velocities, dt=dt, drag=drag)
+
+
+def tried(states: list[BodyState]) -> np.ndarray:
+    """(3, N, 3) m/s."""
+    random = np.random.default_rng(2)
+    return np.stack([state.velocities + 0.1 * random.standard_normal(state.velocities.shape) for state in states])
+
+
+def same(beside: torch.Tensor, alone: list[np.ndarray], *, rel: float = 1e-12) -> None:
+    for one, other in zip(beside.numpy(), alone, strict=True):
+        np.testing.assert_allclose(one.reshape(other.shape), other, rtol=0, atol=rel * np.abs(other).max() + 1e-300)
+
+
+def test_what_a_step_starts_from(body: SoftBody, beside: BatchProblem, alone: list[StepProblem]) -> None:
+    assert beside.unit == pytest.approx(alone[0].unit) and beside.inertia_ratio == pytest.approx(1.0 + DT * DRAG)
+    same(beside.turns, [one.turns for one in alone])
+    same(beside.momenta, [one.momenta for one in alone])
+    same(beside.turning_rates, [np.linalg.inv(one.inertia) for one in alone])
+    same(beside.start()[:2], [one.start for one in alone[:2]])
+    assert np.abs(beside.start()[2].numpy()).max() < 1e-12
+    centres = [body.centre_of_mass(one.state.positions) for one in alone]
+    same(beside.common.centre(beside.positions), centres)
+
+
+@pytest.mark.parametrize("pulling", [False, True])
+def test_residuals(
+    states: list[BodyState],
+    muscles: MuscleSet,
+    activations: np.ndarray,
+    beside: BatchProblem,
+    alone: list[StepProblem],
+    pulling: bool,
+) -> None:
+    """Forces, what the step gives back of a spin, and the whole equation, with muscles and without."""
+    given = tried(states)
+    velocities, tensions = torch.from_numpy(given), torch.from_numpy(muscles.stiffness * activations)
+    pulls = [MuscleTension.of(muscles, one) if pulling else None for one in activations]
+    internal = beside.internal_gradient(velocities, tensions if pulling else None)
+    expected = [one.internal_gradient(v, pull) for one, v, pull in zip(alone, given, pulls, strict=True)]
+    same(internal, expected)
+    spins = [one.spin(gradient) for one, gradient in zip(alone, expected, strict=True)]
+    assert min(np.linalg.norm(spin) for spin in spins) > 1e-4
+    same(beside.spin(internal), spins, rel=1e-10)
+    residuals = [one.residual(v, pull) for one, v, pull in zip(alone, given, pulls, strict=True)]
+    same(beside.residual(velocities, tensions if pulling else None), residuals)
+    same(beside.end_positions(velocities), [one.end_positions(v) for one, v in zip(alone, given, strict=True)])
+
+
+def test_a_world_with_an_inverted_element_is_not_feasible(
+    body: SoftBody, states: list[BodyState], beside: BatchProblem, alone: list[StepProblem]
+) -> None:
+    given = tried(states)
+    given[1] -= 2.0 * (states[1].positions - body.centre_of_mass(states[1].positions)) / DT
+    assert beside.feasible(torch.from_numpy(given)).tolist() == [True, False, True]
+    assert [one.feasible(v) for one, v in zip(alone, given, strict=True)] == [True, False, True]
+
+
+def tangents(
+    body: SoftBody, problems: list[StepProblem], given: np.ndarray, pulls: list[MuscleTension] | list[None]
+) -> list[Tangent]:
+    return [
+        one.tangent(SparseFactors(body.assembly.upper_pattern), v, pull)
+        for one, v, pull in zip(problems, given, pulls, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("pulling", [False, True])
+@pytest.mark.parametrize("chunk_bytes", [1, 2**31])
+def test_tangents(
+    body: SoftBody,
+    states: list[BodyState],
+    muscles: MuscleSet,
+    activations: np.ndarray,
+    alone: list[StepProblem],
+    pulling: bool,
+    chunk_bytes: int,
+) -> None:
+    """What impulses bring about, with and without the stiffness of muscles; a turning that is known is used."""
+    beside = problem_of(BatchBody(body, muscles, 4, panel=32, chunk_bytes=chunk_bytes), states)
+    given, impulses = tried(states), np.random.default_rng(3).standard_normal((3, given_size(body), 4))
+    pulls = [MuscleTension.of(muscles, one) for one in activations] if pulling else [None] * 3
+    tensions = torch.from_numpy(muscles.stiffness * activations) if pulling else None
+    assert beside.factor(torch.from_numpy(given), tensions).tolist() == [True] * 3
+    expected = [one.solve(b) for one, b in zip(tangents(body, alone, given, pulls), impulses, strict=True)]
+    made, turning = inverse_of(beside, torch.from_numpy(impulses))
+    same(made, expected, rel=1e-9)
+    again, kept = inverse_of(beside, torch.from_numpy(impulses[:, :, :1]), turning)
+    assert kept is turning
+    same(again, [one[:, :1] for one in expected], rel=1e-9)
+
+
+def given_size(body: SoftBody) -> int:
+    return 3 * len(body.mesh.nodes)
+
+
+def test_an_indefinite_world_is_projected_and_one_without_numbers_has_no_factors(
+    body: SoftBody, muscles: MuscleSet
+) -> None:
+    """Squashed to 40 % in a long step; the third is as at rest."""
+    rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
+    squashed = BodyState(body.mesh.nodes * [1.1, 1.1, 0.4], rest.velocities)
+    states = [squashed, rest, rest]
+    beside = problem_of(BatchBody(body, muscles, 4), states, dt=1.0, drag=0.0)
+    velocities = np.zeros((3, *rest.velocities.shape))
+    velocities[1, 0, 0] = np.nan
+    fine = beside.factor(torch.from_numpy(velocities), torch.zeros((3, muscles.segment_count), dtype=torch.float64))
+    assert fine.tolist() == [True, False, True]
+    alone = [StepProblem(body, state, 1.0) for state in (squashed, rest)]
+    impulses = np.random.default_rng(7).standard_normal((given_size(body), 3))
+    whole = tangents(body, alone, velocities[[0, 2]], [None, None])
+    made, _ = inverse_of(beside, torch.from_numpy(np.stack([impulses] * 3)))
+    same(made[[0, 2]], [one.solve(impulses) for one in whole], rel=1e-9)
+
+
+def test_muscles_that_would_make_a_world_indefinite_are_left_out(body: SoftBody, muscles: MuscleSet) -> None:
+    """Pushes a thousand times what muscles have: its tangent is that of the elements alone."""
+    rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
+    beside = problem_of(BatchBody(body, muscles, 4), [rest, rest], drag=0.0)
+    pushes = torch.from_numpy(np.stack([-1e3 * muscles.stiffness * muscles.bounds, 0.0 * muscles.bounds]))
+    assert beside.factor(torch.zeros((2, *rest.velocities.shape), dtype=torch.float64), pushes).tolist() == [True, True]
+    impulses = torch.from_numpy(np.random.default_rng(8).standard_normal((given_size(body), 2))).expand(2, -1, -1)
+    made, _ = inverse_of(beside, impulses)
+    np.testing.assert_allclose(made[0], made[1], rtol=0, atol=1e-12 * float(made.abs().max()))
