@@ -138,7 +138,7 @@ class BatchSolver:
             torch.zeros(count, dtype=torch.int64, device=velocities.device),
             torch.zeros(count, dtype=torch.bool, device=velocities.device),
         )
-        todo = torch.arange(count, device=velocities.device)
+        todo = every = torch.arange(count, device=velocities.device)
         for number in range(ROUNDS):
             part, touched = problem.kept(todo), contacts.kept(todo)
             task = _Task(part, touched, self.shift(touched, problem.dt), tensions[todo], frictions[todo])
@@ -155,7 +155,8 @@ class BatchSolver:
             new = self.detector.contacts(added[more], *(each[todo[more]] for each in start_gaps), order=ends[more])
             grown, forces = self.detector.joined(touched.of(more), done.forces[more], new)
             wider = grown.most - contacts.most
-            contacts = contacts.widened(grown.most)
+            # A copy: those that were given stay as they are.
+            contacts = contacts.widened(grown.most).of(every)
             whole = replace(whole, forces=padded(whole.forces, wider))
             todo = todo[more]
             contacts.put(todo, grown)

@@ -1,0 +1,137 @@
+"""Steps with contact of many worlds side by side are those of each alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from egs_warp.assets import pawn
+from egs_warp.contact.batch_contacts import BatchDetector
+from egs_warp.contact.batch_step import BatchSolver
+from egs_warp.contact.coupled_step import ContactResponse, CoupledResult, CoupledSolver
+from egs_warp.contact.detection import push_out_speeds
+from egs_warp.contact.points import ContactPoints
+from egs_warp.fem.batch_problem import BatchBody, BatchProblem
+from egs_warp.fem.body import BodyState
+from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.step_problem import StepProblem
+from egs_warp.muscles.tension import MuscleTension
+from egs_warp.pipelines.creature import Creature, make_creature
+
+FRICTIONS = (0.8, 0.2, 0.6, 1.0, 0.5)
+DRAG = 0.3
+
+
+@pytest.fixture(scope="module")
+def creature() -> Creature:
+    made = pawn(gaussian_count=3000)
+    return make_creature(made.cloud, plane=made.plane, nodes=50)
+
+
+@pytest.fixture(scope="module")
+def states(creature: Creature) -> list[BodyState]:
+    """It stands, slides, falls on its base and on an edge of it, and flies."""
+    nodes, unit = creature.start.positions, creature.body.speed_unit
+    still = np.zeros_like(nodes)
+    leaning = nodes + 0.25 * nodes[:, 2:] * np.array([1.0, 0.3, 0.0])
+    leaning = leaning + np.array([0.0, 0.0, 0.01])
+    return [
+        BodyState(nodes, still),
+        BodyState(nodes, still + unit * np.array([0.5, -0.3, 0.0])),
+        BodyState(nodes + np.array([0.0, 0.0, 0.01]), still - unit * np.array([0.0, 0.1, 0.8])),
+        BodyState(leaning, still - unit * np.array([0.3, 0.0, 0.6])),
+        BodyState(nodes + np.array([0.0, 0.0, 1.0]), still + unit * np.array([0.0, 0.2, 0.1])),
+    ]
+
+
+@pytest.fixture(scope="module")
+def activations(creature: Creature) -> np.ndarray:
+    """(5, M) metres."""
+    shares = np.random.default_rng(1).uniform(-0.2, 0.6, (len(FRICTIONS), creature.muscles.segment_count))
+    return shares * creature.muscles.bounds
+
+
+def solved_alone(
+    creature: Creature, friction: float, problem: StepProblem, chosen: np.ndarray, activations: np.ndarray
+) -> CoupledResult:
+    solver = creature.stepper.with_friction(friction).solver
+    contacts = solver.detector.contact_set(chosen, problem.state.positions)
+    tangent = problem.tangent(SparseFactors(creature.body.assembly.upper_pattern), problem.start, None)
+    tension = MuscleTension.of(creature.muscles, activations)
+    forces = np.zeros((len(chosen), 3))
+    return solver.solve(ContactResponse.of(tangent, contacts), tension, velocities=problem.start, forces=forces)
+
+
+@pytest.mark.parametrize("few", [False, True])
+def test_ends_are_those_of_each_alone(
+    creature: Creature, states: list[BodyState], activations: np.ndarray, few: bool
+) -> None:
+    """From the points that touch as the bodies fly on, or from a third of them, so that many join on the way:
+    velocities, points in their order, forces, and iterations."""
+    body, one = creature.body, creature.stepper.solver
+    dt, device, count = body.time_unit / 20.0, torch.device("cpu"), len(states)
+    points = ContactPoints(creature.geometry, near=one.points.near, lower=one.points.lower)
+    detector = BatchDetector(creature.geometry, points, count, device=device)
+    beside = BatchSolver(
+        detector,
+        push_out_cap=one.push_out_cap,
+        penetration_tolerance=one.penetration_tolerance,
+        tolerance=CoupledSolver.tolerance,
+    )
+    positions, velocities = (
+        torch.from_numpy(np.stack([getattr(state, name) for state in states])) for name in ("positions", "velocities")
+    )
+    common = BatchBody(body, creature.muscles, count)
+    problem = BatchProblem.at(common, torch.arange(count), positions, velocities, dt=dt, drag=DRAG)
+    begun = detector.gaps(positions)
+    ends, _ = detector.gaps(problem.end_positions(velocities + dt * common.gravity))
+    near = detector.deeper(detector.contacts(ends < -1e9, *begun), ends, 0.0)
+    if few:
+        near &= torch.arange(near.shape[1]) % 3 == 0
+    contacts = detector.contacts(near, *begun)
+    assert problem.factor(problem.start(), None).all()
+    touched, made = beside.solve(
+        *(problem, contacts, beside.respond(problem, contacts)),
+        *(torch.from_numpy(creature.muscles.stiffness * activations), torch.tensor(FRICTIONS, dtype=torch.float64)),
+        velocities=problem.start(),
+        forces=torch.zeros((count, contacts.most, 3), dtype=torch.float64),
+        start_gaps=begun,
+    )
+    assert torch.equal(contacts.counts, near.sum(dim=1).int())
+    joined = 0
+    for world, (state, friction) in enumerate(zip(states, FRICTIONS, strict=True)):
+        chosen = contacts.points[world, : int(contacts.counts[world])].numpy()
+        alone = solved_alone(creature, friction, StepProblem(body, state, dt, DRAG), chosen, activations[world])
+        n = int(touched.counts[world])
+        assert np.array_equal(touched.points[world, :n].numpy(), alone.contacts.points)
+        assert (bool(made.converged[world]), int(made.iterations[world])) == (alone.converged, alone.iterations)
+        assert alone.converged and not made.lost[world]
+        np.testing.assert_allclose(made.velocities[world].numpy(), alone.velocities, atol=1e-9 * body.speed_unit)
+        forces = made.forces[world, :n].numpy()
+        # Redundant points share a load in more than one way.
+        nodal = [alone.contacts.pushes(each) for each in (forces, alone.forces)]
+        np.testing.assert_allclose(*nodal, rtol=0, atol=1e-6 * body.weight)
+        joined += n - len(chosen)
+        if world < 4:
+            assert forces[:, 0].sum() > 0.1 * body.weight
+    assert joined > (20 if few else 3)
+
+
+def test_shifts_let_nothing_deeper_and_bring_out_what_is_too_deep(creature: Creature, states: list[BodyState]) -> None:
+    """As for one, down to where the speed is capped; no shift where there is no contact."""
+    one, dt = creature.stepper.solver, 0.01
+    points = ContactPoints(creature.geometry, near=one.points.near, lower=one.points.lower)
+    detector = BatchDetector(creature.geometry, points, 2, device=torch.device("cpu"))
+    beside = BatchSolver(detector, push_out_cap=0.05, penetration_tolerance=0.01, tolerance=1e-8)
+    nodes = torch.from_numpy(np.stack([states[0].positions, states[0].positions - np.array([0.0, 0.0, 0.03])]))
+    gaps, faces = detector.gaps(nodes)
+    contacts = detector.contacts(gaps < 0.003, gaps, faces)
+    made = beside.shift(contacts, dt).numpy()
+    counts = contacts.counts.tolist()
+    assert counts[0] < counts[1]
+    for world, count in enumerate(counts):
+        expected = push_out_speeds(contacts.gaps[world, :count].numpy(), dt, 0.05, 0.2, 0.01)
+        np.testing.assert_allclose(made[world, :count], expected, rtol=0, atol=1e-15)
+        assert not made[world, count:].any()
+    assert made[1].min() == -0.05 and made[0].max() > 0.0
