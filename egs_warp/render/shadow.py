@@ -52,6 +52,7 @@ class ContactShadow:
         """
         self.camera, self.device = camera, device
         self._texel, self._grain = 2.0 * reach / _MAP, grain
+        self._taps: dict[tuple[float, ...], list[wp.array]] = {}
         count = camera.width * camera.height
         self.depth = empty(count, wp.float32, device)
         """(H W,) z-depth of the plane, 0 where a pixel's ray does not meet it from above."""
@@ -101,27 +102,35 @@ class ContactShadow:
         there, back = empty(shape, wp.float32, self.device), empty(shape, wp.float32, self.device)
         count = int(np.prod(shape))
         self._rows(kernels.hidden_shares_kernel, count, [hidden], [there])
-        self._blurred(there, back, [self._grain] * len(_LAYERS))
+        self._blurred(there, back, (self._grain,) * len(_LAYERS))
         self._rows(kernels.covered_kernel, count, [], [there])
-        self._blurred(there, back, [blur * height for _, _, blur in _LAYERS])
+        self._blurred(there, back, tuple(blur * height for _, _, blur in _LAYERS))
         shade = empty(shape[1:], wp.float32, self.device)
         # Far layers see more of the sky past the object, so they darken less.
         paleness = wp.vec3(*(0.5 - 1.4 * blur for _, _, blur in _LAYERS))
         self._rows(kernels.darkest_kernel, _MAP * _MAP, [there, paleness], [shade])
         return shade
 
-    def _blurred(self, layers: wp.array, scratch: wp.array, widths: list[float]) -> None:
+    def _blurred(self, layers: wp.array, scratch: wp.array, widths: tuple[float, ...]) -> None:
         """Blur ``layers`` in place, each by its width in world units."""
-        sigmas = np.maximum(np.array(widths) / self._texel, _LEAST_BLUR)
-        reach = np.minimum(np.ceil(_TAPS * sigmas), _MAP - 1).astype(np.int32)
-        taps = np.exp(-0.5 * (np.arange(reach.max() + 1) / sigmas[:, None]) ** 2)
-        taps *= np.arange(taps.shape[1]) <= reach[:, None]
-        taps /= 2.0 * taps.sum(axis=1, keepdims=True) - taps[:, :1]
-        inputs = [wp.array(taps, wp.float32, device=self.device), wp.array(reach, wp.int32, device=self.device)]
         occupied = empty(len(_LAYERS) * _MAP, wp.bool, self.device)
         for source, target in ((layers, scratch), (scratch, layers)):
             self._rows(kernels.occupied_rows_kernel, len(occupied), [source], [occupied])
-            self._rows(kernels.blur_kernel, source.size, [source, occupied, *inputs], [target])
+            self._rows(kernels.blur_kernel, source.size, [source, occupied, *self._taps_of(widths)], [target])
+
+    def _taps_of(self, widths: tuple[float, ...]) -> list[wp.array]:
+        """(layers, taps) weights from the middle on and (layers,) how many count; those of the last picture, if it had
+        the same."""
+        if widths not in self._taps:
+            sigmas = np.maximum(np.array(widths) / self._texel, _LEAST_BLUR)
+            reach = np.minimum(np.ceil(_TAPS * sigmas), _MAP - 1).astype(np.int32)
+            taps = np.exp(-0.5 * (np.arange(reach.max() + 1) / sigmas[:, None]) ** 2)
+            taps *= np.arange(taps.shape[1]) <= reach[:, None]
+            taps /= 2.0 * taps.sum(axis=1, keepdims=True) - taps[:, :1]
+            made = [wp.array(taps, wp.float32, device=self.device), wp.array(reach, wp.int32, device=self.device)]
+            # A picture has two blurs: the grain's and the layers'.
+            self._taps = {**dict(list(self._taps.items())[-1:]), widths: made}
+        return self._taps[widths]
 
     def _rows(self, kernel: Any, count: int, inputs: list[Any], outputs: list[wp.array]) -> None:
         launch_rows(kernel, count, inputs=inputs, outputs=outputs, device=self.device)
