@@ -71,8 +71,8 @@ def test_an_edited_file_has_no_mutants_of_its_old_text(room: Path) -> None:
 
 
 def test_the_nearest_test_comes_first() -> None:
-    """By the imports that lead from a test to the module, over host code to its kernels."""
-    nearest = ["tests/contact/test_batch_contacts.py", "tests/contact/test_points.py"]
+    """By the imports that lead from a test to the module, over host code to its kernels; its own before others."""
+    nearest = ["tests/contact/test_points.py", "tests/contact/test_batch_contacts.py"]
     assert mutants.tests_of("contact", "egs_warp/contact/points.py")[:2] == nearest
     assert mutants.tests_of("fem", "egs_warp/kernels/fem/elasticity.py")[0] == "tests/fem/test_elasticity.py"
     for chosen in mutants.ROOMS:

@@ -13,8 +13,8 @@ from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.geometry.plane import Plane
 from egs_warp.muscles.muscle_set import MuscleSet, automatic_muscles
 from egs_warp.muscles.tension import MuscleTension
-from tests.fem.test_step_problem import bent_state, spinning_state
 from tests.support.meshes import block_mesh
+from tests.support.states import bent_state, spinning_state
 
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 DT, DRAG = 1 / 60, 0.7

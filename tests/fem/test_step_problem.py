@@ -16,6 +16,7 @@ from egs_warp.muscles.muscle_set import automatic_muscles
 from egs_warp.muscles.tension import MuscleTension
 from tests.support.meshes import block_mesh
 from tests.support.passive import passive_body
+from tests.support.states import bent_state, spinning_state
 
 FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
 DT = 1 / 60
@@ -35,21 +36,6 @@ def some_tension(body: SoftBody) -> MuscleTension:
 @pytest.fixture(scope="module")
 def tension(body: SoftBody) -> MuscleTension:
     return some_tension(body)
-
-
-def spinning_state(body: SoftBody) -> BodyState:
-    random = np.random.default_rng(0)
-    x = body.mesh.nodes * [1.03, 0.97, 0.95]
-    x = x @ Rotation.from_rotvec([0.2, -0.4, 0.9]).as_matrix().T + 0.002 * random.standard_normal(x.shape)
-    arms = x - body.centre_of_mass(x)
-    return BodyState(x, np.cross([0.5, -1.0, 4.0], arms) + 0.05 * random.standard_normal(x.shape) + [1.0, 0.0, 2.0])
-
-
-def bent_state(body: SoftBody, *, seed: int = 0) -> BodyState:
-    rng = np.random.default_rng(seed)
-    x = body.mesh.nodes * [1.05, 0.95, 0.9]
-    x = x @ Rotation.from_rotvec([0.2, -0.4, 0.9]).as_matrix().T + 0.005 * rng.standard_normal(x.shape)
-    return BodyState(x, rng.standard_normal(x.shape) * 0.3 + [1.0, 0.0, 2.0])
 
 
 @pytest.mark.parametrize("muscles", [False, True])

@@ -114,10 +114,14 @@ def sample(room: str, count: int, seed: int) -> list[Mutant]:
 
 
 def tests_of(room: str, file: str) -> list[str]:
-    """The room's test files: those whose imports reach the changed module by the shortest way first."""
+    """The room's test files: those whose imports reach the changed module by the shortest way first, of these the one
+    that bears its name.
+    """
     module = file.removesuffix(".py").replace("/", ".")
-    tests = sorted((ROOT / "tests" / room).glob("test_*.py"))
-    return [path.relative_to(ROOT).as_posix() for path in sorted(tests, key=lambda path: _distance(path, module))]
+    own = f"test_{Path(file).stem}"
+    tests = (ROOT / "tests" / room).glob("test_*.py")
+    nearest = sorted(tests, key=lambda path: (_distance(path, module), path.stem != own, path))
+    return [path.relative_to(ROOT).as_posix() for path in nearest]
 
 
 def _first_that_compiles(room: str, path: Path, source: str, changes: list[Change], rank: str) -> Mutant | None:
