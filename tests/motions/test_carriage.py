@@ -82,7 +82,7 @@ def test_a_base_turns_and_tips_with_its_sides() -> None:
 def test_what_lies_or_rolls_has_no_feet_to_walk_on() -> None:
     """A long bar on the ground; a body of short joined feet takes these for the sides of a base."""
     place = block_place()
-    lying = replace(place, standing=place.standing[:, [2, 1, 0]] * [4.0, 0.3, 0.3])
+    lying = replace(place, standing=place.standing[:, [2, 0, 1]] * [4.0, 0.3, 0.3])
     feet, _ = carried_on(replace(place, standing=place.standing))
     assert len(feet) == 2
     mesh = replace(place.body.mesh, nodes=lying.standing)
