@@ -45,21 +45,22 @@ def measure(creature: Creature, size: tuple[int, int], *, repeats: int) -> Row:
     device, turn = creature.cloud.device, iter(range(1_000_000))
     eye, middle = height * np.array([1.6, -2.4, 1.1]), height * np.array([0.0, 0.0, 0.45])
     camera = Camera.look_at(eye, middle, np.eye(3)[2], width=size[0], height=size[1])
-    where = {"centre": np.zeros(3), "reach": 3.5 * height, "grain": grain_of(creature.cloud)}
-    behind = grid_floor(ContactShadow(camera, GROUND, device=device, **where), cell=0.25 * height)
+    where = {"centre": np.zeros(3), "reach": 3.5 * height}
+    ground = ContactShadow(camera, GROUND, device=device, grain=grain_of(creature.cloud), height=height, **where)
+    behind = grid_floor(ground, cell=0.25 * height)
 
     def bent() -> np.ndarray:
         lean = 0.2 * np.sin(0.3 * next(turn)) * (nodes[:, 2] / height) ** 2
         return nodes + np.outer(height * lean, [1.0, 0.0, 0.0])
 
     def drawn(cloud: GaussianCloud) -> RenderedImage:
-        return render_gaussians(cloud, camera, background=behind.background(cloud, height=height))
+        return render_gaussians(cloud, camera, background=behind.background(cloud))
 
     cloud = deformer.deform(bent()).cloud
-    floor, image = behind.background(cloud, height=height), drawn(cloud)
+    floor, image = behind.background(cloud), drawn(cloud)
     stages = {
         "carry": lambda: deformer.deform(bent()),
-        "shadow": lambda: behind.background(cloud, height=height),
+        "shadow": lambda: behind.background(cloud),
         "draw": lambda: render_gaussians(cloud, camera, background=floor),
         "bytes": image.colour_srgb8,
         "whole": lambda: drawn(deformer.deform(bent()).cloud).colour_srgb8(),

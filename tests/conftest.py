@@ -8,8 +8,12 @@ from pathlib import Path
 
 import pytest
 import warp as wp
+from hypothesis import settings
 
 wp.config.log_level = wp.LOG_WARNING
+# No test is timed; what else there is is Hypothesis's own, which differs in CI.
+settings.register_profile("untimed", settings(), deadline=None)
+settings.load_profile("untimed")
 
 _DATA = Path(os.environ.get("EGS_WARP_DATA", Path(__file__).parents[2] / "shared" / "data"))
 

@@ -26,7 +26,6 @@ def test_the_good_file_is_valid(reader: Reader, tmp_path: Path) -> None:
 
 @settings(
     max_examples=60,
-    deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much],
 )

@@ -33,7 +33,6 @@ def drawn(count: int, **given_: st.SearchStrategy[Any]) -> Callable[[Callable[..
     """A law that is tried on ``count`` cases; the quick ones are the same each time."""
     profile = settings(
         max_examples=count,
-        deadline=None,
         derandomize=count <= QUICK,
         database=None,
         # Making a case smaller takes minutes; it is printed as it was drawn.

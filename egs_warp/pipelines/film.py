@@ -148,11 +148,11 @@ def drawn_frames(
         marks = [time.perf_counter()]
         deformed = deformer.deform(trajectory.positions[step])
         marks.append(time.perf_counter())
-        cloud, height = deformed.cloud, trajectory.height
+        cloud = deformed.cloud
         if behind is None or camera is not cameras[index - 1]:
-            behind = _behind(path, height, camera, scene, shot, grain=grain, shadow=shadow, device=device)
-        shade = behind.cover(cloud, height=height) if shot.transparent else None
-        backdrop = behind.background(cloud, height=height) if shade is None else (0.0, 0.0, 0.0)
+            behind = _behind(path, trajectory.height, camera, scene, shot, grain=grain, shadow=shadow, device=device)
+        shade = behind.cover(cloud) if shot.transparent else None
+        backdrop = behind.background(cloud) if shade is None else (0.0, 0.0, 0.0)
         image = render_gaussians(cloud, camera, background=backdrop)
         wp.synchronize_device(cloud.device)
         marks.append(time.perf_counter())
@@ -188,8 +188,10 @@ def _behind(
     reach = 2.2 * (height + float(np.linalg.norm(np.ptp(path, axis=0))))
     plain = shot.transparent or shot.colour is not None
     if scene is not None and not plain:
-        return captured_scene(scene, camera, GROUND, centre=centre, reach=reach, grain=grain, shadow=shadow)
-    ground = ContactShadow(camera, GROUND, centre=centre, reach=reach, device=device, grain=grain)
+        return captured_scene(
+            scene, camera, GROUND, centre=centre, reach=reach, grain=grain, height=height, shadow=shadow
+        )
+    ground = ContactShadow(camera, GROUND, centre=centre, reach=reach, device=device, grain=grain, height=height)
     if plain:
         return plain_colour(ground, shot.colour or (0.0, 0.0, 0.0), shadow=shadow)
     return grid_floor(ground, cell=0.25 * height, shadow=shadow)

@@ -35,22 +35,21 @@ class Behind:
     strength: wp.array | None
     """(H W,) float32: how much of the shadow each pixel takes; None without one."""
 
-    def cover(self, body: GaussianCloud, *, height: float) -> wp.array:
-        """(H, W) float32, 0 to about 0.5: how much of what is behind the shadow hides; ``height`` is the body's, world
-        units."""
+    def cover(self, body: GaussianCloud) -> wp.array:
+        """(H, W) float32, 0 to about 0.5: how much of what is behind the shadow hides."""
         camera = self.shadow.camera
         if self.strength is None:
             return wp.zeros((camera.height, camera.width), dtype=wp.float32, device=self.shadow.device)
-        return self.shadow.cover(body, self.strength, height=height).reshape((camera.height, camera.width))
+        return self.shadow.cover(body, self.strength).reshape((camera.height, camera.width))
 
-    def background(self, body: GaussianCloud, *, height: float) -> wp.array:
-        """(H, W) vec3: what is seen behind ``body``, with its shadow; ``height`` is the body's, world units."""
+    def background(self, body: GaussianCloud) -> wp.array:
+        """(H, W) vec3: what is seen behind ``body``, with its shadow."""
         camera, device = self.shadow.camera, self.shadow.device
         shape = (camera.height, camera.width)
         if self.strength is None:
             return self.bare.reshape(shape)
         colour = empty(len(self.bare), wp.vec3, device)
-        cover = self.shadow.cover(body, self.strength, height=height)
+        cover = self.shadow.cover(body, self.strength)
         launch_rows(kernels.dim_kernel, len(colour), inputs=[self.bare, cover], outputs=[colour], device=device)
         return colour.reshape(shape)
 
@@ -82,12 +81,13 @@ def captured_scene(
     centre: np.ndarray,
     reach: float,
     grain: float,
+    height: float,
     shadow: bool = True,
 ) -> Behind:
     """The rest of a capture, rendered once; the shadow falls where the plane is what one sees.
 
-    ``scene`` in the world's units; ``centre`` (3,) and ``reach`` bound the shadow, ``grain`` is as ``ContactShadow``
-    wants it.
+    ``scene`` in the world's units; ``centre`` (3,) and ``reach`` bound the shadow, ``grain`` and ``height`` are as
+    ``ContactShadow`` wants them.
     """
     import cv2
 
@@ -100,6 +100,7 @@ def captured_scene(
         reach=reach,
         device=scene.device,
         grain=grain,
+        height=height,
         depth=np.asarray(cv2.medianBlur(depth, 5)),
     )
     bare = wp.array(np.clip(image.colour.numpy(), 0.0, 1.0).reshape(-1, 3), dtype=wp.vec3, device=scene.device)

@@ -45,14 +45,20 @@ class ContactShadow:
         reach: float,
         device: wp.Device,
         grain: float = 0.0,
+        height: float = 0.0,
         depth: np.ndarray | None = None,
     ) -> None:
-        """``centre`` (3,) and ``reach`` (world units) bound the part of the plane that can be in shadow; ``grain``: see
-        ``grain_of``; ``depth`` (H, W) is the z-depth of the uneven ground that it falls on, 0 where that is the plane.
+        """``centre`` (3,) and ``reach`` (world units) bound the part of the plane that can be in shadow; ``grain`` (see
+        ``grain_of``) and ``height`` (world units) are the body's, 0 where only the ground is looked at; ``depth``
+        (H, W) is the z-depth of the uneven ground that it falls on, 0 where that is the plane.
         """
         self.camera, self.device = camera, device
-        self._texel, self._grain = 2.0 * reach / _MAP, grain
-        self._taps: dict[tuple[float, ...], list[wp.array]] = {}
+        edges = height * np.array([layer[:2] for layer in _LAYERS])
+        self._layers = kernels.Layers()
+        self._layers.low, self._layers.high = wp.vec3(*edges[:, 0].tolist()), wp.vec3(*edges[:, 1].tolist())
+        texel, blurs = 2.0 * reach / _MAP, np.array([layer[2] for layer in _LAYERS])
+        self._grain = _taps(np.full(len(_LAYERS), grain) / texel, device)
+        self._blur = _taps(height * blurs / texel, device)
         count = camera.width * camera.height
         self.depth = empty(count, wp.float32, device)
         """(H W,) z-depth of the plane, 0 where a pixel's ray does not meet it from above."""
@@ -75,65 +81,55 @@ class ContactShadow:
             [self.depth, self.flat, self.fade, self.pixel, self.lift, self._texels],
         )
 
-    def cover(self, body: GaussianCloud, strength: wp.array, *, height: float) -> wp.array:
-        """(H W,) float32, 0 to about 0.5 times ``strength`` (H W,): how much light the Gaussians of ``body`` take.
-
-        ``height`` is the body's, world units.
-        """
+    def cover(self, body: GaussianCloud, strength: wp.array) -> wp.array:
+        """(H W,) float32, 0 to about 0.5 times ``strength`` (H W,): how much light the Gaussians of ``body`` take."""
         cover = empty(len(strength), wp.float32, self.device)
-        self._rows(kernels.cover_kernel, len(strength), [self._shade(body, height), self._texels, strength], [cover])
+        self._rows(kernels.cover_kernel, len(strength), [self._shade(body), self._texels, strength], [cover])
         return cover
 
-    def _shade(self, body: GaussianCloud, height: float) -> wp.array:
+    def _shade(self, body: GaussianCloud) -> wp.array:
         """(texels, texels) float32 seen from above."""
         shape = (len(_LAYERS), _MAP, _MAP)
-        edges = height * np.array([layer[:2] for layer in _LAYERS])
-        layers = kernels.Layers()
-        layers.low, layers.high = wp.vec3(*edges[:, 0].tolist()), wp.vec3(*edges[:, 1].tolist())
         hidden = zeros(shape, wp.int64, self.device)
         # One after the other on a CPU, whose threads may not add to one texel at once.
         launch_again(
             kernels.hide_ground_kernel,
             body.count,
-            inputs=[self._ground, layers, body.means, body.log_scales, body.opacity_logits],
+            inputs=[self._ground, self._layers, body.means, body.log_scales, body.opacity_logits],
             outputs=[hidden],
             device=self.device,
         )
         there, back = empty(shape, wp.float32, self.device), empty(shape, wp.float32, self.device)
         count = int(np.prod(shape))
         self._rows(kernels.hidden_shares_kernel, count, [hidden], [there])
-        self._blurred(there, back, (self._grain,) * len(_LAYERS))
+        self._blurred(there, back, self._grain)
         self._rows(kernels.covered_kernel, count, [], [there])
-        self._blurred(there, back, tuple(blur * height for _, _, blur in _LAYERS))
+        self._blurred(there, back, self._blur)
         shade = empty(shape[1:], wp.float32, self.device)
         # Far layers see more of the sky past the object, so they darken less.
         paleness = wp.vec3(*(0.5 - 1.4 * blur for _, _, blur in _LAYERS))
         self._rows(kernels.darkest_kernel, _MAP * _MAP, [there, paleness], [shade])
         return shade
 
-    def _blurred(self, layers: wp.array, scratch: wp.array, widths: tuple[float, ...]) -> None:
-        """Blur ``layers`` in place, each by its width in world units."""
+    def _blurred(self, layers: wp.array, scratch: wp.array, taps: list[wp.array]) -> None:
+        """Blur ``layers`` in place by the ``taps`` of each."""
         occupied = empty(len(_LAYERS) * _MAP, wp.bool, self.device)
         for source, target in ((layers, scratch), (scratch, layers)):
             self._rows(kernels.occupied_rows_kernel, len(occupied), [source], [occupied])
-            self._rows(kernels.blur_kernel, source.size, [source, occupied, *self._taps_of(widths)], [target])
-
-    def _taps_of(self, widths: tuple[float, ...]) -> list[wp.array]:
-        """(layers, taps) weights from the middle on and (layers,) how many count; those of the last picture, if it had
-        the same."""
-        if widths not in self._taps:
-            sigmas = np.maximum(np.array(widths) / self._texel, _LEAST_BLUR)
-            reach = np.minimum(np.ceil(_TAPS * sigmas), _MAP - 1).astype(np.int32)
-            taps = np.exp(-0.5 * (np.arange(reach.max() + 1) / sigmas[:, None]) ** 2)
-            taps *= np.arange(taps.shape[1]) <= reach[:, None]
-            taps /= 2.0 * taps.sum(axis=1, keepdims=True) - taps[:, :1]
-            made = [wp.array(taps, wp.float32, device=self.device), wp.array(reach, wp.int32, device=self.device)]
-            # A picture has two blurs: the grain's and the layers'.
-            self._taps = {**dict(list(self._taps.items())[-1:]), widths: made}
-        return self._taps[widths]
+            self._rows(kernels.blur_kernel, source.size, [source, occupied, *taps], [target])
 
     def _rows(self, kernel: Any, count: int, inputs: list[Any], outputs: list[wp.array]) -> None:
         launch_rows(kernel, count, inputs=inputs, outputs=outputs, device=self.device)
+
+
+def _taps(widths: np.ndarray, device: wp.Device) -> list[wp.array]:
+    """Of blurs ``widths`` (layers,) texels wide the weights (layers, taps) from the middle on, and how many count."""
+    sigmas = np.maximum(widths, _LEAST_BLUR)
+    reach = np.minimum(np.ceil(_TAPS * sigmas), _MAP - 1).astype(np.int32)
+    taps = np.exp(-0.5 * (np.arange(reach.max() + 1) / sigmas[:, None]) ** 2)
+    taps *= np.arange(taps.shape[1]) <= reach[:, None]
+    taps /= 2.0 * taps.sum(axis=1, keepdims=True) - taps[:, :1]
+    return [wp.array(taps, wp.float32, device=device), wp.array(reach, wp.int32, device=device)]
 
 
 def _ground(plane: Plane, centre: np.ndarray, reach: float) -> Any:

@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from egs_warp.assets import pawn
-from egs_warp.pipelines.creature import make_creature
+from tests.support.creatures import coarse_pawn
 from tests.support.scripts import BENCHMARKS, module_of
 
 
@@ -42,8 +41,7 @@ def test_all_that_were_run_alone_for_long_enough_must_be_alike(many_worlds: Modu
 
 
 def test_a_row_tells_the_rate_where_the_time_goes_and_how_far_apart(many_worlds: ModuleType) -> None:
-    made = pawn(gaussian_count=3000)
-    creature = make_creature(made.cloud, plane=made.plane, nodes=50)
+    creature = coarse_pawn()
     jump = many_worlds.recorded(creature, 2)
     assert jump.shape == (2, creature.muscles.segment_count)
     found = many_worlds.measure(creature, jump, 3, alone=2, panel=96, chunk_bytes=2**20)

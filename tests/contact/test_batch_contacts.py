@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from egs_warp.assets import pawn
 from egs_warp.contact.batch_contacts import BatchContacts, BatchDetector
 from egs_warp.contact.detection import ContactDetector, ContactSet
 from egs_warp.contact.points import ContactPoints
-from egs_warp.pipelines.creature import Creature, make_creature
+from egs_warp.pipelines.creature import Creature
+from tests.support.creatures import coarse_pawn
 
 NEAR, LOWER = 0.02, 0.002
 WORLDS = 4
@@ -18,8 +18,7 @@ WORLDS = 4
 
 @pytest.fixture(scope="module")
 def creature() -> Creature:
-    made = pawn(gaussian_count=3000)
-    return make_creature(made.cloud, plane=made.plane, nodes=50)
+    return coarse_pawn()
 
 
 @pytest.fixture(scope="module")

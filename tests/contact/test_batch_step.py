@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from egs_warp.assets import pawn
 from egs_warp.contact.batch_contacts import BatchDetector
 from egs_warp.contact.batch_step import BatchSolver
 from egs_warp.contact.coupled_step import ContactResponse, CoupledResult, CoupledSolver
@@ -17,7 +16,8 @@ from egs_warp.fem.body import BodyState
 from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.muscles.tension import MuscleTension
-from egs_warp.pipelines.creature import Creature, make_creature
+from egs_warp.pipelines.creature import Creature
+from tests.support.creatures import coarse_pawn
 
 FRICTIONS = (0.8, 0.2, 0.6, 1.0, 0.5)
 DRAG = 0.3
@@ -25,8 +25,7 @@ DRAG = 0.3
 
 @pytest.fixture(scope="module")
 def creature() -> Creature:
-    made = pawn(gaussian_count=3000)
-    return make_creature(made.cloud, plane=made.plane, nodes=50)
+    return coarse_pawn()
 
 
 @pytest.fixture(scope="module")

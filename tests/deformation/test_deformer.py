@@ -192,7 +192,7 @@ def test_bend_angle_is_the_angle_between_the_arms(device: str) -> None:
     assert deformer.measure_bend([mesh.nodes]).bend_degrees.max() < 0.05
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**31),
     noise=st.sampled_from([0.0, 0.05, 0.3, 2.0]),

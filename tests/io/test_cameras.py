@@ -332,7 +332,7 @@ def test_bad_colmap(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=200, derandomize=True)
 @given(st.data())
 @pytest.mark.parametrize("name", ["cameras.txt", "images.txt", "cameras.bin", "images.bin", "transforms.json"])
 def test_any_bytes(name: str, data: st.DataObject) -> None:

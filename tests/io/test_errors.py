@@ -219,7 +219,7 @@ def assert_capture_or_one_line(name: str, data: bytes) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=150, derandomize=True)
 @given(st.data())
 @pytest.mark.parametrize("name", WRITERS)
 def test_any_truncation_and_any_flipped_bytes(name: str, data: st.DataObject) -> None:
@@ -234,7 +234,7 @@ def test_any_truncation_and_any_flipped_bytes(name: str, data: st.DataObject) ->
 
 
 @pytest.mark.filterwarnings("error")
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=200, derandomize=True)
 @given(st.data())
 def test_any_flipped_bytes_inside_gzip(data: st.DataObject) -> None:
     """Behind the checksum, where flips of the compressed file do not reach."""
@@ -252,7 +252,7 @@ JSON = st.recursive(
 
 
 @pytest.mark.filterwarnings("error")
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=200, derandomize=True)
 @given(st.data())
 def test_any_entry_of_meta_json_replaced(data: st.DataObject) -> None:
     with tempfile.TemporaryDirectory() as folder:

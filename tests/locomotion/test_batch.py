@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 
-from egs_warp.assets import pawn
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.errors import ArgumentError
 from egs_warp.fem.body import BodyState, SoftBody
@@ -19,8 +18,9 @@ from egs_warp.locomotion.stepper import LocomotionStepper, StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.script import motion
 from egs_warp.muscles.muscle_set import MuscleSet
-from egs_warp.pipelines.creature import Creature, make_creature
+from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.performance import simulate
+from tests.support.creatures import coarse_pawn
 
 FRICTIONS = (0.8, 0.3, 1.2)
 STRENGTHS = (1.0, 0.9, 0.5)
@@ -31,8 +31,7 @@ FIRST, STEPS = 29, 30
 
 @pytest.fixture(scope="module")
 def creature() -> Creature:
-    made = pawn(gaussian_count=3000)
-    return make_creature(made.cloud, plane=made.plane, nodes=50)
+    return coarse_pawn()
 
 
 @pytest.fixture(scope="module")

@@ -96,7 +96,7 @@ def test_base_plane_goes_along(thing: Lying) -> None:
     assert find_base_plane(turned.cloud, turned.up).offset == pytest.approx(level, abs=1e-5)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     st.integers(0, 10**6),
     st.floats(1e-3, 1e3),

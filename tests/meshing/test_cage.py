@@ -223,7 +223,7 @@ def test_where_tetwild_fails_the_lattice_stands_in(monkeypatch: pytest.MonkeyPat
     assert np.array_equal(cage.mesh.tets, lattice.mesh.tets)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @example(325082, 0.098)
 @example(306295, 0.09375)
 @given(st.integers(0, 10**6), st.floats(0.08, 0.16))

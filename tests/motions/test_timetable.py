@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from egs_warp.motions.timetable import Timetable
@@ -15,7 +15,6 @@ CORNER = np.array([[0.0, 0.0], [0.8, 0.0], [0.8, 0.6]])
 _POINTS = st.lists(st.tuples(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0)), min_size=2, max_size=6)
 
 
-@settings(deadline=None)
 @given(_POINTS)
 def test_from_rest_to_rest_within_the_bounds(points: list[tuple[float, float]]) -> None:
     way = np.array(points)

@@ -30,7 +30,7 @@ def random_muscles(rng: np.random.Generator) -> MuscleSet:
     return attach_fibres(COLUMN, fibres)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_columns_make_no_net_force_or_torque(seed: int) -> None:
     """Eq. (7): whatever the pose, every column's nodal forces sum to nothing and turn nothing."""

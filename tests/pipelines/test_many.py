@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 import torch
 
-from egs_warp.assets import pawn
 from egs_warp.errors import ArgumentError, UserError
 from egs_warp.locomotion.batch import BatchState, BatchStepper
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.push import read_pushes
 from egs_warp.motions.script import motion
 from egs_warp.motions.style import read_style
-from egs_warp.pipelines.creature import Creature, make_creature
+from egs_warp.pipelines.creature import Creature
 from egs_warp.pipelines.ending import State
 from egs_warp.pipelines.job import Job
 from egs_warp.pipelines.many import Outcome, simulate_many
 from egs_warp.pipelines.performance import simulate
+from tests.support.creatures import coarse_pawn
 
 FRAMES, FEW = 31, 11
 """30 steps after the first picture, and 10 where nothing new comes later."""
@@ -31,8 +31,7 @@ FRAMES, FEW = 31, 11
 
 @pytest.fixture(scope="module")
 def creature() -> Creature:
-    made = pawn(gaussian_count=3000)
-    return make_creature(made.cloud, plane=made.plane, nodes=50)
+    return coarse_pawn()
 
 
 @pytest.fixture(scope="module")
@@ -220,8 +219,7 @@ def test_a_creature_can_be_sent(creature: Creature) -> None:
 
 
 def test_other_ground_is_that_of_a_creature_made_on_it(creature: Creature) -> None:
-    made = pawn(gaussian_count=3000)
-    again = make_creature(made.cloud, plane=made.plane, nodes=50, friction=0.4)
+    again = coarse_pawn(friction=0.4)
     other = creature.with_friction(0.4)
     assert other.geometry.friction == other.stepper.planner.friction == 0.4
     assert np.array_equal(other.start.positions, again.start.positions)

@@ -36,13 +36,17 @@ def parts() -> tuple[GaussianCloud, GaussianCloud]:
 
 
 def over_scene(scene: GaussianCloud, body: GaussianCloud, *, shadow: bool) -> np.ndarray:
-    behind = captured_scene(scene, camera(), FLOOR, centre=np.zeros(3), reach=2.0, grain=grain_of(body), shadow=shadow)
-    return behind.background(body, height=1.0).numpy()
+    behind = captured_scene(
+        scene, camera(), FLOOR, centre=np.zeros(3), reach=2.0, grain=grain_of(body), height=1.0, shadow=shadow
+    )
+    return behind.background(body).numpy()
 
 
-def on_ground(body: GaussianCloud, plane: Plane = FLOOR, centre: np.ndarray | None = None) -> ContactShadow:
-    middle = np.zeros(3) if centre is None else centre
-    return ContactShadow(camera(), plane, centre=middle, reach=2.0, device=body.device, grain=grain_of(body))
+def on_ground(
+    body: GaussianCloud, plane: Plane = FLOOR, centre: np.ndarray | None = None, *, height: float = 1.0
+) -> ContactShadow:
+    where = {"centre": np.zeros(3) if centre is None else centre, "reach": 2.0}
+    return ContactShadow(camera(), plane, **where, device=body.device, grain=grain_of(body), height=height)
 
 
 def square(values: Any) -> np.ndarray:
@@ -59,8 +63,8 @@ def test_the_shadow_falls_where_the_floor_is_seen() -> None:
     assert dark[under].mean() < 0.75 * bare[under].mean()
     np.testing.assert_array_equal(dark[far], bare[far])
     behind = plain_colour(ground, (1.0, 1.0, 1.0))
-    lifted = behind.cover(placed(body, body.means.numpy() + [0.0, 0.0, 0.4]), height=1.0).numpy()
-    assert 0.0 < lifted.max() < behind.cover(body, height=1.0).numpy().max() <= 0.5
+    lifted = behind.cover(placed(body, body.means.numpy() + [0.0, 0.0, 0.4])).numpy()
+    assert 0.0 < lifted.max() < behind.cover(body).numpy().max() <= 0.5
     # A wall in front of the floor takes no shadow.
     wall = placed(floor, floor.means.numpy()[:, [0, 2, 1]] + [0.0, -1.2, 1.0])
     plain, shaded = (over_scene(wall, body, shadow=shadow) for shadow in (False, True))
@@ -125,7 +129,8 @@ def test_it_is_what_bins_blurs_and_rays_make(tilt: float, device: str) -> None:
         device=device,
     )
     centre = np.array([0.1, -0.2, 0.0])
-    found = on_ground(body, plane, centre).cover(body, on_ground(body, plane, centre).fade, height=0.7)
+    ground = on_ground(body, plane, centre, height=0.7)
+    found = ground.cover(body, ground.fade)
     expected = darkness(body, plane, centre, 2.0, 0.7)
     assert expected.max() > 0.3
     np.testing.assert_allclose(square(found), expected, atol=0.01)
@@ -136,7 +141,7 @@ def test_a_floor_has_lines_and_ends_in_the_sky() -> None:
     """Lines a cell apart, nothing of it from the reach on; without a shadow it is the same under a body."""
     body, _ = parts()
     ground = on_ground(body)
-    picture = grid_floor(ground, cell=0.5, shadow=False).background(body, height=1.0).numpy()
+    picture = grid_floor(ground, cell=0.5, shadow=False).background(body).numpy()
     flat, fade = square(ground.flat), square(ground.fade)
     assert (picture[fade == 0.0] == 1.0).all() and (fade == 0.0).any()
     near = np.abs((flat / 0.5 + 0.5) % 1.0 - 0.5).min(axis=-1) * 0.5 / square(ground.pixel)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from egs_warp.assets import pawn
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.fem.body import BodyState, make_body
@@ -16,8 +17,15 @@ from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.stance import Ground
 from egs_warp.muscles.muscle_set import automatic_muscles
+from egs_warp.pipelines.creature import Creature, make_creature
 from tests.support.meshes import UP
 from tests.support.places import DT, FLOOR
+
+
+def coarse_pawn(*, friction: float = 0.8) -> Creature:
+    """The built-in pawn of few Gaussians, made by the package in a cage of about 50 nodes."""
+    made = pawn(gaussian_count=3000)
+    return make_creature(made.cloud, plane=made.plane, nodes=50, friction=friction)
 
 
 @dataclass(frozen=True)
