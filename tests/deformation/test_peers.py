@@ -88,5 +88,10 @@ def test_a_surface_needs_triangles_with_area() -> None:
     corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
     with pytest.raises(UserError, match="surface: triangle 0 has no area; give triangles with three corners apart"):
         BoundSurface(corners, np.array([[0, 1, 2]], dtype=np.int32))
+    shifted = corners + [1.0, -2.0, 3.0]
+    twice = np.array([[1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [0.0, 1.0, 0.0]])
+    for flat in (shifted, twice, twice[[0, 2, 1]]):
+        with pytest.raises(UserError, match="surface: triangle 1 has no area"):
+            BoundSurface(np.vstack([np.eye(3), flat]), np.array([[0, 1, 2], [3, 4, 5]], dtype=np.int32))
     with pytest.raises(UserError, match="surface: it has no triangles"):
         BoundSurface(corners, np.zeros((0, 3), dtype=np.int32))

@@ -75,6 +75,15 @@ def test_a_sliver_between_two_bounds_has_an_optimum() -> None:
         assert -slack < (A @ found.x)[-1] - inside < 1e-6 + slack
 
 
+def test_bounds_are_met_where_the_objective_has_nowhere_to_fall_to() -> None:
+    """q = 0: whatever they cost, by a search that joins row after row, too."""
+    for seed in range(60):
+        P, q, A, lower, upper = random_program(seed)
+        reduced = ReducedRows.of(P, 0.0 * q, A)
+        found = optimum_near(reduced, lower, upper, reduced.free < lower, reduced.free > upper)
+        assert found is not None and found.feasible
+
+
 def test_a_minimum_within_its_bounds_is_the_optimum() -> None:
     """Nothing holds it, whatever was guessed."""
     P, q, A, _, _ = random_program(3)

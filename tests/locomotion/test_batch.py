@@ -192,6 +192,16 @@ def test_a_world_that_cannot_be_solved_is_told_and_leaves(creature: Creature) ->
     assert not lost.any() and torch.isfinite(state.positions).all()
 
 
+def test_a_world_that_never_converges_is_lost(creature: Creature, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not even in its smallest parts, as where all accuracy is asked."""
+    monkeypatch.setattr("egs_warp.contact.coupled_step.CoupledSolver.tolerance", 0.0)
+    dt, _ = solver_steps(creature.body)
+    stepper = BatchStepper(*parts(creature), FRICTIONS)
+    given = np.zeros((3, creature.muscles.segment_count))
+    state, done, lost = stepper.advance(stepper.start([creature.start] * 3), given, dt)
+    assert lost.all() and len(state.worlds) == 0 and done == []
+
+
 def test_ground_that_is_not_flat_is_refused(creature: Creature) -> None:
     ground = HeightField(np.eye(3), np.zeros(3), 1.0, np.zeros((3, 3)))
     geometry = replace(creature.geometry, field=ground)

@@ -10,7 +10,7 @@ import pytest
 
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import UnsolvableStepError
-from egs_warp.locomotion.rollout import Simulation, roll_out, settle
+from egs_warp.locomotion.rollout import REST_FRAMES, Simulation, roll_out, settle
 from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
@@ -49,6 +49,23 @@ def test_what_was_solved_before_is_kept(
     assert cut.stopped and not whole.stopped
     assert len(cut.reports) == 3 and cut.frames.tolist() == [0, 1, 2, 3]
     assert np.array_equal(cut.trajectory.positions, whole.trajectory.positions[:4])
+
+
+@pytest.mark.parametrize("before", [[], [True] * 5 + [False]], ids=["at once", "and goes on"])
+def test_what_has_finished_rests_before_it_ends(made: CoarseCreature, before: list[bool]) -> None:
+    """So many frames in a row: what goes on meanwhile begins anew."""
+    frames = iter(before + [True] * 100)
+    nothing = np.zeros((100, made.stepper.muscles.segment_count))
+    done = roll_out(
+        made.stepper,
+        made.stepper.geometry,
+        made.start,
+        MotionSequence(made.place, motion("stand 1").parts(made.place.body.height)),
+        frames=100,
+        finished=lambda: next(frames),
+        activations=nothing,
+    )
+    assert len(done.frames) == 1 + len(before) + REST_FRAMES and not done.stopped
 
 
 def test_steps_that_have_no_solution(made: CoarseCreature) -> None:

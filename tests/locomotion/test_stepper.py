@@ -15,6 +15,7 @@ import warp as wp
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.fem.body import BodyState, SoftBody, make_body
+from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.objectives import (
     AnyObjective,
@@ -122,6 +123,23 @@ def test_audit_of_a_hop(device: str) -> None:
     speeds = [body.centre_of_mass(s.velocities)[2] for s in states]
     assert min(speeds) < -0.2 and max(speeds) > 0.8
     assert max(np.abs(r.activations / stepper.muscles.bounds).max() for r in reports) > 0.05
+
+
+def test_what_a_program_foresees_is_in_its_units() -> None:
+    """Contact speeds in sqrt(g H), forces in body weights, activations in their bounds, as the prospect has them."""
+    stepper = muscular_block()
+    body = stepper.body
+    states, reports = run_hop(stepper, 3)
+    memory = StepMemory.after(reports[-1])
+    problem = StepProblem(body, states[-1], DT, stepper.settings.drag)
+    prospect = stepper.foresee(problem, reports[-1].contacts, memory, memory.activations)
+    foreseen = stepper.planner.program(prospect, memory.activations, hop(body, 3)).foreseen
+    speeds = prospect.response.contacts.speeds(prospect.velocities.ravel()).reshape(-1, 3)
+    assert np.abs(speeds).max() > 1e-3 and prospect.forces[:, 0].sum() > 0.5 * body.weight
+    np.testing.assert_allclose(foreseen.velocities, speeds / body.speed_unit, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(foreseen.forces, prospect.forces / body.weight, rtol=1e-12)
+    shares = stepper.planner.synergies.mean(memory.activations / stepper.muscles.bounds)
+    np.testing.assert_allclose(foreseen.activations, shares, rtol=1e-12)
 
 
 def test_a_body_bobs_as_asked() -> None:

@@ -181,6 +181,7 @@ def test_every_strategy_solves_the_same_program() -> None:
             reached[strategy].append(found.objective)
     means = {strategy: float(np.mean(values)) for strategy, values in reached.items()}
     assert means[Strategy.PIECES] < means[Strategy.PAPER] < means[Strategy.STATIC]
+    assert means[Strategy.QPCC_OUR_MOVES] < 0.9 * means[Strategy.QPCC]
 
 
 def test_strategies_and_solvers_are_chosen_by_name() -> None:
