@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import warp as wp
 from scipy.spatial import Delaunay
 
-from egs_warp.deformation.embedding import embed_points
+from egs_warp.deformation.embedding import CageLocator, embed_points
 from egs_warp.errors import UserError
 from egs_warp.geometry.tetmesh import TetMesh
 
@@ -87,6 +88,25 @@ def test_weights_reproduce_points_and_shared_faces_take_the_lowest_tet(device: s
     assert embedding.inside.numpy().all()
     lowest = np.array([np.flatnonzero((far.tets == node).any(axis=1))[0] for node in range(len(far.nodes))])
     np.testing.assert_array_equal(embedding.tets.numpy()[: len(far.nodes)], lowest)
+
+
+@pytest.mark.parametrize("off", [0.0, 30.0])
+def test_the_nearest_faces_are_those_of_brute_force(off: float, device: str) -> None:
+    """Of the cage's own surface and of a level sheet within it, from inside and outside, far from the origin too."""
+    mesh = blob(seed=4)
+    mesh = TetMesh(mesh.nodes + np.array([off, -2.0 * off, 0.3]), mesh.tets)
+    cage = CageLocator(mesh, device=device)
+    points = np.random.default_rng(5).uniform(-0.6, 1.6, (200, 3)) + mesh.nodes.min(axis=0)
+    sheet = mesh.nodes.min(axis=0) + np.array([[0.1, 0.1, 0.4], [0.9, 0.1, 0.4], [0.9, 0.9, 0.4], [0.1, 0.9, 0.4]])
+    for vertices, faces, surface in (
+        (mesh.nodes, mesh.boundary_faces(), None),
+        (sheet, np.array([[0, 1, 2], [0, 2, 3]]), cage.local_surface(sheet, np.array([[0, 1, 2], [0, 2, 3]]))),
+    ):
+        given = wp.array(points.astype(np.float32), dtype=wp.vec3, device=device)
+        found = cage.nearest_faces(given, surface).numpy()
+        distance = np.stack([distance_to_triangles(vertices[faces], point) for point in points])
+        np.testing.assert_allclose(distance[np.arange(200), found], distance.min(axis=1), rtol=0, atol=2e-5)
+        assert len(set(found.tolist())) > 1
 
 
 def test_a_point_that_is_not_finite_is_refused() -> None:

