@@ -103,7 +103,7 @@ def test_the_nearest_faces_are_those_of_brute_force(off: float, device: str) -> 
         (sheet, np.array([[0, 1, 2], [0, 2, 3]]), cage.local_surface(sheet, np.array([[0, 1, 2], [0, 2, 3]]))),
     ):
         given = wp.array(points.astype(np.float32), dtype=wp.vec3, device=device)
-        found = cage.nearest_faces(given, surface).numpy()
+        found = np.asarray(cage.nearest_faces(given, surface).numpy(), np.int64)
         distance = np.stack([distance_to_triangles(vertices[faces], point) for point in points])
         np.testing.assert_allclose(distance[np.arange(200), found], distance.min(axis=1), rtol=0, atol=2e-5)
         assert len(set(found.tolist())) > 1
