@@ -19,6 +19,10 @@ _HIT = 0.1
 """Of the largest blending weight under a click: what shows less there was not meant."""
 _FIRST = 0.25
 """Of the light of a click: what it comes from is what is clicked on."""
+_WIDE, _FAINT = 0.05, 0.5
+"""Of the distance, across, and of opacity: what is wider and fainter is a veil in the air, and one means what is behind
+it.
+"""
 _DEEP = 0.03
 """Of the distance: what is so far before or behind the surface that is clicked on is another."""
 _SURE = 0.5
@@ -51,7 +55,8 @@ def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside
     """What pixel (``u``, ``v``), from the top left corner of ``camera``'s picture, hits; None where it shows nothing.
 
     Only a window about the click is drawn. What it shows is as far away as the first quarter of its light comes from:
-    between leaves one sees through to the wall, and means the leaves. Hits are what paints it there.
+    between leaves one sees through to the wall, and means the leaves. Veils in the air, as captures from a turntable
+    have them, do not count where there is enough light without them. Hits are what paints it there.
     """
     reach = max(1, round(_RADIUS * max(camera.width, camera.height)))
     left, top, side = int(u) - reach, int(v) - reach, 2 * reach + 1
@@ -62,12 +67,20 @@ def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside
     if weights.sum() < 0.5 * disc.sum():
         return None
     depths = cloud.means.numpy().astype(np.float64) @ camera.rotation[2] + camera.translation[2]
+    clear = np.where(_veils(cloud, depths), 0.0, weights)
+    weights = clear if clear.sum() > _FIRST * weights.sum() else weights
     order = np.argsort(depths, kind="stable")
     depth = float(depths[order[np.searchsorted(np.cumsum(weights[order]), _FIRST * weights.sum())]])
     hits = (np.abs(depths - depth) < _DEEP * depth) & (weights > 0.0)
     hits &= weights > _HIT * weights[hits].max(initial=0.0)
     point = camera.centre + depth * camera_rays(window)[reach, reach]
     return Click(point, np.flatnonzero(hits), inside, camera, (u, v))
+
+
+def _veils(cloud: GaussianCloud, depths: np.ndarray) -> np.ndarray:
+    """(n,) bool: what is wide and faint as seen from so far away."""
+    across = np.exp(np.sort(cloud.log_scales.numpy(), axis=1)[:, 1])
+    return (across > _WIDE * depths) & (cloud.opacities() < _FAINT)
 
 
 def hits_among(nodes: np.ndarray, clicks: Sequence[Click], *, inside: bool) -> np.ndarray:

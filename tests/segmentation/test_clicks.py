@@ -46,6 +46,19 @@ def test_haze_before_what_is_clicked_on_is_not_hit() -> None:
         assert (400 in click(cloud, (0.0, -0.5, 0.5)).hits) is hit
 
 
+@pytest.mark.parametrize("opacity, through", [(0.2, True), (0.9, False)])
+def test_veils_between_camera_and_object_are_looked_through(opacity: float, through: bool) -> None:
+    """Three in a row, each a third as wide as they are far away: faint ones hide nothing, dense ones are what shows."""
+    skin = round_ones(shell(400), 0.04)
+    means = np.concatenate([skin.means.numpy(), [[0.0, y, 0.5] for y in (-1.2, -1.0, -0.8)]])
+    scales = np.concatenate([skin.log_scales.numpy(), np.log([[0.8, 0.002, 0.8]] * 3)])
+    logits = np.append(skin.opacity_logits.numpy(), [np.log(opacity / (1.0 - opacity))] * 3)
+    turns = np.tile([1.0, 0.0, 0.0, 0.0], (403, 1))
+    found = click(GaussianCloud.from_numpy(means, turns, scales, logits, np.zeros((403, 1, 3))), (0.0, -0.5, 0.5))
+    assert bool((found.hits < 400).all()) is through
+    assert found.point[1] == pytest.approx(-0.5 if through else -1.2, abs=0.05)
+
+
 @pytest.mark.parametrize("tones", [(-1.0, 1.0), (0.0, 0.0)])
 def test_a_click_beside_cuts_off_what_touches(tones: tuple[float, float]) -> None:
     """Of two balls that touch one click takes both; a second takes the other away, whatever the colours."""
