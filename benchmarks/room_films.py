@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import resource
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,8 +20,6 @@ from drawn import DrawnScene, read_drawn
 from egs_warp.commands.object_flag import read_object
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.inpainting.holes import hole_under
-from egs_warp.inpainting.inpaint import inpaint
 from egs_warp.inpainting.picture import before_and_after
 from egs_warp.io import read_cameras, read_capture
 from egs_warp.io.ply import write_ply
@@ -33,10 +32,9 @@ from egs_warp.pipelines.doubts import doubts
 from egs_warp.pipelines.film import draw_film
 from egs_warp.pipelines.front import mean_view
 from egs_warp.pipelines.ground_left import ground_left
-from egs_warp.pipelines.locate_plane import locate_plane, on_its_ground
 from egs_warp.pipelines.performance import simulate
 from egs_warp.pipelines.pictures import picture_cameras, plane_picture, segmentation_picture
-from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, set_down, take_apart, viewing_direction
+from egs_warp.pipelines.prepare_scene import PreparedScene, prepare_scene, viewing_direction
 from egs_warp.pipelines.report import GaussianCounts, report_of_run
 from egs_warp.pipelines.train_capture import train
 from egs_warp.segmentation.object_spec import ObjectSpec
@@ -170,6 +168,10 @@ def _capture(
     return result.cloud
 
 
+_STAGE_OF = {"plane": "plane", "ground": "plane", "segment": "object", "inpaint": "hole"}
+"""Of the stages that ``prepare_scene`` tells: which of ours each belongs to."""
+
+
 def _taken_apart(
     cloud: GaussianCloud,
     spec: ObjectSpec,
@@ -177,20 +179,17 @@ def _taken_apart(
     photographs: list[TrainingView] | None,
     seconds: dict[str, float],
 ) -> PreparedScene:
-    """As ``prepare_scene`` does, stage by stage."""
-    options = SceneOptions()
-    located, first = timed(locate_plane, cloud, spec, cameras=cameras)
-    located, second = timed(on_its_ground, cloud, located, spec, cameras)
-    seconds["plane"] = first + second
-    (thing, bare, notes), seconds["object"] = timed(take_apart, cloud, located, options, photographs)
-    thing, came_down = set_down(thing, located)
-    notes = (*notes, *came_down)
-    hole = hole_under(cloud, located.plane, located.segmentation)
-    if hole is None:
-        return PreparedScene(thing, bare, bare, located.plane, hole, located, (*located.notes, *notes))
-    filled, seconds["hole"] = timed(inpaint, bare, hole)
-    notes = (*located.notes, *notes, *filled.notes)
-    return PreparedScene(thing, filled.cloud, bare, located.plane, hole, located, notes, filled)
+    """By ``prepare_scene``; milliseconds of its stages into ``seconds``."""
+    began: dict[str, float] = {}
+
+    def note(stage: str, done: float) -> None:
+        began.setdefault(stage, time.perf_counter())
+
+    scene = prepare_scene(cloud, spec, cameras=cameras, photographs=photographs, progress=note)
+    ends = [*list(began.values())[1:], time.perf_counter()]
+    for (stage, start), end in zip(began.items(), ends, strict=True):
+        seconds[_STAGE_OF[stage]] = seconds.get(_STAGE_OF[stage], 0.0) + 1e3 * (end - start)
+    return scene
 
 
 def _pictures(run: RunFolder, cloud: GaussianCloud, scene: PreparedScene, cameras: Sequence[Camera]) -> list[str]:

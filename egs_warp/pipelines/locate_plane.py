@@ -21,6 +21,7 @@ from egs_warp.segmentation.object_mask import TOUCHING, segment
 from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
 from egs_warp.segmentation.plane_fit import PlaneFit
 from egs_warp.segmentation.plane_search import FoundPlane, find_planes, plane_under, refine_plane
+from egs_warp.segmentation.resting_plane import resting_plane
 from egs_warp.segmentation.table_top import planes_below, surface_around
 from egs_warp.segmentation.votes import votes_of_masks
 
@@ -32,7 +33,8 @@ _TILT_DEGREES, _HELD_DEGREES = 25.0, 10.0
 """What is level may be so far off an up that was guessed, or told by an axis; and off one that many cameras tell: a
 white desk that no photo could be matched on is a haze through which planes of any tilt can be laid.
 """
-_LEVEL_DEGREES = 5.0
+_LEVEL_DEGREES, _CLEARLY_DEGREES = 5.0, 1.0
+"""What leans by more is doubted, and what leans by so much less is taken instead."""
 _TOP = 0.995
 """Quantile of the Gaussians' heights that is the object's."""
 _HIGHER = 0.7
@@ -52,7 +54,7 @@ class LocatedPlane:
 
     plane: Plane
     fit: PlaneFit | None
-    """None where the plane was given."""
+    """None where the plane was given, or laid under the object."""
     centre: np.ndarray
     """(3,) middle of the object."""
     size: float
@@ -61,6 +63,8 @@ class LocatedPlane:
     notes: tuple[str, ...]
     ground: HeightField | None = None
     """What is there, scene units, where it is not flat."""
+    in_sight: bool = True
+    """Whether views tell what the object stands on; else the plane was laid under it."""
 
     def known(self) -> KnownPlane:
         """What ``plane.json`` says of it."""
@@ -85,7 +89,8 @@ def locate_plane(
 
     A coarse plane is sampled from the Gaussians (a table top goes before a wider floor), the object found on it, and
     the plane then fitted to the depth rendered beside the object, through ``cameras`` or else a ring of steep ones;
-    then the object is found again. With ``plane`` given, only the object is sought.
+    then the object is found again. Where the cameras tell up, and what is rendered is not level (the haze over a white
+    desk), the plane is laid under the object instead. With ``plane`` given, only the object is sought.
     """
     notes: list[str] = []
     if plane is not None:
@@ -103,22 +108,54 @@ def locate_plane(
     else:
         level = centre - coarse.heights(centre) * coarse.normal
         views = ring_cameras(coarse, level, radius, count=9, elevations=_PLANE_ELEVATIONS, size=_PLANE_SIDE)
-    fit = refine_plane(cloud, coarse, views, centre=centre, radius=radius, object_mask=~found.background_mask)
+    beside = ~found.background_mask
+    fit, failure = None, None
+    try:
+        fit = refine_plane(cloud, coarse, views, centre=centre, radius=radius, object_mask=beside)
+    except UserError as error:
+        failure = error
+    seen = coarse if fit is None else fit.plane
+    if tilt == _HELD_DEGREES and (fit is None or _lean(seen, up) > _LEVEL_DEGREES):
+        with contextlib.suppress(UserError):
+            laid = resting_plane(cloud, beside, seen, up, degrees=tilt, size=found.size)
+            if fit is None or _lean(laid, up) < _lean(seen, up) - _CLEARLY_DEGREES:
+                return _laid(cloud, spec, laid, tuple(notes))
+        degrees = f"{_lean(seen, up):.0f} degrees"
+        notes.append(f"the plane leans by {degrees} if the cameras were held upright; look at plane.png")
+    if fit is None:
+        assert failure is not None
+        raise failure
     found = segment(cloud, fit.plane, spec, hover=_HOVERING)
-    if tilt == _HELD_DEGREES:
-        notes += _leaning(fit.plane, up)
     notes += _hovering(cloud, fit.plane, found)
     notes.append(
-        f"plane {','.join(f'{x:.4f}' for x in (*fit.plane.normal, fit.plane.offset))}: fits {fit.pixel_count} pixels "
+        f"{_said(fit.plane)}: fits {fit.pixel_count} pixels "
         f"to {100 * fit.noise:.2f} % of depth, {100 * fit.inlier_share:.0f} % of them inliers"
     )
     return LocatedPlane(fit.plane, fit, _middle(cloud, found), found.size, found, tuple(notes))
+
+
+def _laid(cloud: GaussianCloud, spec: ObjectSpec, plane: Plane, notes: tuple[str, ...]) -> LocatedPlane:
+    """The object on the ``plane`` that was laid under it."""
+    found = segment(cloud, plane, spec, hover=_HOVERING)
+    note = f"{_said(plane)}: laid under the object's lowest parts, as no view tells where the ground is; see plane.png"
+    return LocatedPlane(plane, None, _middle(cloud, found), found.size, found, (*notes, note), in_sight=False)
+
+
+def _said(plane: Plane) -> str:
+    return f"plane {','.join(f'{x:.4f}' for x in (*plane.normal, plane.offset))}"
+
+
+def _lean(plane: Plane, up: np.ndarray) -> float:
+    """Degrees."""
+    return float(np.degrees(np.arccos(np.clip(plane.normal @ up / np.linalg.norm(up), -1.0, 1.0))))
 
 
 def on_its_ground(
     cloud: GaussianCloud, located: LocatedPlane, spec: ObjectSpec, cameras: Sequence[Camera] = ()
 ) -> LocatedPlane:
     """``located``, and where the ground is not flat, what is there, and the object down to it; or why not."""
+    if not located.in_sight:
+        return located
     found = located.segmentation
     means = cloud.means.numpy()[found.object_mask]
     height = float(np.quantile(located.plane.heights(means), _TOP))
@@ -148,14 +185,6 @@ def on_its_ground(
         notes=(*located.notes, note),
         ground=measured.touched_by(cloud.subset(found.object_mask), found.size),
     )
-
-
-def _leaning(plane: Plane, up: np.ndarray) -> tuple[str, ...]:
-    """What there is to say of a plane that is not level by the cameras."""
-    degrees = float(np.degrees(np.arccos(np.clip(plane.normal @ up / np.linalg.norm(up), -1.0, 1.0))))
-    if degrees <= _LEVEL_DEGREES:
-        return ()
-    return (f"the plane leans by {degrees:.0f} degrees if the cameras were held upright; look at plane.png",)
 
 
 def _hovering(cloud: GaussianCloud, plane: Plane, found: Segmentation) -> tuple[str, ...]:

@@ -41,6 +41,10 @@ _LIKELY, _LARGEST = 0.3, 4.0
 """Of a guess: smaller and larger objects are not what it was made for."""
 _HANGING = 0.5
 """Of the object's size: what is this high above the plane in all of its parts does not stand on it."""
+_VEIL, _USUAL, _FAINT = 0.05, 4.0, 0.3
+"""Of the object's size, across, times what is usual on it, and of opacity: what is wider and fainter is haze about it,
+and would go along as a halo.
+"""
 _FOOT = 0.015
 """Of the object's size: within this height above the plane, floor and object cannot be told apart by connection."""
 
@@ -123,6 +127,7 @@ def _of_size(
     object_mask = (chosen | at_foot | faint) & ~cut_off
     for click in spec.clicks:
         object_mask[click.hits] = click.inside & (scene.heights[click.hits] > 0.0) & ~cut_off[click.hits]
+    object_mask &= ~_veils(scene, object_mask, size)
     lowest = float(np.quantile(scene.heights[object_mask], 0.002))
     if lowest > hover * size:
         raise UserError(
@@ -141,6 +146,13 @@ def _of_size(
         halo |= shreds
     floaters = (halo | (claimed & above)) & ~object_mask & ~buried & ~cut_off
     return Segmentation(object_mask, buried, floaters, size)
+
+
+def _veils(scene: AbovePlane, chosen: np.ndarray, size: float) -> np.ndarray:
+    """(n,) bool: the haze in what is ``chosen`` (n,) bool."""
+    across = np.exp(np.sort(scene.cloud.log_scales.numpy(), axis=1)[:, 1])
+    wide = across > max(_VEIL * size, _USUAL * float(np.median(across[chosen])))
+    return chosen & wide & (scene.opacity < _FAINT)
 
 
 def _body(

@@ -77,9 +77,10 @@ def fit_plane(views: Sequence[PlaneView], *, start: Plane | None = None, seed: i
     scale = _scale(residual)
     inside = residual < _TUKEY * max(scale, _LEAST_NOISE)
     if scale > 0.1 or inside.mean() < 0.4:
+        errors, share = (f"{100.0 * value:.0f} %" for value in (scale, inside.mean()))
+        fault = f"leaves depth errors of {errors}" if scale > 0.1 else f"explains only {share} of what is"
         raise UserError(
-            f"plane: none in sight: the best one leaves depth errors of {100 * scale:.0f} % in the masks; "
-            "mark a flat part of what the object stands on"
+            f"plane: none in sight: the best one {fault} in the masks; mark a flat part of what the object stands on"
         )
     if plane.heights(pixels.origins[0]) < 0.0:
         plane = Plane(-plane.normal, -plane.offset)

@@ -1,0 +1,106 @@
+"""The plane under an object on haze: by its own lowest parts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.errors import UserError
+from egs_warp.geometry.camera_ring import ring_cameras
+from egs_warp.geometry.gaussians import GaussianCloud, joined
+from egs_warp.geometry.plane import Plane
+from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, on_its_ground
+from egs_warp.segmentation.object_mask import segment
+from egs_warp.segmentation.object_spec import ObjectSpec
+from egs_warp.segmentation.resting_plane import resting_plane
+from tests.support.grounds import level, sheet
+from tests.support.scenes import FLOOR, ball_on_floor, round_ones
+
+UP = np.array([0.0, 0.0, 1.0])
+BOX = np.array([1.0, 0.6, 0.5])
+
+
+def leaning(degrees: float) -> np.ndarray:
+    """(3,) up, turned about y."""
+    angle = np.radians(degrees)
+    return np.array([np.sin(angle), 0.0, np.cos(angle)])
+
+
+def skin_of_box(count: int = 3000) -> np.ndarray:
+    """(n, 3) on all sides of a box whose underside is in the floor, about its middle."""
+    random = np.random.default_rng(2)
+    points = random.uniform(-0.5, 0.5, (count, 3))
+    side = random.integers(0, 3, count)
+    points[np.arange(count), side] = np.sign(points[np.arange(count), side]) / 2.0
+    return points * BOX + [0.0, 0.0, 0.5 * BOX[2]]
+
+
+def box_on_haze(degrees: float) -> GaussianCloud:
+    """The box, and a sheet that leans so, through its foot."""
+    normal = leaning(degrees)
+    haze = level((-2.0, -2.0), (2.0, 2.0), 0.0, 0.1)
+    haze[:, 2] = 0.05 - haze[:, 0] * normal[0] / normal[2]
+    return joined(round_ones(skin_of_box(), 0.008), sheet(haze, np.tile(normal, (len(haze), 1)), 0.06, (0.9, 0.9, 0.9)))
+
+
+def degrees_between(one: np.ndarray, other: np.ndarray) -> float:
+    return float(np.degrees(np.arccos(np.clip(one @ other, -1.0, 1.0))))
+
+
+@pytest.mark.parametrize("off", [0.0, 3.0, 8.0])
+def test_a_box_rests_on_its_underside(off: float) -> None:
+    """Whatever plane cuts through it, up may be off by ``off`` degrees, and some strays lie below."""
+    skin = skin_of_box()
+    strays = np.random.default_rng(0).uniform(-0.4, 0.4, (8, 3)) * [1.0, 1.0, 0.2] - [0.0, 0.0, 0.1]
+    cloud = round_ones(np.concatenate([skin, strays]), 0.008)
+    cut = Plane(leaning(-off), -0.1)
+    thing = cut.heights(cloud.means.numpy().astype(np.float64)) > 0.0
+    found = resting_plane(cloud, thing, cut, leaning(off), degrees=10.0, size=1.3)
+    assert degrees_between(found.normal, UP) < 0.6
+    assert abs(float(found.heights(np.zeros(3)))) < 0.01
+
+
+def test_a_direction_beyond_what_is_allowed_is_not_taken() -> None:
+    cloud = round_ones(skin_of_box(), 0.008)
+    found = resting_plane(cloud, np.ones(cloud.count, bool), FLOOR, leaning(8.0), degrees=5.0, size=1.3)
+    assert degrees_between(found.normal, leaning(8.0)) == pytest.approx(5.0, abs=0.1)
+
+
+def test_haze_alone_carries_nothing() -> None:
+    wide = round_ones(skin_of_box(), 0.1)
+    with pytest.raises(UserError, match="the object has only 0 fine Gaussians"):
+        resting_plane(wide, np.ones(wide.count, bool), FLOOR, UP, degrees=10.0, size=1.3)
+
+
+def found_on(cloud: GaussianCloud) -> LocatedPlane:
+    cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.25]), 0.9, count=8, elevations=(20.0, 50.0), size=200)
+    spec = ObjectSpec(point=np.array([0.0, 0.0, 0.45]))
+    return on_its_ground(cloud, locate_plane(cloud, spec, cameras=cameras), spec, cameras)
+
+
+def test_where_what_is_seen_is_not_level_the_plane_is_laid_under_the_object() -> None:
+    """By 8 degrees it is haze; by 3 it is a table."""
+    laid, seen = found_on(box_on_haze(8.0)), found_on(box_on_haze(3.0))
+    assert not laid.in_sight and laid.fit is None and seen.in_sight
+    assert "laid under the object's lowest parts" in laid.notes[-1]
+    assert degrees_between(laid.plane.normal, UP) < 0.6
+    assert abs(float(laid.plane.heights(np.zeros(3)))) < 0.01
+    assert degrees_between(seen.plane.normal, leaning(3.0)) < 0.6
+    assert laid.ground is None
+
+
+def test_haze_about_an_object_is_not_taken_along() -> None:
+    cloud, truth = ball_on_floor()
+    random = np.random.default_rng(4)
+    where = random.normal(size=(30, 3))
+    where = 0.55 * where / np.linalg.norm(where, axis=1, keepdims=True) + [0.0, 0.0, 0.7]
+    for opacity, taken in ((0.2, False), (0.9, True)):
+        haze = round_ones(where, 0.2)
+        logits = np.full(30, np.log(opacity / (1.0 - opacity)), np.float32)
+        both = joined(
+            cloud,
+            GaussianCloud.from_numpy(where, haze.rotations.numpy(), haze.log_scales.numpy(), logits, haze.sh.numpy()),
+        )
+        found = segment(both, FLOOR, ObjectSpec(point=np.array([0.0, 0.0, 0.5])))
+        assert bool(found.object_mask[cloud.count :].any()) is taken
+        assert found.object_mask[: cloud.count][truth].mean() > 0.95
