@@ -53,7 +53,7 @@ def _lowest(points: np.ndarray, up: np.ndarray, reach: float) -> Plane:
     axes = np.stack(Plane(up, 0.0).tangents())
     best, step = np.zeros(2), reach / (_ACROSS // 2)
     for _ in range(_ROUNDS):
-        tried = best + step * np.stack(np.indices((_ACROSS, _ACROSS)) - _ACROSS // 2, axis=-1).reshape(-1, 2)
+        tried = best + step * (np.indices((_ACROSS, _ACROSS)).reshape(2, -1).T - _ACROSS // 2)
         tried = tried[np.hypot(*tried.T) <= reach * (1.0 + 1e-9)]
         normals = up + tried @ axes
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)

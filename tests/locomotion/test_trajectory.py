@@ -29,6 +29,19 @@ def test_ballistic_flight_is_measured(flight: Trajectory) -> None:
     assert reached.airborne_frames == pytest.approx(60 * (flight.time[com > 0][-1] - flight.time[1]))
 
 
+def test_a_part_of_a_trajectory_is_measured_alone(flight: Trajectory) -> None:
+    """From the third state to the tenth, in the air all along, is as a trajectory that begins and ends there."""
+    cut = replace(
+        flight,
+        **{name: getattr(flight, name)[3:11] for name in ("time", "positions", "velocities", "min_gap")},
+    )
+    part = measure(flight, first=3, last=10)
+    alone = measure(cut)
+    for name in part.__dataclass_fields__:
+        assert getattr(part, name) == pytest.approx(getattr(alone, name), rel=1e-12, abs=1e-12), name
+    assert part.airborne_frames == pytest.approx(60.0 * 7 * DT)
+
+
 def test_tilt_is_the_angle_to_the_normal(flight: Trajectory) -> None:
     leaned = flight.positions.copy()
     leaned[-1] = leaned[-1] @ Rotation.from_rotvec([0.3, 0.0, 0.0]).as_matrix().T
