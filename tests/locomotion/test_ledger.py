@@ -15,7 +15,7 @@ from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion import ledger as module
 from egs_warp.locomotion.ledger import FLOWS, STORED, Ledger, ledger
 from egs_warp.locomotion.trajectory import Trajectory
-from egs_warp.muscles.tension import MuscleTension
+from egs_warp.muscles.tension import MuscleTension, shares_of_tension
 from tests.support.places import DT
 from tests.support.slides import slide
 
@@ -222,3 +222,13 @@ def imported(path: Path) -> set[str]:
     nodes = ast.walk(ast.parse(path.read_text()))
     names |= {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
     return {name for name in names if name.split(".")[0] in ("numpy", "scipy", "warp", "egs_warp")}
+
+
+def test_what_a_shortened_muscle_has_pulled_is_the_integral_of_its_share() -> None:
+    """By the midpoint rule over lengths from nothing to 1.2 of that at rest: the ledger has a formula of its own."""
+    count, rest = 4800, 0.5
+    lengths = 1.2 * rest * np.arange(count + 1) / count
+    middles = 0.5 * (lengths[1:] + lengths[:-1]) / rest
+    summed = np.append(0.0, np.cumsum(shares_of_tension(middles)[0] * np.diff(lengths)))
+    muscles = module._Muscles(*[np.zeros(0)] * 5, rest_lengths=np.full(count + 1, rest))
+    np.testing.assert_allclose(muscles._pulled(lengths), summed, atol=1e-7)

@@ -1,0 +1,46 @@
+"""A capture in the frame of its body: shapes, sizes and colours go with it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from egs_warp.deformation.rigid import in_body_frame
+from egs_warp.geometry.body_frame import BodyFrame
+from egs_warp.geometry.gaussians import GaussianCloud
+
+
+def covariances(cloud: GaussianCloud) -> np.ndarray:
+    """(n, 3, 3)."""
+    turns = Rotation.from_quat(cloud.rotations.numpy().astype(np.float64), scalar_first=True).as_matrix()
+    scales = np.exp(cloud.log_scales.numpy().astype(np.float64))
+    return np.einsum("nij,nj,nkj->nik", turns, scales**2, turns)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_shapes_turn_and_grow_with_the_frame(degree: int) -> None:
+    """C -> s^2 A C A^T and m -> s A (m - o), A the frame's axes; the same colour is seen from the same side."""
+    random = np.random.default_rng(3)
+    count = 40
+    cloud = GaussianCloud.from_numpy(
+        random.normal(size=(count, 3)),
+        random.normal(size=(count, 4)),
+        random.uniform(-4.0, -1.0, (count, 3)),
+        random.normal(size=count),
+        random.normal(size=(count, (degree + 1) ** 2, 3)),
+    )
+    axes = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
+    frame = BodyFrame(axes, np.array([0.3, -0.2, 0.5]), 1.7)
+    moved = in_body_frame(cloud, frame)
+    expected = 1.7**2 * axes @ covariances(cloud) @ axes.T
+    np.testing.assert_allclose(covariances(moved), expected, rtol=2e-5, atol=1e-7 * np.abs(expected).max())
+    means = cloud.means.numpy().astype(np.float64)
+    np.testing.assert_allclose(moved.means.numpy(), frame.points(means), atol=1e-5)
+    np.testing.assert_array_equal(moved.opacity_logits.numpy(), cloud.opacity_logits.numpy())
+    np.testing.assert_allclose(moved.sh.numpy()[:, 0], cloud.sh.numpy()[:, 0], atol=1e-6)
+    if degree:
+        # Band 1 is a vector (y, z, x): it turns as directions do.
+        before, after = (one.sh.numpy()[:, 1:4].astype(np.float64)[:, [2, 0, 1]] for one in (cloud, moved))
+        signs = np.array([-1.0, -1.0, 1.0])[:, None]
+        np.testing.assert_allclose(signs * after, np.einsum("ij,njc->nic", axes, signs * before), atol=1e-5)
