@@ -49,6 +49,17 @@ def test_tops_of_a_step_a_ramp_a_wall_and_a_box() -> None:
     assert stair.scaled(2.0).top(2.0 * at, UP) == pytest.approx(0.2)
 
 
+def test_the_top_of_what_hangs_over() -> None:
+    """A solid under a level face at 1 and over one that rises by 2: it ends above the point where that face has not
+    reached the other yet, and is nowhere beyond.
+    """
+    wedge = Solid((Plane.from_coefficients(0.0, 0.0, 1.0, -1.0), Plane.from_coefficients(2.0, 0.0, -1.0, 0.0)))
+    for x, z in ((0.0, 0.0), (0.0, -3.0), (0.4, 0.1), (-2.0, -1.0)):
+        assert wedge.top(np.array([x, 0.0, z]), UP) == pytest.approx(1.0 - z)
+    for x, z in ((0.6, 0.0), (1.0, 0.5), (4.0, -1.0)):
+        assert wedge.top(np.array([x, 0.0, z]), UP) == -np.inf
+
+
 def test_a_terrain_file(tmp_path: Path) -> None:
     path = tmp_path / "t.json"
     path.write_text("[[[0, 0, 2, -0.4], [-1, 0, 0, 0.5]], [[0, 1, 0, 3]]]")

@@ -341,6 +341,21 @@ def test_the_rotation_of_a_map_that_flattens_is_that_of_its_plane(device: str) -
         np.testing.assert_allclose(found.numpy(), left @ right, atol=2e-5)
 
 
+def test_of_a_map_onto_a_line_the_rotation_takes_that_line_along(device: str) -> None:
+    """F = s u v^T, along each axis and aslant: proper, and R v = u."""
+    slanted = np.random.default_rng(5).normal(size=(6, 2, 3))
+    lines = np.concatenate([[(a, b) for a in np.eye(3) for b in np.eye(3)], slanted])
+    u, v = np.swapaxes(lines / np.linalg.norm(lines, axis=2, keepdims=True), 0, 1)
+    maps = 1.3 * u[:, :, None] * v[:, None, :]
+    given = wp.array(maps.astype(np.float32), dtype=wp.mat33, device=device)
+    found = wp.zeros(len(maps), dtype=wp.mat33, device=device)
+    wp.launch(rotation_parts_kernel, len(maps), inputs=[given], outputs=[found], device=device)
+    turns = found.numpy().astype(np.float64)
+    np.testing.assert_allclose(turns @ np.swapaxes(turns, 1, 2), np.tile(np.eye(3), (len(maps), 1, 1)), atol=2e-5)
+    np.testing.assert_allclose(np.linalg.det(turns), 1.0, atol=2e-5)
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", turns, v), u, atol=2e-5)
+
+
 def test_axes_keep_their_order(device: str) -> None:
     """Of the six orders of a frame's columns the one whose columns are best aligned with the carried, by trying."""
     count = 200

@@ -107,6 +107,23 @@ def test_splitting_for_a_motion_makes_every_part_nearly_affine() -> None:
     assert cloud.count < capped.cloud.count <= 1.5 * cloud.count
 
 
+def test_where_not_all_can_be_split_the_worst_are() -> None:
+    """Those with the largest misfit, of those that would be split without a cap."""
+    mesh, cloud = box((24, 2, 2), (4.0, 0.4, 0.4)), bar_cloud()
+    embedding = embed_gaussians(cloud, mesh)
+    bend = Deformer(cloud, embedding).measure_bend([bent(mesh.nodes, 1.5)])
+
+    def split(most: int | None) -> np.ndarray:
+        result = split_bent(cloud, embedding, bend, max_count=most)
+        return np.unique(result.parents[result.depths == 1])
+
+    more = len(child_layout(SplitRule.MEASURED)[0]) - 1
+    everyone, some = split(None), split(cloud.count + 8 * more)
+    misfits = bend.fit_error.max(axis=1)
+    assert len(everyone) > 20 and len(some) == 8
+    assert misfits[some].min() >= np.sort(misfits[everyone])[-8]
+
+
 def test_an_affine_motion_splits_nothing() -> None:
     """Eq. (16): no bend under stretch, shear and turn, and the very same arrays come back."""
     mesh, cloud = box((4, 4, 4)), random_cloud(300)
