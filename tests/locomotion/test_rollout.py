@@ -11,7 +11,7 @@ import pytest
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import UnsolvableStepError
 from egs_warp.locomotion.rollout import REST_FRAMES, Simulation, roll_out, settle
-from egs_warp.locomotion.stepper import LocomotionStepper
+from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence
 from tests.support.creatures import CoarseCreature, coarse_creature
@@ -49,6 +49,29 @@ def test_what_was_solved_before_is_kept(
     assert cut.stopped and not whole.stopped
     assert len(cut.reports) == 3 and cut.frames.tolist() == [0, 1, 2, 3]
     assert np.array_equal(cut.trajectory.positions, whole.trajectory.positions[:4])
+
+
+def test_a_step_in_parts_hands_on_its_last(made: CoarseCreature, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second step begins where the second part of the first has ended, with what that did."""
+    advance, given, parts = LocomotionStepper.advance, [], []
+
+    def halved(stepper: LocomotionStepper, state: BodyState, memory: StepMemory, *rest: Any) -> Any:
+        given.append((state, memory))
+        end, after, done = advance(stepper, state, memory, *rest)
+        if len(given) == 1:
+            end, after, more = advance(stepper, end, after, *rest)
+            done = [*done, *more]
+            parts.extend(done)
+        return end, after, done
+
+    monkeypatch.setattr(LocomotionStepper, "advance", halved)
+    run(made, made.start)
+    state, memory = given[1]
+    assert len(parts) == 2 and state is parts[1].state
+    for name in ("points", "forces", "activations"):
+        expected = getattr(StepMemory.after(parts[1]), name)
+        np.testing.assert_array_equal(getattr(memory, name), expected)
+    assert not np.array_equal(memory.activations, parts[0].activations)
 
 
 @pytest.mark.parametrize("before", [[], [True] * 5 + [False]], ids=["at once", "and goes on"])
