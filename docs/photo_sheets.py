@@ -16,11 +16,13 @@ import numpy as np
 from egs_warp.assets import scene
 from egs_warp.assets.scene import Scene
 from egs_warp.geometry.camera import Camera
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.geometry.plane import Plane
 from egs_warp.io.video import contact_sheet, write_png
+from egs_warp.pipelines.locate_plane import locate_plane
 from egs_warp.pipelines.pictures import plane_picture
 from egs_warp.render import render_gaussians
+from egs_warp.segmentation.object_spec import ObjectSpec
 
 SIDE = 300
 MIDDLE = np.array([0.0, 0.0, 0.4])
@@ -84,6 +86,26 @@ def foggy(cloud: GaussianCloud) -> GaussianCloud:
     return GaussianCloud.from_numpy(means, *rest)
 
 
+def on_haze(made: Scene, degrees: float = 8.0) -> tuple[GaussianCloud, Plane]:
+    """The object where its ground was white and plain: wide faint Gaussians, of which the lowest are in a plane that
+    leans, and that plane.
+    """
+    random, count = np.random.default_rng(5), 3000
+    leaning = Plane(np.array([np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees))]), -0.02)
+    flat = random.uniform(-2.0, 2.0, (count, 2)) @ np.stack(leaning.tangents())
+    lift = np.where(np.arange(count) % 3 == 0, 0.0, random.uniform(0.0, 0.25, count))
+    # (w, x, y, z) of a turn about y.
+    half = np.radians(degrees) / 2.0
+    haze = GaussianCloud.from_numpy(
+        flat + (lift - leaning.offset)[:, None] * leaning.normal,
+        np.tile([np.cos(half), 0.0, np.sin(half), 0.0], (count, 1)),
+        np.tile(np.log([0.16, 0.16, 0.004]), (count, 1)),
+        np.where(lift > 0.0, -6.0, 1.0),
+        np.full((count, made.object.sh.shape[1], 3), 0.0) + (np.arange(made.object.sh.shape[1]) == 0)[:, None] * 1.4,
+    )
+    return joined(made.object, haze), leaning
+
+
 def taking(made: Scene) -> np.ndarray:
     """Ten photos' worth of advice."""
     whole, _ = made.whole()
@@ -122,6 +144,9 @@ def photos(made: Scene) -> np.ndarray:
     cut[int(0.55 * SIDE) :] = 128
     cropped = np.full_like(good, 255)
     cropped[40:260, 20:240] = good[60:280, 60:280]
+    haze, leaning = on_haze(made)
+    eyes = [camera(eye(degrees, elevation)) for elevation in (20.0, 45.0) for degrees in range(0, 360, 45)]
+    laid = locate_plane(haze, ObjectSpec(point=np.array([0.0, 0.0, 0.6])), cameras=eyes).plane
     noise = np.random.default_rng(1).integers(170, 256, (SIDE // 10, SIDE // 10, 3)).astype(np.uint8)
     pictures = [
         (way_round(whole, arcs), "a two groups"),
@@ -132,8 +157,12 @@ def photos(made: Scene) -> np.ndarray:
         (cut, "f cut short"),
         (drawn(foggy(whole), camera(eye(70.0))), "g fog in new views"),
         (np.concatenate([good, toned(good, (0.5, 0.55, 0.7))], axis=1), "h exposures differ: found"),
+        *(
+            (grid(made.object, plane, camera(eye(-10.0, 14.0))), words)
+            for plane, words in ((leaning, "i in haze it leans"), (laid, "i laid under it"))
+        ),
     ]
-    return sheet(pictures, 4)
+    return sheet(pictures, 5)
 
 
 def taken_out(made: Scene) -> np.ndarray:
@@ -145,29 +174,29 @@ def taken_out(made: Scene) -> np.ndarray:
     def alone(chosen: np.ndarray) -> np.ndarray:
         return drawn(whole.subset(chosen), view, BACKDROP)
 
-    def grid(lift: float) -> np.ndarray:
-        plane = Plane(made.plane.normal, made.plane.offset - lift)
-        picture = plane_picture(whole, [plane], [view], centre=MIDDLE, size=1.3)
-        # Without the words of the picture itself.
-        return cv2.resize(picture[24:SIDE, 12 : SIDE - 12], (SIDE, SIDE), interpolation=cv2.INTER_AREA)
-
     near = np.linalg.norm(means[:, :2], axis=1)
     foot = (heights < 0.02) & (near < 0.75)
     left = drawn(whole.subset(~thing & ~((near < 0.3) & (heights < 0.02))), view)
     pictures = [
-        (grid(0.0), "i the plane as it should lie"),
-        (grid(0.3), "j it lies too high"),
-        (alone(thing), "k the object as it should be"),
-        (alone(thing & (heights < 0.62)), "l a part is missing"),
-        (alone(thing & (heights > 0.12)), "m its foot is missing"),
-        (alone(thing | foot), "n floor taken along"),
-        (left, "o the hole, not filled"),
+        (grid(whole, made.plane, view), "j the plane as it should lie"),
+        (grid(whole, Plane(made.plane.normal, made.plane.offset - 0.3), view), "k it lies too high"),
+        (alone(thing), "l the object as it should be"),
+        (alone(thing & (heights < 0.62)), "m a part is missing"),
+        (alone(thing & (heights > 0.12)), "n its foot is missing"),
+        (alone(thing | foot), "o floor taken along"),
+        (left, "p the hole, not filled"),
         (
             drawn(joined_at(made, np.array([1.9, 0.0, 0.0])), camera(eye(-20.0), 60.0, np.array([0.7, 0.0, 0.3]))),
-            "p beyond the edge",
+            "q beyond the edge",
         ),
     ]
     return sheet(pictures, 4)
+
+
+def grid(cloud: GaussianCloud, plane: Plane, view: Camera) -> np.ndarray:
+    """``plane`` as plane.png shows it, without the words of that picture."""
+    picture = plane_picture(cloud, [plane], [view], centre=MIDDLE, size=1.3)
+    return cv2.resize(picture[24:SIDE, 12 : SIDE - 12], (SIDE, SIDE), interpolation=cv2.INTER_AREA)
 
 
 def sheet(pictures: list[tuple[np.ndarray, str]], columns: int) -> np.ndarray:
