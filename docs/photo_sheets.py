@@ -87,21 +87,21 @@ def foggy(cloud: GaussianCloud) -> GaussianCloud:
 
 
 def on_haze(made: Scene, degrees: float = 8.0) -> tuple[GaussianCloud, Plane]:
-    """The object where its ground was white and plain: wide faint Gaussians, of which the lowest are in a plane that
-    leans, and that plane.
+    """The object where its ground was white and plain, so that training laid wide Gaussians through its foot in a plane
+    that leans; and that plane.
     """
-    random, count = np.random.default_rng(5), 3000
+    count, bands = 1000, made.object.sh.shape[1]
     leaning = Plane(np.array([np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees))]), -0.02)
-    flat = random.uniform(-2.0, 2.0, (count, 2)) @ np.stack(leaning.tangents())
-    lift = np.where(np.arange(count) % 3 == 0, 0.0, random.uniform(0.0, 0.25, count))
+    flat = np.random.default_rng(5).uniform(-2.0, 2.0, (count, 2)) @ np.stack(leaning.tangents())
+    white = np.tile(1.4 * (np.arange(bands) == 0)[:, None], (count, 1, 3))
     # (w, x, y, z) of a turn about y.
     half = np.radians(degrees) / 2.0
     haze = GaussianCloud.from_numpy(
-        flat + (lift - leaning.offset)[:, None] * leaning.normal,
+        flat - leaning.offset * leaning.normal,
         np.tile([np.cos(half), 0.0, np.sin(half), 0.0], (count, 1)),
         np.tile(np.log([0.16, 0.16, 0.004]), (count, 1)),
-        np.where(lift > 0.0, -6.0, 1.0),
-        np.full((count, made.object.sh.shape[1], 3), 0.0) + (np.arange(made.object.sh.shape[1]) == 0)[:, None] * 1.4,
+        np.full(count, 1.0),
+        white,
     )
     return joined(made.object, haze), leaning
 

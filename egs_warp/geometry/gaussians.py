@@ -118,6 +118,12 @@ class GaussianCloud:
         with np.errstate(over="ignore"):
             return 1.0 / (1.0 + np.exp(-self.opacity_logits.numpy().astype(np.float64)))
 
+    def breadths(self, rows: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """(m,) float64 on the host: the middle standard deviation of those ``rows``, scene units; of a flat one how far
+        it reaches across.
+        """
+        return np.exp(np.median(self.log_scales.numpy()[rows].astype(np.float64), axis=1))
+
     def scaled(self, factor: float) -> GaussianCloud:
         """The same capture with every length multiplied by ``factor``."""
         return GaussianCloud.from_numpy(

@@ -182,7 +182,7 @@ def _look(background: GaussianCloud, hole: Hole, margin: float) -> tuple[PlaneWi
     if not floor.any():
         raise UserError("inpaint: the hole is off the floor: nothing lies on the plane around it; check plane and hole")
     # The smallest axis of a floor's Gaussian stands upright; the middle one tells what detail it can show.
-    width = float(np.exp(np.quantile(np.sort(background.log_scales.numpy()[floor], axis=1)[:, 1], 0.25)))
+    width = float(np.quantile(background.breadths(floor), 0.25))
     return window, mask, int(np.clip(round(_SHARPNESS * width / window.texel), 1, _MOST_SPACING))
 
 

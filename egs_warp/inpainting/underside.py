@@ -54,7 +54,7 @@ def with_underside(thing: GaussianCloud, ground: HeightField, size: float) -> tu
     order = np.argsort(-plane.heights(rim), kind="stable")
     colours[row[order], column[order]] = thing.sh.numpy()[low][order, 0] * SH_BAND_0 + 0.5
     # Splats cover what is between their middles.
-    width = float(np.median(np.exp(np.sort(thing.log_scales.numpy()[low], axis=1)[:, 1])))
+    width = float(np.median(thing.breadths(low)))
     covered = distance_to(seen) <= _REACH * width / texel
     # Filled while swollen, since the rim is a sieve.
     inside = depth_inside(np.asarray(ndimage.binary_fill_holes(distance_to(seen) <= _BRIDGED))) > _BRIDGED

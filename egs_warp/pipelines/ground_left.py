@@ -33,7 +33,7 @@ def share_over_ground(nodes: np.ndarray, scene: GaussianCloud, ground: Surface, 
         return 1.0
     if len(floor) == 0:
         return 0.0
-    broad = np.exp(np.sort(scene.log_scales.numpy()[floor].astype(np.float64), axis=1)[:, 1])
+    broad = scene.breadths(floor)
     away, nearest = KDTree(means[floor, :2]).query(standing[:, :2])
     return float((away < np.maximum(2.0 * broad[nearest], _REACH * height)).mean())
 

@@ -120,8 +120,10 @@ def locate_plane(
             laid = resting_plane(cloud, beside, seen, up, degrees=tilt, size=found.size)
             if fit is None or _lean(laid, up) < _lean(seen, up) - _CLEARLY_DEGREES:
                 return _laid(cloud, spec, laid, tuple(notes))
-        degrees = f"{_lean(seen, up):.0f} degrees"
-        notes.append(f"the plane leans by {degrees} if the cameras were held upright; look at plane.png")
+        leaning = (
+            f"the plane leans by {_lean(seen, up):.0f} degrees if the cameras were held upright; look at plane.png"
+        )
+        notes.append(leaning)
     if fit is None:
         assert failure is not None
         raise failure

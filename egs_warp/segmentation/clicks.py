@@ -67,7 +67,8 @@ def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside
     if weights.sum() < 0.5 * disc.sum():
         return None
     depths = cloud.means.numpy().astype(np.float64) @ camera.rotation[2] + camera.translation[2]
-    clear = np.where(_veils(cloud, depths), 0.0, weights)
+    clear, seen = weights.copy(), np.flatnonzero(weights)
+    clear[seen[_veils(cloud, seen, depths)]] = 0.0
     weights = clear if clear.sum() > _FIRST * weights.sum() else weights
     order = np.argsort(depths, kind="stable")
     depth = float(depths[order[np.searchsorted(np.cumsum(weights[order]), _FIRST * weights.sum())]])
@@ -77,10 +78,9 @@ def click_at(cloud: GaussianCloud, camera: Camera, u: float, v: float, *, inside
     return Click(point, np.flatnonzero(hits), inside, camera, (u, v))
 
 
-def _veils(cloud: GaussianCloud, depths: np.ndarray) -> np.ndarray:
-    """(n,) bool: what is wide and faint as seen from so far away."""
-    across = np.exp(np.sort(cloud.log_scales.numpy(), axis=1)[:, 1])
-    return (across > _WIDE * depths) & (cloud.opacities() < _FAINT)
+def _veils(cloud: GaussianCloud, rows: np.ndarray, depths: np.ndarray) -> np.ndarray:
+    """(m,) bool: which of the ``rows`` (m,) of ``cloud`` are wide and faint as seen from ``depths`` (n,) of all."""
+    return (cloud.breadths(rows) > _WIDE * depths[rows]) & (cloud.opacities()[rows] < _FAINT)
 
 
 def hits_among(nodes: np.ndarray, clicks: Sequence[Click], *, inside: bool) -> np.ndarray:

@@ -127,7 +127,7 @@ def _of_size(
     object_mask = (chosen | at_foot | faint) & ~cut_off
     for click in spec.clicks:
         object_mask[click.hits] = click.inside & (scene.heights[click.hits] > 0.0) & ~cut_off[click.hits]
-    object_mask &= ~_veils(scene, object_mask, size)
+    object_mask[_veils(scene, np.flatnonzero(object_mask), size)] = False
     lowest = float(np.quantile(scene.heights[object_mask], 0.002))
     if lowest > hover * size:
         raise UserError(
@@ -148,11 +148,11 @@ def _of_size(
     return Segmentation(object_mask, buried, floaters, size)
 
 
-def _veils(scene: AbovePlane, chosen: np.ndarray, size: float) -> np.ndarray:
-    """(n,) bool: the haze in what is ``chosen`` (n,) bool."""
-    across = np.exp(np.sort(scene.cloud.log_scales.numpy(), axis=1)[:, 1])
-    wide = across > max(_VEIL * size, _USUAL * float(np.median(across[chosen])))
-    return chosen & wide & (scene.opacity < _FAINT)
+def _veils(scene: AbovePlane, thing: np.ndarray, size: float) -> np.ndarray:
+    """(k,) int: the haze among the Gaussians ``thing`` (m,)."""
+    across = scene.cloud.breadths(thing)
+    wide = across > max(_VEIL * size, _USUAL * float(np.median(across)))
+    return thing[wide & (scene.opacity[thing] < _FAINT)]
 
 
 def _body(

@@ -34,8 +34,7 @@ def resting_plane(
 
     Raises ``UserError`` where there are too few of them.
     """
-    across = np.exp(np.sort(cloud.log_scales.numpy(), axis=1)[:, 1])
-    fine = (across < _FINE * size) & (cloud.opacities() > _VISIBLE)
+    fine = (cloud.breadths() < _FINE * size) & (cloud.opacities() > _VISIBLE)
     means = cloud.means.numpy().astype(np.float64)
     flat = means @ np.stack(plane.tangents(), axis=1)
     fine &= plane.heights(means) > -_BELOW * size

@@ -9,13 +9,7 @@ from scipy.spatial.transform import Rotation
 from egs_warp.deformation.rigid import in_body_frame
 from egs_warp.geometry.body_frame import BodyFrame
 from egs_warp.geometry.gaussians import GaussianCloud
-
-
-def covariances(cloud: GaussianCloud) -> np.ndarray:
-    """(n, 3, 3)."""
-    turns = Rotation.from_quat(cloud.rotations.numpy().astype(np.float64), scalar_first=True).as_matrix()
-    scales = np.exp(cloud.log_scales.numpy().astype(np.float64))
-    return np.einsum("nij,nj,nkj->nik", turns, scales**2, turns)
+from tests.support.carrying_scenes import covariances
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
