@@ -74,6 +74,38 @@ def arithmetic_kernel(
     sum_out[i] = a + b + c + d + e + f + g + h
 
 
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    #pragma clang fp contract(fast)
+    typedef float f8 __attribute__((ext_vector_type(8)));
+    f8 chains[8];
+    for (int i = 0; i < 8; ++i) chains[i] = (f8)(float)i;
+    const f8 by = factor, one = start;
+    for (int step = 0; step < 2048; ++step)
+        for (int i = 0; i < 8; ++i) chains[i] = chains[i] * by + one;
+    f8 sum = 0.0f;
+    for (int i = 0; i < 8; ++i) sum += chains[i];
+    sum_out.data[row] = sum[0] + sum[1] + sum[2] + sum[3] + sum[4] + sum[5] + sum[6] + sum[7];
+#endif
+""")
+def vector_chains(row: wp.int32, start: wp.float32, factor: wp.float32, sum_out: wp.array[wp.float32]):
+    """``arithmetic_kernel`` in vectors of eight, as compositing on a CPU is written."""
+    ...
+
+
+@wp.kernel
+def vector_arithmetic_kernel(
+    first: wp.int32,
+    # In:
+    factor: wp.float32,
+    # Out:
+    sum_out: wp.array[wp.float32],
+):
+    """Eight independent chains of multiply and add, each on eight numbers at once: the most that one core can do."""
+    i = wp.tid() + first
+    vector_chains(i, 1.0, factor, sum_out)
+
+
 @wp.kernel
 def copy_kernel(
     # In:

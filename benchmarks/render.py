@@ -202,6 +202,7 @@ def cpu_row(points: dict[str, np.ndarray], *, seed: int, repeats: int) -> Row:
         "threads": threads,
         **times,
         "stages_by_threads": by_stage,
+        "stages": stage_rows(cloud, camera, repeats=repeats, threads=1),
         "twin": project_and_list + min(twin_times.values()),
         "difference": difference(picture, twin),
     }

@@ -18,7 +18,7 @@ from egs_warp.render.compositing import Background, composite
 from egs_warp.render.projection import ProjectedGaussians, project, view_from_camera
 from egs_warp.render.tiles import TileLists, build_tile_lists
 from harness import median_ms
-from kernels import PROBE_STEPS, arithmetic_kernel, hits_kernel
+from kernels import PROBE_STEPS, arithmetic_kernel, hits_kernel, vector_arithmetic_kernel
 
 
 def stage_rows(cloud: GaussianCloud, camera: Camera, *, repeats: int, threads: int) -> dict[str, dict[str, Any]]:
@@ -80,16 +80,18 @@ def device_limits(device: wp.Device) -> tuple[float, float]:
     target = wp.empty_like(source)
     lanes = 2**20 if device.is_cuda else 64
     sums = wp.zeros(lanes, dtype=wp.float32, device=device)
+    # A core does eight numbers at once only where it is told to.
+    kernel, width = (arithmetic_kernel, 1) if device.is_cuda else (vector_arithmetic_kernel, 8)
     times = median_ms(
         {
             "copy": lambda: wp.copy(target, source),
-            "arithmetic": lambda: wp.launch(arithmetic_kernel, lanes, inputs=[0, 0.999], outputs=[sums], device=device),
+            "arithmetic": lambda: wp.launch(kernel, lanes, inputs=[0, 0.999], outputs=[sums], device=device),
         },
         repeats=7,
         synchronise=lambda: wp.synchronize_device(device),
     )
     # Eight chains, two operations a step.
-    operations = lanes * int(PROBE_STEPS) * 8 * 2
+    operations = lanes * width * int(PROBE_STEPS) * 8 * 2
     return 2 * size / (times["copy"] * 1e-3), operations / (times["arithmetic"] * 1e-3)
 
 

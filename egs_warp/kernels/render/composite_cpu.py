@@ -1,7 +1,7 @@
 """The C++ of compositing on a CPU: one thread for a tile, eight pixels of a row at a time.
 
-Only rows and half rows inside the ellipse are visited, without branches in between, so that the compiler makes vector
-code of them; it does not of the same loop written in Warp's Python, which took about four times as long.
+Written in vectors of eight, which Clang maps to what the processor has. Which half rows of a tile an ellipse reaches is
+found for eight rows at once; those that are full are left out.
 """
 
 from egs_warp.kernels.render.ellipse import CUTOFFS_IN_CPP
@@ -9,78 +9,84 @@ from egs_warp.kernels.render.ellipse import CUTOFFS_IN_CPP
 _SHARED = f"""
     #pragma clang fp contract(fast){CUTOFFS_IN_CPP}"""
 _SHARED += """
+    typedef float f8 __attribute__((ext_vector_type(8)));
+    typedef int i8 __attribute__((ext_vector_type(8)));
+    typedef bool b8 __attribute__((ext_vector_type(8)));
+    constexpr float LOG2_E = 1.4426950408889634f;
+    // Code that is compiled at run time fetches its constants at every use, unless they are read from memory once.
+    volatile float kept[] = {-100.0f, 1.32764720e-3f, 9.67554133e-3f, 5.55071327e-2f, 2.40221197e-1f, 6.93146967e-1f,
+                             LIMIT, CUT, STOP, 0.0f, 1.0f, 2.0f, 3.0f, 4.0f, 5.0f, 6.0f, 7.0f};
+    const f8 least = kept[0], p5 = kept[1], p4 = kept[2], p3 = kept[3], p2 = kept[4], p1 = kept[5];
+    const f8 limit = kept[6], cut = kept[7], stopped = kept[8], none = kept[9], one = kept[10];
+    const f8 steps = {kept[9], kept[10], kept[11], kept[12], kept[13], kept[14], kept[15], kept[16]};
+    // 2^x for x <= 0 to 8e-8: 2^whole times the polynomial nearest to 2^part, part in [-1/2, 1/2].
+    auto power_of_two = [&](f8 x) -> f8 {
+        #pragma clang fp contract(fast)
+        const f8 t = x > least ? x : least;
+        const f8 whole = __builtin_elementwise_roundeven(t);
+        const f8 part = t - whole;
+        const f8 p = ((((p5 * part + p4) * part + p3) * part + p2) * part + p1) * part + one;
+        i8 bits;
+        __builtin_memcpy(&bits, &p, 32);
+        bits += __builtin_convertvector(whole, i8) << 23;
+        f8 power;
+        __builtin_memcpy(&power, &bits, 32);
+        return power;
+    };
+    auto bits_of = [](i8 mask) -> unsigned {
+        const b8 set = __builtin_convertvector(mask, b8);
+        unsigned char bits;
+        __builtin_memcpy(&bits, &set, 1);
+        return bits;
+    };
+    // Half rows are numbered down the left half, then down the right one; pixels by half rows. Bits: those not full.
     const int tile_width = width - left < 16 ? width - left : 16;
     const int tile_height = height - top < 16 ? height - top : 16;
-    // Pixels not yet full, by eights.
-    int open_in_half[32];
-    for (int i = 0; i < 32; ++i) {
-        const int columns = tile_width - 8 * (i & 1);
-        open_in_half[i] = (i >> 1) < tile_height && columns > 0 ? (columns < 8 ? columns : 8) : 0;
-    }
-    // e^x for x <= 0 to 2e-7: 2^whole times a polynomial for 2^part, part in (-1, 0].
-    auto exponential = [](float x) -> float {
-        #pragma clang fp contract(fast)
-        float t = x * 1.4426950408889634f;
-        t = t < -100.0f ? -100.0f : t;
-        const int whole = (int)t;
-        const float part = t - (float)whole;
-        float p = 1.5403530e-4f;
-        p = p * part + 1.3333558e-3f;
-        p = p * part + 9.6181291e-3f;
-        p = p * part + 5.5504109e-2f;
-        p = p * part + 2.4022651e-1f;
-        p = p * part + 6.9314718e-1f;
-        p = p * part + 1.0f;
-        const int bits = (whole + 127) << 23;
-        float power;
-        __builtin_memcpy(&power, &bits, 4);
-        return p * power;
-    };
+    const unsigned inside_rows = 0xFFFFu >> (16 - tile_height);
+    unsigned open = inside_rows | (tile_width > 8 ? inside_rows << 16 : 0u);
+    auto column_of = [](int i) -> int { return (i >> 7) * 8 + (i & 7); };
+    auto row_of = [](int i) -> int { return (i >> 3) & 15; };
 """
 
-_EACH_PIXEL = """
+_EACH_HALF = """
+        if (i + 8 < end) {
+            const int soon = gaussians.data[i + 8];
+            __builtin_prefetch(ellipse.data + soon);
+            __builtin_prefetch(falloff.data + soon);
+            __builtin_prefetch(colour_depth.data + soon);
+        }
         const wp::vec4 e = ellipse.data[id];
         const wp::vec2 f = falloff.data[id];
         const wp::vec4 c = colour_depth.data[id];
         const float x = e[0] - (float)left - 0.5f, y = e[1] - (float)top - 0.5f;
-        const float a = e[2], cut = f[1] + LOG_255;
-        const float reach = __builtin_sqrtf(cut / f[0]);
-        const float highest = y - reach, lowest = y + reach;
-        const int row_first = highest > 0.0f ? (int)__builtin_ceilf(highest < 16.0f ? highest : 16.0f) : 0;
-        const int row_last = lowest < (float)(tile_height - 1) ? (int)__builtin_floorf(lowest < -1.0f ? -1.0f : lowest)
-                                                               : tile_height - 1;
-        for (int row = row_first; row <= row_last; ++row) {
-            const float dy = (float)row - y;
-            const float at_row = f[1] - f[0] * dy * dy;
-            const float room = at_row + LOG_255;
-            const float half_width = __builtin_sqrtf((room > 0.0f ? room : 0.0f) / a) + 1.0e-3f;
-            const float middle = x - e[3] * dy;
-            const float leftmost = middle - half_width, rightmost = middle + half_width;
-            if (rightmost < 0.0f || leftmost > 15.0f) continue;
-            const int half_first = leftmost <= 7.0f ? 0 : 1;
-            const int half_last = rightmost >= 8.0f ? 1 : 0;
-            for (int half = half_first; half <= half_last; ++half) {
-                if (open_in_half[2 * row + half] == 0) continue;
-                const int at = row * 16 + half * 8;
-                const float origin = (float)(half * 8) - middle;
-                int closed = 0;
-                #pragma clang loop vectorize(enable)
-                for (int k = 0; k < 8; ++k) {
-                    const float u = origin + (float)k;
-                    const float raw = exponential(at_row - a * u * u);
-                    const float alpha = raw < LIMIT ? raw : LIMIT;
-                    const float before = passing[at + k];
-                    const float after = before * (1.0f - alpha);
-                    const int hit = (alpha >= CUT) & (before > 0.0f);
-                    const int stop = hit & (after <= STOP);
-"""
-
-_PIXELS_DONE = """
-                }
-                open_pixels -= closed;
-                open_in_half[2 * row + half] -= closed;
-            }
+        const float steep = e[2] * LOG2_E, over_a = 1.0f / e[2];
+        // Of each half row: where it begins, from the middle of the ellipse there. Of each row: log2 of alpha there.
+        alignas(32) float begins[32], tops[16], down[16];
+        unsigned reached = 0;
+        for (int rows = 0; rows < 16; rows += 8) {
+            const f8 dy = steps + ((float)rows - y);
+            const f8 at_row = f[1] - f[0] * dy * dy;
+            const f8 room = at_row + LOG_255;
+            const f8 reach = __builtin_elementwise_sqrt((room > none ? room : none) * over_a) + 1.0e-3f;
+            const f8 middle = x - e[3] * dy;
+            const f8 first = middle - reach, last = middle + reach;
+            const i8 level = room > -1.0e-3f;
+            reached |= bits_of(level & (first <= 7.0f) & (last >= none)) << rows;
+            reached |= bits_of(level & (first <= 15.0f) & (last >= 8.0f)) << (16 + rows);
+            *(f8*)(begins + rows) = -middle;
+            *(f8*)(begins + 16 + rows) = 8.0f - middle;
+            *(f8*)(tops + rows) = at_row * LOG2_E;
+            *(f8*)(down + rows) = dy;
         }
+        for (unsigned to_do = reached & open; to_do != 0; to_do &= to_do - 1) {
+            const int half = __builtin_ctz(to_do), at = 8 * half;
+            const f8 u = steps + begins[half];
+            const f8 raw = power_of_two(tops[half & 15] - steep * u * u);
+            const f8 alpha = raw < limit ? raw : limit;
+            const f8 before = *(f8*)(passing + at);
+            const f8 after = before * (one - alpha);
+            const i8 hit = (alpha >= cut) & (before > none);
+            const i8 stop = hit & (after <= stopped);
 """
 
 FORWARD = (
@@ -89,29 +95,27 @@ FORWARD = (
     // Transmittance; zero outside of the image, negative once a pixel is full.
     alignas(64) float passing[256], red[256], green[256], blue[256], far[256];
     for (int i = 0; i < 256; ++i) {
-        passing[i] = (i & 15) < tile_width && (i >> 4) < tile_height ? 1.0f : 0.0f;
+        passing[i] = column_of(i) < tile_width && row_of(i) < tile_height ? 1.0f : 0.0f;
         red[i] = green[i] = blue[i] = far[i] = 0.0f;
     }
-    int open_pixels = tile_width * tile_height;
-    for (int i = start; i < end && open_pixels > 0; ++i) {
+    for (int i = start; i < end && open != 0; ++i) {
         const int id = gaussians.data[i];
 """
-    + _EACH_PIXEL
+    + _EACH_HALF
     + """
-                    const float weight = (hit & !stop) ? before * alpha : 0.0f;
-                    passing[at + k] = stop ? -before : (hit ? after : before);
-                    closed += stop;
-                    red[at + k] += weight * c[0];
-                    green[at + k] += weight * c[1];
-                    blue[at + k] += weight * c[2];
-                    far[at + k] += weight * c[3];
-"""
-    + _PIXELS_DONE
-    + """
+            const f8 weight = (hit & ~stop) ? before * alpha : none;
+            const f8 left_over = stop ? -before : (hit ? after : before);
+            *(f8*)(passing + at) = left_over;
+            *(f8*)(red + at) += weight * c[0];
+            *(f8*)(green + at) += weight * c[1];
+            *(f8*)(blue + at) += weight * c[2];
+            *(f8*)(far + at) += weight * c[3];
+            if (__builtin_reduce_or(stop) && !__builtin_reduce_or(left_over > none)) open &= ~(1u << half);
+        }
     }
     for (int row = 0; row < tile_height; ++row)
         for (int column = 0; column < tile_width; ++column) {
-            const int i = row * 16 + column, pixel = (top + row) * width + left + column;
+            const int i = (column >> 3) * 128 + row * 8 + (column & 7), pixel = (top + row) * width + left + column;
             const float through = passing[i] < 0.0f ? -passing[i] : passing[i];
             const wp::vec3 behind = background.shape[0] > 0 ? background.data[pixel] : flat_background;
             colour.data[pixel] = wp::vec3(
@@ -128,8 +132,8 @@ BACKWARD = (
     + """
     alignas(64) float passing[256], rest[256], by_red[256], by_green[256], by_blue[256], by_far[256];
     for (int i = 0; i < 256; ++i) {
-        const bool inside = (i & 15) < tile_width && (i >> 4) < tile_height;
-        const int pixel = inside ? (top + (i >> 4)) * width + left + (i & 15) : 0;
+        const bool inside = column_of(i) < tile_width && row_of(i) < tile_height;
+        const int pixel = inside ? (top + row_of(i)) * width + left + column_of(i) : 0;
         const wp::vec4 g = sum_gradient.data[pixel];
         passing[i] = inside ? 1.0f : 0.0f;
         rest[i] = remaining.data[pixel];
@@ -138,47 +142,47 @@ BACKWARD = (
         by_blue[i] = g[2];
         by_far[i] = g[3];
     }
-    int open_pixels = tile_width * tile_height;
     for (int i = start; i < end; ++i) {
         float* out = (float*)moments.data + 12 * (size_t)slots.data[i];
-        if (open_pixels == 0) {
+        if (open == 0) {
             for (int q = 0; q < 12; ++q) out[q] = 0.0f;
             continue;
         }
         const int id = gaussians.data[i];
-        alignas(64) float sums[10][8] = {};
+        f8 sums[10] = {};
 """
-    + _EACH_PIXEL
+    + _EACH_HALF
     + """
-                    const int drawn = hit & !stop;
-                    const float weight = drawn ? before * alpha : 0.0f;
-                    passing[at + k] = stop ? 0.0f : (hit ? after : before);
-                    closed += stop;
-                    const float value = c[0] * by_red[at + k] + c[1] * by_green[at + k] + c[2] * by_blue[at + k]
-                                        + c[3] * by_far[at + k];
-                    const float left_over = rest[at + k] - weight * value;
-                    rest[at + k] = left_over;
-                    const float free = alpha * (before * value - left_over / (1.0f - alpha));
-                    const float slope = (drawn & (raw <= LIMIT)) ? free : 0.0f;
-                    const float moment = slope * u;
-                    sums[0][k] += slope;
-                    sums[1][k] += moment;
-                    sums[2][k] += slope * dy;
-                    sums[3][k] += moment * u;
-                    sums[4][k] += moment * dy;
-                    sums[5][k] += slope * dy * dy;
-                    sums[6][k] += weight * by_far[at + k];
-                    sums[7][k] += weight * by_red[at + k];
-                    sums[8][k] += weight * by_green[at + k];
-                    sums[9][k] += weight * by_blue[at + k];
-"""
-    + _PIXELS_DONE
-    + """
+            const i8 drawn = hit & ~stop;
+            const f8 weight = drawn ? before * alpha : none;
+            const f8 left_over = stop ? none : (hit ? after : before);
+            *(f8*)(passing + at) = left_over;
+            const f8 red = *(f8*)(by_red + at), green = *(f8*)(by_green + at), blue = *(f8*)(by_blue + at);
+            const f8 far = *(f8*)(by_far + at);
+            const f8 value = c[0] * red + c[1] * green + c[2] * blue + c[3] * far;
+            const f8 behind = *(f8*)(rest + at) - weight * value;
+            *(f8*)(rest + at) = behind;
+            const f8 free = alpha * (before * value - behind / (one - alpha));
+            const f8 slope = (drawn & (raw <= limit)) ? free : none;
+            const f8 moment = slope * u;
+            const float dy = down[half & 15];
+            sums[0] += slope;
+            sums[1] += moment;
+            sums[2] += slope * dy;
+            sums[3] += moment * u;
+            sums[4] += moment * dy;
+            sums[5] += slope * dy * dy;
+            sums[6] += weight * far;
+            sums[7] += weight * red;
+            sums[8] += weight * green;
+            sums[9] += weight * blue;
+            if (__builtin_reduce_or(stop) && !__builtin_reduce_or(left_over > none)) open &= ~(1u << half);
+        }
         for (int q = 0; q < 10; ++q) {
-            float total = 0.0f;
-            for (int k = 0; k < 8; ++k) total += sums[q][k];
+            const auto four = sums[q].lo + sums[q].hi;
+            const auto two = four.lo + four.hi;
             // Entry 7 is padding.
-            out[q + (q >= 7 ? 1 : 0)] = total;
+            out[q + (q >= 7 ? 1 : 0)] = two[0] + two[1];
         }
     }
 """

@@ -24,6 +24,32 @@ def first_slot_of(slot_end: wp.array[wp.int64], g: wp.int32) -> wp.int32:
     return slot
 
 
+AHEAD = wp.constant(12)
+"""Gaussians in depth order lie anywhere in memory: so many are asked for before their turn."""
+
+
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    __builtin_prefetch(slot_end.data + g);
+    __builtin_prefetch(ellipse.data + g);
+    __builtin_prefetch(falloff.data + g);
+#endif
+""")
+def ask_for_ellipse(slot_end: wp.array[wp.int64], ellipse: wp.array[wp.vec4], falloff: wp.array[wp.vec2], g: wp.int32):
+    """Have what ``count_tiles_kernel`` reads of Gaussian ``g`` brought to the CPU's cache."""
+    ...
+
+
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    __builtin_prefetch(slot_end.data + g);
+#endif
+""")
+def ask_for_slots(slot_end: wp.array[wp.int64], g: wp.int32):
+    """Have what ``fill_tiles_kernel`` reads of Gaussian ``g`` brought to the CPU's cache."""
+    ...
+
+
 @wp.kernel
 def count_tiles_kernel(
     first_chunk: wp.int32,
@@ -42,7 +68,9 @@ def count_tiles_kernel(
     """One thread walks one chunk of the Gaussians, from front to back, and counts them tile by tile (CPU)."""
     chunk = wp.tid() + first_chunk
     columns = (width + TILE - 1) / TILE
-    for rank in range(chunk_start[chunk], chunk_start[chunk + 1]):
+    last = chunk_start[chunk + 1] - 1
+    for rank in range(chunk_start[chunk], last + 1):
+        ask_for_ellipse(slot_end, ellipse, falloff, gaussian_from_rank[wp.min(rank + AHEAD, last)])
         g = gaussian_from_rank[rank]
         slot = first_slot_of(slot_end, g)
         e = ellipse[g]
@@ -72,7 +100,9 @@ def fill_tiles_kernel(
 ):
     """The same walk appends each Gaussian to its tiles; ``cursor_out`` begins where the chunk's part of a tile does."""
     chunk = wp.tid() + first_chunk
-    for rank in range(chunk_start[chunk], chunk_start[chunk + 1]):
+    last = chunk_start[chunk + 1] - 1
+    for rank in range(chunk_start[chunk], last + 1):
+        ask_for_slots(slot_end, gaussian_from_rank[wp.min(rank + AHEAD, last)])
         g = gaussian_from_rank[rank]
         slot = first_slot_of(slot_end, g)
         end = wp.int32(slot_end[g])
