@@ -23,7 +23,7 @@ from egs_warp.inpainting.inpainters import Inpainter
 from egs_warp.inpainting.new_floor import flat_gaussians, rim_heights, with_gloss
 from egs_warp.inpainting.patch_synthesis import PatchSynthesis
 from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, matte, rectify
-from egs_warp.inpainting.stains import stain_around
+from egs_warp.inpainting.stains import shaded, stain_around
 from egs_warp.segmentation.plane_search import near_plane
 
 _MARGIN = 0.01
@@ -138,7 +138,9 @@ def inpaint(
     junk |= _in_hole(background, window, grown, hole.bounds()[1], depth=_THICKNESS)
     kept = background.subset(~junk)
     clock.lap("rectify")
-    painted = inpainter.fill(np.where(known[..., None], before.colour, 0.0), grown, known)
+    # Where nothing was stained, nothing shades the floor, and what is dark is its own.
+    shade = shaded(grown, known, before.colour) if stained else None
+    painted = inpainter.fill(np.where(known[..., None], before.colour, 0.0), grown, known, shade)
     clock.lap("inpaint")
     new = flat_gaussians(
         window,

@@ -23,10 +23,13 @@ _BRIGHTEST = 4.0
 class Inpainter(Protocol):
     """Fills a hole in a picture of a plane seen face-on."""
 
-    def fill(self, image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> np.ndarray:
+    def fill(
+        self, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray | None = None
+    ) -> np.ndarray:
         """(H, W, 3) float32, 0 to 1, that equals ``image`` outside ``hole``.
 
-        ``image`` (H, W, 3) float32 is to be trusted where ``known`` (H, W) and not ``hole`` (H, W, both bool).
+        ``image`` (H, W, 3) float32 is to be trusted where ``known`` (H, W) and not ``hole`` (H, W, both bool); what
+        lies in the ``shade`` (H, W) bool is better not copied to places that do not.
         """
         ...
 
@@ -48,7 +51,9 @@ class OpenCvInpainter:
     radius: float = 5.0
     """Pixels around each one that are looked at."""
 
-    def fill(self, image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> np.ndarray:
+    def fill(
+        self, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray | None = None
+    ) -> np.ndarray:
         """As ``Inpainter.fill``."""
         flag = cv2.INPAINT_TELEA if self.method is OpenCvMethod.TELEA else cv2.INPAINT_NS
         missing = (hole | ~known).astype(np.uint8)
@@ -68,7 +73,9 @@ class OnnxInpainter:
 
     path: Path
 
-    def fill(self, image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> np.ndarray:
+    def fill(
+        self, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray | None = None
+    ) -> np.ndarray:
         """As ``Inpainter.fill``. Raises ``UserError`` for a file that is no such network."""
         file, network = self._load()
         picture, missing = _padded(image, hole, known)
@@ -106,7 +113,9 @@ class TorchScriptInpainter:
     device: str = "cpu"
     """Of torch."""
 
-    def fill(self, image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> np.ndarray:
+    def fill(
+        self, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray | None = None
+    ) -> np.ndarray:
         """As ``Inpainter.fill``. Raises ``UserError`` for a file that is no such network."""
         torch, network = self._load()
         picture, missing = _padded(image, hole, known)

@@ -25,8 +25,10 @@ _RIM_SMOOTHING = 3.0
 """Texels: the floor's height at the rim is taken from about this far around."""
 _OUTLIER = 2.0
 """Deviations from the tilted plane through the rim beyond which heights are clipped: cracks and blades of grass."""
-_NEIGHBOURS = 32
-"""Gaussians of the old floor that a new one takes its gloss from."""
+_NEIGHBOURS = 512
+"""Gaussians of the old floor that a new one takes its gloss from: of few at one place of the rim some are haze."""
+_GLOSS_CELL = 4.0
+"""Texels: new Gaussians nearer to each other than this have the same."""
 
 
 def rim_heights(before: RectifiedImage, hole: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -100,11 +102,14 @@ def with_gloss(new: GaussianCloud, floor: GaussianCloud, window: PlaneWindow) ->
     if coefficients == 1:
         return new
     neighbours = min(_NEIGHBOURS, floor.count)
-    distance, index = KDTree(floor.means.numpy()).query(new.means.numpy(), k=neighbours)
-    weight = 1.0 / np.maximum(np.reshape(distance, (new.count, neighbours)), window.texel)
+    in_cells = np.floor(window.pixels(new.means.numpy()) / _GLOSS_CELL)
+    cells, cell_of = np.unique(in_cells, axis=0, return_inverse=True)
+    middles = window.points(_GLOSS_CELL * (cells + 0.5))
+    distance, index = KDTree(floor.means.numpy()).query(middles, k=neighbours)
+    weight = 1.0 / np.maximum(np.reshape(distance, (len(cells), neighbours)), window.texel)
     weight /= weight.sum(axis=1, keepdims=True)
     sh = np.zeros((new.count, coefficients, 3), np.float32)
-    sh[:, 1:] = np.einsum("nk,nkcd->ncd", weight, floor.sh.numpy()[np.reshape(index, weight.shape), 1:])
+    sh[:, 1:] = np.einsum("nk,nkcd->ncd", weight, floor.sh.numpy()[np.reshape(index, weight.shape), 1:])[cell_of]
     glossy = replace(new, sh=wp.array(sh, dtype=wp.vec3, device=new.device))
     sh[:, 0] = (mean_colours(new, window.plane) - mean_colours(glossy, window.plane)) / SH_BAND_0
     return replace(new, sh=wp.array(sh, dtype=wp.vec3, device=new.device))

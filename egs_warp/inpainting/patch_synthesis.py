@@ -26,6 +26,8 @@ _STRIDES = (8, 4, 2, 1, 8, 4, 2, 1)
 """Of the neighbours that are asked in one search."""
 _TOLERANCE = 0.5
 """Patches this many times worse than the median one count 1 / e."""
+_LEAST_LIT = 0.5
+"""Share of the sources that must be left for those in the shade not to be copied from."""
 _SCREEN = 0.01
 """Pull of the voted colours against the gradients of the sources: within about 1 / sqrt of it, in pixels, they hold."""
 _STRICT_TOLERANCE = 0.25
@@ -43,10 +45,12 @@ class PatchSynthesis:
     seed: int = 0
     device: str | None = None
 
-    def fill(self, image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> np.ndarray:
+    def fill(
+        self, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray | None = None
+    ) -> np.ndarray:
         """As ``Inpainter.fill``. Raises ``UserError`` where no whole patch is known outside the hole."""
         work = None
-        wide = _with_half_turn(image, hole, known)
+        wide = _with_half_turn(image, hole, known, np.zeros_like(hole) if shade is None else shade)
         for depth, level in enumerate(reversed(_pyramid(*wide))):
             if not level.is_source.any():
                 continue
@@ -63,7 +67,7 @@ class PatchSynthesis:
                 f"inpaint: no piece of {2 * RADIUS + 1} x {2 * RADIUS + 1} texels is known around the hole;"
                 " make the hole smaller or show more of the floor"
             )
-        _, wide_hole, wide_known = wide
+        _, wide_hole, wide_known, _ = wide
         melded = meld(work.picture, wide_hole, wide_known | wide_hole, work.sources())[:, : hole.shape[1]]
         return np.where(hole[..., None], np.clip(melded, 0.0, 1.0), image).astype(np.float32)
 
@@ -76,21 +80,25 @@ class _Level:
     is_source: np.ndarray
     targets: np.ndarray
     confidence: np.ndarray
+    shade: np.ndarray
 
     @classmethod
-    def of(cls, image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> _Level:
+    def of(cls, image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray) -> _Level:
         square = np.ones((2 * RADIUS + 1, 2 * RADIUS + 1), bool)
         usable = known & ~hole
         is_source = ndimage.binary_erosion(usable, square, border_value=0)
+        lit = is_source & ~shade
+        if lit.sum() >= _LEAST_LIT * is_source.sum():
+            is_source = lit
         targets = ndimage.binary_dilation(hole, square)
         # Deep in the hole the guess counts less than what stands near its rim.
         confidence = np.where(hole, 1.3 ** -depth_inside(hole), np.where(known, 1.0, 0.0))
-        return cls(image, hole, known, is_source, targets, np.maximum(confidence, 1e-4).astype(np.float32))
+        return cls(image, hole, known, is_source, targets, np.maximum(confidence, 1e-4).astype(np.float32), shade)
 
 
-def _pyramid(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[_Level]:
+def _pyramid(image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray) -> list[_Level]:
     """Finest first; each half the size of the one before."""
-    levels = [_Level.of(image.astype(np.float32), hole, known)]
+    levels = [_Level.of(image.astype(np.float32), hole, known, shade)]
     while depth_inside(np.pad(levels[-1].hole, 1)).max() > _COARSEST_HALF_WIDTH:
         fine = levels[-1]
         size = (-(-fine.hole.shape[0] // 2), -(-fine.hole.shape[1] // 2))
@@ -100,13 +108,14 @@ def _pyramid(image: np.ndarray, hole: np.ndarray, known: np.ndarray) -> list[_Le
         coarse_hole = cv2.resize(fine.hole.astype(np.float32), size[::-1], interpolation=cv2.INTER_AREA) > 0.25
         coarse_known = (share > 0.5) & ~coarse_hole
         coarse = np.where(coarse_known[..., None], colour / np.maximum(share, 1e-3)[..., None], 0.0)
-        levels.append(_Level.of(coarse.astype(np.float32), coarse_hole, coarse_known))
+        coarse_shade = cv2.resize(fine.shade.astype(np.float32), size[::-1], interpolation=cv2.INTER_AREA) > 0.5
+        levels.append(_Level.of(coarse.astype(np.float32), coarse_hole, coarse_known, coarse_shade))
     return levels
 
 
 def _with_half_turn(
-    image: np.ndarray, hole: np.ndarray, known: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    image: np.ndarray, hole: np.ndarray, known: np.ndarray, shade: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The picture and, to copy from, the same turned by 180 degrees beside it: the like of an edge or a corner is often
     found only the other way round. A strip between the two keeps patches apart."""
 
@@ -114,7 +123,8 @@ def _with_half_turn(
         strip = np.zeros((first.shape[0], 2 * RADIUS, *first.shape[2:]), first.dtype)
         return np.concatenate([first, strip, second[::-1, ::-1]], axis=1)
 
-    return beside(image, image), beside(hole, np.zeros_like(hole)), beside(known, known & ~hole)
+    here = beside(image, image), beside(hole, np.zeros_like(hole)), beside(known, known & ~hole)
+    return *here, beside(shade, shade)
 
 
 def _start(level: _Level, shift_limit: float) -> np.ndarray:

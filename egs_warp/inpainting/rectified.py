@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import warp as wp
+from scipy import ndimage
 
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
@@ -18,6 +20,16 @@ from egs_warp.segmentation.plane_search import near_plane
 _SEEN_FROM = 40.0
 """Degrees above the plane, from all around: the directions that a floor is looked at from. Straight down, few captures
 have seen it."""
+
+_LOOKS = 8
+_FINER = 1.5
+"""Pixels a texel, of such a look."""
+_SMOOTHING = 1.0
+"""Texels: of the heights that looks from all around are laid down at."""
+_DETAIL = 4.0
+"""Texels, standard deviation of a blur: what is finer is detail."""
+_NOTHING = 1e-3
+"""Opacity."""
 
 _CAMERA_DISTANCE = 40.0
 """Of the face-on camera, in window sides: far enough that rays are parallel to 1/80, near enough for float32 depth."""
@@ -83,6 +95,24 @@ class PlaneWindow:
             near=0.5 * distance,
         )
 
+    def camera_from(self, azimuth: float, *, pixels_per_texel: float) -> Camera:
+        """A camera that sees all of the window from the side, from where floors are looked at; ``azimuth`` (radians)
+        from the first tangent to the second."""
+        first, second = self.plane.tangents()
+        elevation = np.radians(_SEEN_FROM)
+        level = np.cos(azimuth) * first + np.sin(azimuth) * second
+        distance, to_corner = self.camera_distance, np.sqrt(2.0) * self.reach
+        side = int(np.ceil(pixels_per_texel * 2.0 * to_corner / self.texel))
+        return Camera.look_at(
+            self.centre + distance * (np.cos(elevation) * level + np.sin(elevation) * self.plane.normal),
+            self.centre,
+            self.plane.normal,
+            width=side,
+            height=side,
+            vertical_fov_degrees=float(np.degrees(2.0 * np.arctan(to_corner / distance))),
+            near=0.5 * distance,
+        )
+
     @property
     def camera_distance(self) -> float:
         """Height of the face-on camera above the plane, scene units."""
@@ -126,16 +156,67 @@ def matte(cloud: GaussianCloud, plane: Plane) -> GaussianCloud:
 
 
 def rectify(cloud: GaussianCloud, window: PlaneWindow, *, thickness: float) -> RectifiedImage:
-    """Picture of the Gaussians of ``cloud`` within ``thickness`` (scene units) of the window's plane, face-on, in their
-    mean colours from all around."""
+    """Picture of the Gaussians of ``cloud`` within ``thickness`` (scene units) of the window's plane, face-on.
+
+    How high and how dense the floor is tells a look straight down. Its colours are the mean of looks from all around,
+    each laid down at that height, and the detail of one of them, that of middling contrast: from above, where no photo
+    was taken, a capture's threads and gaps lie in disorder.
+    """
     shape = (window.rows, window.columns)
     chosen = near_plane(cloud, window.plane, thickness)
     if not chosen.any():
         nothing = np.zeros(shape, np.float32)
         return RectifiedImage(np.zeros((*shape, 3), np.float32), nothing, nothing)
-    image = render_gaussians(matte(cloud.subset(chosen), window.plane), window.camera(), background=(0.0, 0.0, 0.0))
-    alpha = image.alpha.numpy()
-    seen = alpha > 1e-3
-    colour = np.where(seen[..., None], image.colour.numpy() / np.maximum(alpha, 1e-3)[..., None], 0.0)
-    height = np.where(seen, window.camera_distance - image.depth.numpy(), 0.0)
+    floor = cloud.subset(chosen)
+    above = render_gaussians(matte(floor, window.plane), window.camera(), background=(0.0, 0.0, 0.0))
+    alpha = above.alpha.numpy()
+    seen = alpha > _NOTHING
+    height = np.where(seen, window.camera_distance - above.depth.numpy(), 0.0)
+    straight = above.colour.numpy() / np.maximum(alpha, _NOTHING)[..., None]
+    colour = np.where(seen[..., None], _from_all_around(floor, window, alpha > 0.5, height, straight), 0.0)
     return RectifiedImage(np.clip(colour, 0.0, 1.0).astype(np.float32), alpha, height.astype(np.float32))
+
+
+def _from_all_around(
+    floor: GaussianCloud, window: PlaneWindow, solid: np.ndarray, height: np.ndarray, otherwise: np.ndarray
+) -> np.ndarray:
+    """(rows, columns, 3) colour of the ``floor`` at its ``height`` (rows, columns), where it is ``solid`` (rows,
+    columns); ``otherwise`` (rows, columns, 3) where no look meets it."""
+    share = np.maximum(ndimage.gaussian_filter(solid.astype(float), _SMOOTHING), _NOTHING)
+    level = ndimage.gaussian_filter(np.where(solid, height, 0.0), _SMOOTHING) / share
+    rows, columns = np.indices(solid.shape)
+    places = window.points(np.stack([columns.ravel(), rows.ravel()], axis=1) + 0.5)
+    places += level.reshape(-1, 1) * window.plane.normal
+    looks = [_look(floor, window, places, 2.0 * np.pi * number / _LOOKS) for number in range(_LOOKS)]
+    opacity = np.mean([alpha for _, alpha in looks], axis=0)
+    mean = np.mean([colour for colour, _ in looks], axis=0) / np.maximum(opacity, _NOTHING)[..., None]
+    # Their mean is blurred, for what lies higher or lower is elsewhere in each.
+    details = [_detail(colour / np.maximum(alpha, _NOTHING)[..., None], alpha * solid) for colour, alpha in looks]
+    middling = int(np.argsort([np.square(one).sum() for one in details])[_LOOKS // 2])
+    mean += details[middling] - _detail(mean, opacity * solid)
+    return np.where((opacity > _NOTHING)[..., None], mean, otherwise)
+
+
+def _detail(colour: np.ndarray, opacity: np.ndarray) -> np.ndarray:
+    """(rows, columns, 3): what is finer than ``_DETAIL`` in ``colour`` (rows, columns, 3), where its ``opacity`` (rows,
+    columns) is more than a half."""
+    dense = opacity > 0.5
+    share = np.maximum(ndimage.gaussian_filter(dense.astype(float), _DETAIL), _NOTHING)
+    broad = ndimage.gaussian_filter(colour * dense[..., None], (_DETAIL, _DETAIL, 0.0)) / share[..., None]
+    return np.where(dense[..., None], colour - broad, 0.0)
+
+
+def _look(
+    floor: GaussianCloud, window: PlaneWindow, places: np.ndarray, azimuth: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Colour times opacity (rows, columns, 3) and opacity (rows, columns) of the ``floor`` at ``places`` (rows *
+    columns, 3), looked at from ``azimuth``."""
+    camera = window.camera_from(azimuth, pixels_per_texel=_FINER)
+    image = render_gaussians(floor, camera, background=(0.0, 0.0, 0.0))
+    x, y, z = camera.rotation @ places.T + camera.translation[:, None]
+    shape = (window.rows, window.columns)
+    u = (camera.fx * x / z + camera.cx - 0.5).reshape(shape).astype(np.float32)
+    v = (camera.fy * y / z + camera.cy - 0.5).reshape(shape).astype(np.float32)
+    colour: np.ndarray = image.colour.numpy()
+    alpha: np.ndarray = image.alpha.numpy()
+    return cv2.remap(colour, u, v, cv2.INTER_CUBIC), cv2.remap(alpha, u, v, cv2.INTER_CUBIC)

@@ -18,6 +18,10 @@ _BROAD = 12.0
 """Texels: the same of what the floor is taken to look like from place to place; light changes slowly."""
 _DARKER = 0.2
 """Natural logarithm: what is less dark than this is a shade that no one minds."""
+_SHADE, _SHADE_BLUR = 0.1, 4.0
+"""Natural logarithm, and texels: what is darker than that, after such a blur, is not copied from."""
+_END = 4.0
+"""Texels from where the floor ends: no shade of what stood in the hole reaches there."""
 _UNUSUAL = 3.0
 """Standard deviations (robust) of the floor far from the hole, from place to place: a pattern is no stain."""
 _ALIKE, _COMMON = 0.1, 0.02
@@ -65,8 +69,7 @@ def _next_to(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndar
     floor = known & ~hole
     if not floor.any():
         return np.zeros_like(hole)
-    away = distance_to(hole)
-    far = floor & (away >= np.median(away[floor]))
+    far = _far(floor, hole)
     brightness = np.log(np.maximum(_blurred(colour, floor, _BLUR), _DARKEST))
     off = brightness - _carried_on(_blurred(brightness, far, _BROAD), far)
     usual = 1.4826 * np.median(np.abs(off[far]), axis=0)
@@ -79,6 +82,29 @@ def _next_to(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndar
     dark &= (like_floor < 0.5 * np.bincount(parts[dark], minlength=count + 1))[parts]
     parts, _ = connected_parts(dark | hole)
     return dark & np.isin(parts, np.unique(parts[hole]))
+
+
+def shaded(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndarray:
+    """(rows, columns) bool: the part of the ``known`` (rows, columns) floor that is darker, as a whole, than the floor
+    further from the ``hole`` (rows, columns) lets expect, though it may be no stain. What is copied from there takes
+    shadows into places that had none."""
+    floor = known & ~hole
+    if not floor.any():
+        return np.zeros_like(hole)
+    far = _far(floor, hole)
+    brightness = np.log(np.maximum(_blurred(colour, floor, _SHADE_BLUR), _DARKEST))
+    off = brightness - _carried_on(_blurred(brightness, far, _BROAD), far)
+    shade = floor & (off.mean(axis=-1) < -_SHADE)
+    # A seam or a dark plank goes on as far as the floor does.
+    parts, _ = connected_parts(shade)
+    end = distance_to(np.pad(~(known | hole), 1, constant_values=True))[1:-1, 1:-1] <= _END
+    return shade & ~np.isin(parts, np.unique(parts[shade & end]))
+
+
+def _far(floor: np.ndarray, hole: np.ndarray) -> np.ndarray:
+    """(rows, columns) bool: the half of the ``floor`` (rows, columns) that is further from the ``hole``."""
+    away = distance_to(hole)
+    return floor & (away >= np.median(away[floor]))
 
 
 def _common(colours: np.ndarray, floor: np.ndarray) -> np.ndarray:

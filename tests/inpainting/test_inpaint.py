@@ -19,7 +19,7 @@ from egs_warp.inpainting.holes import Hole, disc, footprint, unseen
 from egs_warp.inpainting.inpaint import InpaintOptions, InpaintResult, inpaint
 from egs_warp.inpainting.inpainters import OpenCvInpainter
 from egs_warp.inpainting.new_floor import rim_heights, with_gloss
-from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, mean_colours, rectify
+from egs_warp.inpainting.rectified import PlaneWindow, RectifiedImage, matte, mean_colours, rectify
 from egs_warp.io import read_capture, write_ply
 from egs_warp.io.planes import KnownPlane, write_planes
 from egs_warp.render import render_gaussians
@@ -114,8 +114,8 @@ def test_training_comes_nearer_to_what_was_painted() -> None:
 
     def run(steps: int) -> tuple[InpaintResult, float]:
         result = inpaint(damaged, hole, inpainter=OpenCvInpainter(), options=InpaintOptions(steps=steps))
-        image = rectify(result.cloud, result.window, thickness=0.05)
-        return result, float(np.abs(image.colour - result.painted)[result.hole].mean())
+        image = render_gaussians(matte(result.cloud, PLANE), result.window.camera())
+        return result, float(np.abs(image.colour.numpy() - result.painted)[result.hole].mean())
 
     (start, before), (end, after) = run(0), run(60)
     assert after < 0.7 * before
@@ -165,6 +165,24 @@ def test_window_camera_and_rectified_picture() -> None:
     assert np.std(off - off.mean(axis=(0, 1))) < 0.045
     assert image.height[5:-5, 5:-5] == pytest.approx(0.01, abs=2e-3)
     assert rectify(floor(height=0.1), window, thickness=0.09).alpha.max() == 0.0
+
+
+def test_threads_at_two_heights_keep_their_contrast() -> None:
+    """Looks from the side see bright threads before dark ones, each elsewhere: their mean alone has 0.11 of 0.23."""
+    window = PlaneWindow(PLANE, on_plane(0.0, 0.0), 0.01, 80, 80)
+    columns, rows = np.meshgrid(*[np.arange(-20.0, 100.0, 0.5) + 0.25] * 2)
+    pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    bright, count = np.floor(pixels[:, 0] / 4) % 2 == 0, len(pixels)
+    threads = GaussianCloud.from_numpy(
+        window.points(pixels) + np.where(bright, 0.02, 0.0)[:, None] * PLANE.normal,
+        np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+        np.full((count, 3), np.log(0.003)),
+        np.full(count, 4.0),
+        np.where(bright, 0.8, -0.8)[:, None, None] * np.ones((1, 1, 3)),
+    )
+    colour = rectify(threads, window, thickness=0.1).colour[10:-10, 10:-10, 0]
+    assert colour.mean(axis=0).std() > 0.14
+    assert colour.mean(axis=1).std() < 0.02
 
 
 def test_footprints_and_what_no_view_sees() -> None:

@@ -115,3 +115,22 @@ def test_nothing_to_learn_from() -> None:
     hole[:, :3] = False
     with pytest.raises(UserError, match="no piece of 7 x 7 texels is known around the hole; make the hole smaller"):
         PatchSynthesis().fill(np.zeros((40, 40, 3), np.float32), hole, ~hole)
+
+
+def test_what_lies_in_the_shade_is_not_copied():
+    """A hole with shade on one side of it: all of it may be darkened, or what is near the shade alone."""
+    rows, columns = np.indices((96, 96))
+    hole = np.hypot(rows - 48, columns - 48) < 14
+    shade = (columns < 44) & (np.abs(rows - 48) < 24) & ~hole
+    threads = 0.6 + 0.1 * np.sin(rows) * np.sin(columns)
+    image = np.repeat((threads * np.where(shade, 0.7, 1.0))[..., None], 3, axis=-1).astype(np.float32)
+    image[hole] = 0.0
+
+    def brightness(shade: np.ndarray | None) -> float:
+        filled = PatchSynthesis().fill(image, hole, ~hole, shade)
+        assert np.array_equal(filled[~hole], image[~hole])
+        return float(filled[hole].mean())
+
+    assert brightness(shade) > brightness(None) + 0.02
+    # Where nearly all is in the shade, there is nothing else to copy from.
+    assert brightness(~hole) == pytest.approx(brightness(None), abs=1e-6)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egs_warp.inpainting.stains import stain_around
+from egs_warp.inpainting.stains import shaded, stain_around
 
 SIDE = 240
 ROWS, COLUMNS = np.indices((SIDE, SIDE))
@@ -76,3 +76,17 @@ def test_what_is_larger_than_twice_the_hole_is_another_floor():
 
 def test_no_floor_has_no_stain():
     assert not stain_around(HOLE, np.zeros_like(HOLE), weave()).any()
+
+
+def test_a_faint_shadow_beside_the_hole_shades_the_floor_and_a_seam_does_not():
+    """It is no stain, but nothing that is in it may be copied."""
+    shadow = (np.abs(ROWS - SIDE / 2) < 20) & (COLUMNS > SIDE / 2) & (COLUMNS < SIDE / 2 + 50)
+    seam = np.abs(ROWS - 60) < 4
+    floor = np.where(shadow[..., None], 0.84, 1.0) * np.where(seam[..., None], 0.7, 1.0) * weave()
+    assert not stain_around(HOLE, ~HOLE, floor).any()
+    found = shaded(HOLE, ~HOLE, floor)
+    core = (np.abs(ROWS - SIDE / 2) < 14) & shadow & (COLUMNS < SIDE / 2 + 42) & ~HOLE
+    assert found[core].mean() > 0.9
+    assert not found[~(np.abs(ROWS - SIDE / 2) < 26)].any()
+    assert not found[HOLE].any()
+    assert not shaded(np.ones_like(HOLE), ~HOLE, floor).any()
