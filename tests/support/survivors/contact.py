@@ -189,7 +189,7 @@ CONTACT = [
         "kernels/contact/coulomb_equations.py",
         "newton.step[n + 1] = real(0.0)",
         "newton.step[n * 1] = real(0.0)",
-        "a contact that opens is left to the sweeps of the next attempt: of 1,720 random problems 22 stay unsolved, not 21",
+        "a contact that opens is left to the sweeps of the next attempt: of 1,720 problems 22 stay unsolved, not 21",
     ),
     Survivor(
         "kernels/contact/coulomb_equations.py",
