@@ -98,6 +98,12 @@ def test_the_limit_is_kept_and_more_qps_are_never_worse() -> None:
             last = found.objective
 
 
+def test_a_search_in_doubt_may_take_thrice_the_limit() -> None:
+    """As the docs say: some of many problems take all of it, none takes more."""
+    counts = [search(small_problem(seed, contacts=3).program, Strategy.RELAXED, limit=2).qp_count for seed in range(20)]
+    assert max(counts) == 6 and min(counts) <= 3
+
+
 def test_contact_under_given_activations_obeys_every_pair() -> None:
     """Eq. (9): for any activations there are forces, found to rounding."""
     for seed in range(10):
