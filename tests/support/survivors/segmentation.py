@@ -131,4 +131,28 @@ SEGMENTATION = [
         "count: int = 5,",
         "a default: one plane more that is looked for, the least wide one",
     ),
+    Survivor(
+        "segmentation/clicks.py",
+        "pixel: tuple[float, float] = (0.0, 0.0)",
+        "pixel: tuple[float, float] = ( -1.0, 0.0)",
+        "of a click in no picture, where nothing reads it",
+    ),
+    Survivor(
+        "segmentation/mask_model.py",
+        "whole = cv2.resize(masks[0, 0, best].astype(np.float32), (SIDE, SIDE))[:height, :width]",
+        "whole = cv2.resize(masks[ -1, 0, best].astype(np.float32), (SIDE, SIDE))[:height, :width]",
+        "there is one, or the answer is refused before",
+    ),
+    Survivor(
+        "segmentation/object_spec.py",
+        "return ~(self.object_mask | self.buried_mask | self.floater_mask)",
+        "return ~(self.object_mask | self.buried_mask ^ self.floater_mask)",
+        "no Gaussian is both buried and a floater",
+    ),
+    Survivor(
+        "segmentation/selection_masks.py",
+        "render_gaussians(painted, camera, background=(0.0, 0.0, 0.0)).colour.numpy()[..., 0] > 0.5,",
+        "render_gaussians(painted, camera, background=(0.0, 0.0, 0.0)).colour.numpy()[..., -1] > 0.5,",
+        "what is painted is grey: its three colours are the same",
+    ),
 ]
