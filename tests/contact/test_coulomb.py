@@ -117,10 +117,10 @@ def test_problems_that_take_all_iterations_have_the_same_bits_side_by_side() -> 
         free, shift = random.normal(size=3 * count), 0.1 * random.normal(size=count)
         start = np.abs(random.normal(size=(count, 3)))
         problems.append((half @ half.T + 1e-7 * np.eye(3 * count), free, shift, start))
-    given = [torch.from_numpy(np.stack(each)) for each in zip(*problems, strict=True)]
+    delassus, free, shifts, starts = (torch.from_numpy(np.stack(each)) for each in zip(*problems, strict=True))
     counts, frictions = torch.full((40,), count, dtype=torch.int32), torch.full((40,), friction, dtype=torch.float64)
-    forces, missed = coulomb_forces_of_many(counts, *given[:3], frictions, given[3])
-    alone = [coulomb_forces(*each[:3], friction, each[3]) for each in problems]
+    forces, missed = coulomb_forces_of_many(counts, delassus, free, shifts, frictions, starts)
+    alone = [coulomb_forces(matrix, u, shift, friction, start) for matrix, u, shift, start in problems]
     assert np.array_equal(forces.numpy(), np.stack([one for one, _ in alone]))
     assert missed.tolist() == [size for _, size in alone] and 5 < (missed > 1e-9).sum() < 35
 

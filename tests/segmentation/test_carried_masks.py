@@ -91,8 +91,8 @@ def test_a_mask_thrice_as_large_is_of_something_else(cameras: list[Camera], time
     """What the network marks from where the first mask was drawn, about its middle, larger by so many times."""
     cloud = balls(TONES)
     (first,) = masks_from_selection(cloud, np.arange(cloud.count) < 1500, cameras[:1])
-    rows, columns = np.indices(first.mask.shape)
-    away = np.hypot(rows - rows[first.mask].mean(), columns - columns[first.mask].mean())
+    places = np.indices(first.mask.shape).transpose(1, 2, 0)
+    away = np.linalg.norm(places - places[first.mask].mean(axis=0), axis=2)
 
     class Swollen(ByTone):
         def mask(self, picture: np.ndarray, points: np.ndarray, inside: np.ndarray) -> np.ndarray:
