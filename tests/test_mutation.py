@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from tests.support import mutants, mutation
-from tests.support.survivors import SURVIVORS, Survivor
+from tests.support.survivors import SURVIVORS
+from tests.support.survivors.survivor import Survivor
 
 pytest.importorskip("cosmic_ray", reason="cosmic-ray is part of the dev extra")
 SOURCE = """

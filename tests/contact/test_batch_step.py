@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from egs_warp.contact.batch_contacts import BatchDetector
-from egs_warp.contact.batch_step import BatchSolver
+from egs_warp.contact.batch_contacts import BatchContacts, BatchDetector
+from egs_warp.contact.batch_step import BatchResult, BatchSolver
 from egs_warp.contact.coupled_step import ContactResponse, CoupledResult, CoupledSolver
 from egs_warp.contact.detection import push_out_speeds
 from egs_warp.contact.points import ContactPoints
@@ -62,14 +62,12 @@ def solved_alone(
     return solver.solve(ContactResponse.of(tangent, contacts), tension, velocities=problem.start, forces=forces)
 
 
-@pytest.mark.parametrize("few", [False, True])
-def test_ends_are_those_of_each_alone(
-    creature: Creature, states: list[BodyState], activations: np.ndarray, few: bool
-) -> None:
-    """From the points that touch as the bodies fly on, or from a third of them, so that many join on the way:
-    velocities, points in their order, forces, and iterations."""
-    body, one = creature.body, creature.stepper.solver
-    dt, device, count = body.time_unit / 20.0, torch.device("cpu"), len(states)
+def solved_together(
+    creature: Creature, states: list[BodyState], activations: np.ndarray, dt: float, *, few: bool = False
+) -> tuple[BatchContacts, BatchContacts, BatchResult]:
+    """The contacts that are given, those of the end, and the end: from the points that touch as the bodies fly on, or
+    from a ``few``, a third of them."""
+    one, device, count = creature.stepper.solver, torch.device("cpu"), len(states)
     points = ContactPoints(creature.geometry, near=one.points.near, lower=one.points.lower)
     detector = BatchDetector(creature.geometry, points, count, device=device)
     beside = BatchSolver(
@@ -81,7 +79,7 @@ def test_ends_are_those_of_each_alone(
     positions, velocities = (
         torch.from_numpy(np.stack([getattr(state, name) for state in states])) for name in ("positions", "velocities")
     )
-    common = BatchBody(body, creature.muscles, count)
+    common = BatchBody(creature.body, creature.muscles, count)
     problem = BatchProblem.at(common, torch.arange(count), positions, velocities, dt=dt, drag=DRAG)
     begun = detector.gaps(positions)
     ends, _ = detector.gaps(problem.end_positions(velocities + dt * common.gravity))
@@ -98,6 +96,18 @@ def test_ends_are_those_of_each_alone(
         start_gaps=begun,
     )
     assert torch.equal(contacts.counts, near.sum(dim=1).int())
+    return contacts, touched, made
+
+
+@pytest.mark.parametrize("few", [False, True])
+def test_ends_are_those_of_each_alone(
+    creature: Creature, states: list[BodyState], activations: np.ndarray, few: bool
+) -> None:
+    """From the points that touch as the bodies fly on, or from a third of them, so that many join on the way:
+    velocities, points in their order, forces, and iterations."""
+    body = creature.body
+    dt = body.time_unit / 20.0
+    contacts, touched, made = solved_together(creature, states, activations, dt, few=few)
     joined = 0
     for world, (state, friction) in enumerate(zip(states, FRICTIONS, strict=True)):
         chosen = contacts.points[world, : int(contacts.counts[world])].numpy()
@@ -115,6 +125,44 @@ def test_ends_are_those_of_each_alone(
         if world < 4:
             assert forces[:, 0].sum() > 0.1 * body.weight
     assert joined > (20 if few else 3)
+
+
+def test_steps_that_hardly_converge_go_the_way_of_each_alone(creature: Creature) -> None:
+    """Crushed, thrown at the ground, torn by all muscles at odds, in steps four times too long: lengths of steps and
+    tangents are chosen as alone, so that even what has not converged when time is up is the same."""
+    body, nodes = creature.body, creature.start.positions
+    up, still, random = np.array([0.0, 0.0, 1.0]), np.zeros_like(nodes), np.random.default_rng(0)
+    states = [
+        BodyState(nodes + 0.01 * up, still - 3.0 * body.speed_unit * up),
+        BodyState(nodes * [1.0, 1.0, 0.6], still),
+        BodyState(nodes * [1.0, 1.0, 0.5] + 0.01 * up, still - body.speed_unit * np.array([1.0, 0.0, 2.0])),
+        BodyState(nodes, 2.0 * body.speed_unit * random.standard_normal(nodes.shape)),
+        BodyState(nodes + 0.05 * up, 4.0 * body.speed_unit * random.standard_normal(nodes.shape)),
+    ]
+    shape = len(states), creature.muscles.segment_count
+    activations = np.random.default_rng(0).choice([-1.0, 1.0], shape) * creature.muscles.bounds
+    dt = body.time_unit / 5.0
+    contacts, _, made = solved_together(creature, states, activations, dt)
+    for world, (state, friction) in enumerate(zip(states, FRICTIONS, strict=True)):
+        chosen = contacts.points[world, : int(contacts.counts[world])].numpy()
+        alone = solved_alone(creature, friction, StepProblem(body, state, dt, DRAG), chosen, activations[world])
+        assert (bool(made.converged[world]), int(made.iterations[world])) == (alone.converged, alone.iterations)
+        np.testing.assert_allclose(made.velocities[world].numpy(), alone.velocities, atol=1e-6 * body.speed_unit)
+    assert made.converged.any() and not made.converged.all()
+
+
+def test_a_world_that_no_tangent_helps_gives_up_at_once(creature: Creature) -> None:
+    """One whose muscles pull by no number, on the ground and in the air: in its second iteration, after a tangent of
+    its own; the others go on."""
+    nodes = creature.start.positions
+    still, up = np.zeros_like(nodes), np.array([0.0, 0.0, 1.0])
+    states = [BodyState(nodes + (world > 1) * up, still) for world in range(4)]
+    states.append(states[0])
+    activations = np.zeros((5, creature.muscles.segment_count))
+    activations[[1, 3]] = np.nan
+    _, _, made = solved_together(creature, states, activations, creature.body.time_unit / 20.0)
+    assert made.converged.tolist() == [True, False, True, False, True] and not made.lost.any()
+    assert made.iterations[[1, 3]].tolist() == [2, 2]
 
 
 def test_shifts_let_nothing_deeper_and_bring_out_what_is_too_deep(creature: Creature, states: list[BodyState]) -> None:

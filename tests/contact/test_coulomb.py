@@ -108,6 +108,23 @@ def test_problems_side_by_side_have_the_bits_of_each_alone() -> None:
         assert np.array_equal(forces[world, count:].numpy(), starts[world, count:])
 
 
+def test_problems_that_take_all_iterations_have_the_same_bits_side_by_side() -> None:
+    """20 points that move as 30 unknowns do, and cling: some are not solved, after as many steps as alone."""
+    count, friction, problems = 20, 1.5, []
+    for seed in range(40):
+        random = np.random.default_rng(seed)
+        half = random.normal(size=(3 * count, 30))
+        free, shift = random.normal(size=3 * count), 0.1 * random.normal(size=count)
+        start = np.abs(random.normal(size=(count, 3)))
+        problems.append((half @ half.T + 1e-7 * np.eye(3 * count), free, shift, start))
+    delassus, free, shifts, starts = (torch.from_numpy(np.stack(each)) for each in zip(*problems, strict=True))
+    counts, frictions = torch.full((40,), count, dtype=torch.int32), torch.full((40,), friction, dtype=torch.float64)
+    forces, missed = coulomb_forces_of_many(counts, delassus, free, shifts, frictions, starts)
+    alone = [coulomb_forces(matrix, u, shift, friction, start) for matrix, u, shift, start in problems]
+    assert np.array_equal(forces.numpy(), np.stack([one for one, _ in alone]))
+    assert missed.tolist() == [size for _, size in alone] and 5 < (missed > 1e-9).sum() < 35
+
+
 def test_many_points_under_a_soft_base_are_solved_from_rest() -> None:
     """25 points that move as 12 unknowns do, made unique as a step makes them, pressed, pushed and turned: their
     equations hold, and no force is large.

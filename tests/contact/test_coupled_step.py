@@ -14,7 +14,8 @@ from egs_warp.contact import coupled_step
 from egs_warp.contact.coupled_step import ContactResponse, CoupledResult
 from egs_warp.contact.detection import ContactDetector
 from egs_warp.fem.body import BodyState, SoftBody, make_body
-from egs_warp.fem.step_problem import StepProblem
+from egs_warp.fem.sparse_factors import SparseFactors
+from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh
 from tests.support.meshes import block_mesh
@@ -230,6 +231,26 @@ def test_points_that_would_sink_join_the_set() -> None:
     assert len(set(result.contacts.points)) == result.contacts.count
     gaps, _ = solver.detector.gaps(problem.end_positions(result.velocities))
     assert gaps.min() >= -solver.penetration_tolerance
+
+
+def test_a_tangent_that_leads_nowhere_is_made_anew() -> None:
+    """That of a body without stiffness and a billionth as heavy inverts elements however short its step: the end is the
+    one that the body's own tangent leads to, which is made once.
+    """
+    standing = block()
+    body, solver = standing.body, standing.solver
+    squashed = BodyState(body.mesh.nodes * [1.0, 1.0, 0.9], np.zeros_like(body.mesh.nodes))
+    problem = StepProblem(body, squashed, DT)
+    light, masses = SparseFactors(body.assembly.upper_pattern), np.zeros(body.assembly.upper_pattern.nnz)
+    masses[body.assembly.diagonal_entries] = 1e-9 * np.repeat(body.node_mass, 3)
+    assert light.update(masses)
+    contacts = solver.detector.contact_set(np.arange(25), squashed.positions)
+    ends = []
+    for tangent in (problem.tangent(solver.factors, problem.start, None), Tangent(problem, light)):
+        response = ContactResponse.of(tangent, contacts)
+        ends.append(solver.solve(response, None, velocities=problem.start, forces=np.zeros((25, 3))))
+    assert ends[0].converged and ends[1].converged and ends[1].tangents >= 1
+    np.testing.assert_allclose(ends[1].velocities, ends[0].velocities, atol=1e-6 * body.speed_unit)
 
 
 def test_a_response_is_the_linear_answer_of_the_step() -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from egs_warp.deformation.deformer import Deformer, deform
-from egs_warp.deformation.embedding import CageLocator, embed_gaussians
+from egs_warp.deformation.embedding import CageLocator, GaussianEmbedding, embed_gaussians
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
@@ -143,6 +143,22 @@ def test_an_affine_cage_carries_flat_splats_exactly(device: str) -> None:
     assert np.einsum("nij,nij->nj", matrices(result), carried).sum(axis=1).min() > 2.0
 
 
+def tets_of(embedding: GaussianEmbedding) -> np.ndarray:
+    """(n, 7) of the mean and of the ends of the six arms."""
+    return np.asarray(embedding.points.tets.numpy(), np.int32).reshape(-1, 7)
+
+
+def by_arms(cloud: GaussianCloud, embedding: GaussianEmbedding, positions: np.ndarray) -> np.ndarray:
+    """(n, 3, 3) Eq. (14), (F+ + F-)/2 from the carried ends of the arms, in float64."""
+    nodes = np.asarray(embedding.points.nodes.numpy(), np.int32)
+    weights = np.asarray(embedding.points.weights.numpy(), np.float64)
+    ends = np.einsum("pk,pki->pi", weights, positions[nodes]).reshape(-1, 7, 3)
+    arms = embedding.arms.numpy().astype(float)
+    plus = (ends[:, 1:4] - ends[:, :1]) / arms[:, :3, None]
+    minus = (ends[:, :1] - ends[:, 4:]) / arms[:, 3:, None]
+    return 0.5 * (plus + minus).transpose(0, 2, 1) @ matrices(cloud).transpose(0, 2, 1)
+
+
 def test_arms_go_where_their_ends_go(device: str) -> None:
     """Eq. (14): (F+ + F-)/2 from the carried ends, in float64, gives the carried covariance: for ends in the same
     tetrahedron, in the next one and beyond, where the cage is bent and shaken."""
@@ -151,16 +167,8 @@ def test_arms_go_where_their_ends_go(device: str) -> None:
     positions = bent(mesh.nodes, 1.0) + 0.02 * rng.normal(size=mesh.nodes.shape)
     embedding = embed_gaussians(cloud, mesh)
     result = deform(cloud, embedding, positions, max_stretch=1e9).cloud
-    nodes = np.asarray(embedding.points.nodes.numpy(), np.int32)
-    weights = np.asarray(embedding.points.weights.numpy(), np.float64)
-    ends = np.einsum("pk,pki->pi", weights, positions[nodes]).reshape(-1, 7, 3)
-    arms = embedding.arms.numpy().astype(float)
-    axes = matrices(cloud)
-    plus = (ends[:, 1:4] - ends[:, :1]) / arms[:, :3, None]
-    minus = (ends[:, :1] - ends[:, 4:]) / arms[:, 3:, None]
-    gradient = 0.5 * (plus + minus).transpose(0, 2, 1) @ axes.transpose(0, 2, 1)
+    gradient, tets, arms = by_arms(cloud, embedding, positions), tets_of(embedding), embedding.arms.numpy()
     sigma = gradient @ covariances(cloud) @ gradient.transpose(0, 2, 1)
-    tets = np.asarray(embedding.points.tets.numpy(), np.int32).reshape(-1, 7)
     shared = (mesh.tets[tets][:, 1:, :, None] == mesh.tets[tets][:, :1, None, :]).any(axis=3).sum(axis=2)
     assert (shared == 4).any() and (shared == 3).any() and (shared < 3).any()
     # An arm too short for a difference of float32 positions takes the middle of the two gradients instead.
@@ -168,6 +176,25 @@ def test_arms_go_where_their_ends_go(device: str) -> None:
     assert exact.mean() > 0.9
     error = np.abs(covariances(result) - sigma).max(axis=(1, 2)) / np.abs(sigma).max(axis=(1, 2))
     assert error[exact].max() < 2e-4
+
+
+def test_colour_turns_with_the_mean_of_the_arms(device: str) -> None:
+    """Eq. (15): where a Gaussian reaches into other tetrahedra it turns by the polar rotation of (F+ + F-)/2, by SciPy,
+    which is not that of the tetrahedron of its middle."""
+    mesh, cloud = box((4, 4, 4)), random_cloud(400, degree=0, scale=0.15, device=device)
+    positions = bent(mesh.nodes, 1.0) + 0.01 * np.random.default_rng(2).normal(size=mesh.nodes.shape)
+    embedding = embed_gaussians(cloud, mesh)
+    turns = Rotation.from_quat(deform(cloud, embedding, positions, max_stretch=1e9).turns.numpy(), scalar_first=True)
+    through, tets = by_arms(cloud, embedding, positions), tets_of(embedding)
+    corners, rest = (x[mesh.tets[tets[:, 0]]] for x in (positions, mesh.nodes))
+    edges, rest_edges = ((x[:, 1:] - x[:, :1]).transpose(0, 2, 1) for x in (corners, rest))
+    within = edges @ np.linalg.inv(rest_edges)
+    mean, own = (Rotation.from_matrix(u @ vt) for u, _, vt in map(np.linalg.svd, (through, within)))
+    reaching = (tets != tets[:, :1]).any(axis=1) & (embedding.arms.numpy() > 5e-3).all(axis=1)
+    reaching &= np.linalg.det(through) > 0.2
+    assert reaching.sum() > 200
+    assert (turns * mean.inv()).magnitude()[reaching].max() < 1e-3
+    assert np.median((own * mean.inv()).magnitude()[reaching]) > 0.01
 
 
 def test_bend_angle_is_the_angle_between_the_arms(device: str) -> None:
@@ -190,6 +217,26 @@ def test_bend_angle_is_the_angle_between_the_arms(device: str) -> None:
     assert measure.fit_error[0, 0] == pytest.approx(0.4**2 / (2 * radius), rel=0.1)
     assert measure.curl_degrees[0, 0] == pytest.approx(40.0, abs=1.0)
     assert deformer.measure_bend([mesh.nodes]).bend_degrees.max() < 0.05
+
+
+@pytest.mark.parametrize("along", [0, 1, 2])
+@pytest.mark.parametrize("quarters", [0, 1])
+def test_a_bend_about_any_axis_of_a_needle_is_read(device: str, along: int, quarters: int) -> None:
+    """Eq. (16): 40 degrees whichever of its axes is the long one and whichever of the others it is bent about."""
+    mesh, radius = box((24, 2, 2), (4.0, 0.4, 0.4)), 1.2 / np.radians(40.0)
+    # Axis ``along`` lies in x, the one after it in y, or in z after a quarter turn about x.
+    frame = Rotation.from_rotvec([0.5 * np.pi * quarters, 0.0, 0.0]).as_matrix() @ np.roll(np.eye(3), along, axis=1)
+    scales = np.roll([0.4, 0.02, 0.004], along)
+    cloud = GaussianCloud.from_numpy(
+        np.array([[2.0, 0.2, 0.2]]),
+        Rotation.from_matrix(frame).as_quat(scalar_first=True)[None],
+        np.log(scales)[None],
+        np.zeros(1),
+        np.zeros((1, 1, 3)),
+        device=device,
+    )
+    measure = Deformer(cloud, embed_gaussians(cloud, mesh, gamma=3.0)).measure_bend([bent(mesh.nodes, radius)])
+    assert measure.bend_degrees[0] == pytest.approx(40.0, abs=1.0)
 
 
 @settings(max_examples=40)

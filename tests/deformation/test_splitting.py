@@ -124,6 +124,20 @@ def test_where_not_all_can_be_split_the_worst_are() -> None:
     assert misfits[some].min() >= np.sort(misfits[everyone])[-8]
 
 
+def test_what_was_split_three_times_is_left() -> None:
+    """Whatever its bend; others are split once more, and count it."""
+    mesh, cloud = box((24, 2, 2), (4.0, 0.4, 0.4)), bar_cloud()
+    embedding = embed_gaussians(cloud, mesh)
+    bend = Deformer(cloud, embedding).measure_bend([bent(mesh.nodes, 1.5)])
+    everyone = np.unique(split_bent(cloud, embedding, bend).parents, return_counts=True)[1] > 1
+    depths = (np.arange(cloud.count) % 4).astype(np.int8)
+    result = split_bent(cloud, embedding, bend, depths=depths)
+    parents, counts = np.unique(result.parents, return_counts=True)
+    np.testing.assert_array_equal(counts > 1, everyone & (depths < 3))
+    grown = result.depths - depths[result.parents]
+    np.testing.assert_array_equal(grown, (counts > 1)[np.searchsorted(parents, result.parents)])
+
+
 def test_an_affine_motion_splits_nothing() -> None:
     """Eq. (16): no bend under stretch, shear and turn, and the very same arrays come back."""
     mesh, cloud = box((4, 4, 4)), random_cloud(300)

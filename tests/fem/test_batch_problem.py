@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -148,6 +150,23 @@ def test_tangents(
     again, kept = inverse_of(beside, torch.from_numpy(impulses[:, :, :1]), turning)
     assert kept is turning
     same(again, [one[:, :1] for one in expected], rel=1e-9)
+
+
+def test_tangents_of_muscles_that_are_half_slack(
+    body: SoftBody, muscles: MuscleSet, activations: np.ndarray, states: list[BodyState], alone: list[StepProblem]
+) -> None:
+    """Muscles of 0.35 to 0.65 of their length, where the share of the tension that is left falls with it: what impulses
+    bring about is as alone, and not as without muscles."""
+    half = replace(muscles, rest_lengths=muscles.rest_lengths / np.linspace(0.35, 0.65, muscles.segment_count))
+    beside, given, pulls = problem_of(BatchBody(body, half, 4), states), tried(states), np.abs(activations)
+    assert beside.factor(torch.from_numpy(given), torch.from_numpy(half.stiffness * pulls)).all()
+    impulses = np.random.default_rng(4).standard_normal((3, given_size(body), 3))
+    made, _ = inverse_of(beside, torch.from_numpy(impulses))
+    pulling = tangents(body, alone, given, [MuscleTension.of(half, one) for one in pulls])
+    expected = [one.solve(b) for one, b in zip(pulling, impulses, strict=True)]
+    same(made, expected, rel=1e-9)
+    for one, plain, b in zip(expected, tangents(body, alone, given, [None] * 3), impulses, strict=True):
+        assert np.abs(one - plain.solve(b)).max() > 1e-3 * np.abs(one).max()
 
 
 def given_size(body: SoftBody) -> int:

@@ -79,8 +79,14 @@ def test_projected_hessian_clamps_each_element(device: str) -> None:
     weights = np.linalg.cholesky(assembly_gram(corners)).T
     rng = np.random.default_rng(4)
     indefinite = 0
-    for _ in range(20):
-        x = corners @ (np.diag(rng.uniform(0.3, 1.6, 3)) + 0.3 * rng.standard_normal((3, 3))).T
+    maps = [np.diag(rng.uniform(0.3, 1.6, 3)) + 0.3 * rng.standard_normal((3, 3)) for _ in range(20)]
+    for i, k in ((0, 1), (1, 2), (2, 0)):
+        # Sheared in one plane alone; blown up, most along all axes but one.
+        sheared, blown = np.diag([0.5, 0.7, 0.6]), np.diag([3.0, 2.6, 2.8])
+        sheared[i, k], blown[k, k] = 0.4, 1.1
+        maps += [sheared, blown, blown + 0.1 * rng.standard_normal((3, 3))]
+    for map_ in maps:
+        x = corners @ map_.T
         if np.linalg.det((x[1:] - x[0]).T) < 0.05:
             continue
         true = full(assembly, assembly.hessian_entries(x))

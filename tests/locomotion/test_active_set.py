@@ -92,3 +92,27 @@ def test_a_minimum_within_its_bounds_is_the_optimum() -> None:
     found = optimum_near(reduced, at - 1.0, at + 1.0, np.ones(len(at), bool), np.zeros(len(at), bool))
     assert found is not None
     assert np.allclose(found.x, np.linalg.solve(P, -q)) and not found.multipliers.any()
+
+
+@pytest.mark.parametrize(("times", "feasible"), [(0.99, True), (1.01, False)])
+def test_what_costs_a_million_times_the_gain_counts_as_no_point(times: float, feasible: bool) -> None:
+    """x_1 >= s and x_k >= x_(k-1): the nearest point to 0 is (s, ..., s), which costs n s^2 / 2, here a million by
+    ``times``; a search finds it row after row."""
+    count = 6
+    side = np.sqrt(2e6 * times / count)
+    A = np.eye(count) - np.eye(count, k=-1)
+    lower, nothing = np.r_[side, np.zeros(count - 1)], np.zeros(count, bool)
+    found = optimum_near(
+        ReducedRows.of(np.eye(count), np.zeros(count), A), lower, np.full(count, np.inf), nothing, nothing
+    )
+    assert found is not None and found.feasible == feasible
+    if feasible:
+        np.testing.assert_allclose(found.x, side, rtol=1e-6)
+
+
+def test_a_hessian_that_holds_no_number_has_no_optimum() -> None:
+    """It is no error either: whoever asked goes on without."""
+    P, q, A, lower, upper = random_program(3)
+    P[1, 1] = np.nan
+    nothing = np.zeros(len(A), bool)
+    assert optimum_near(ReducedRows.of(P, q, A), lower, upper, nothing, nothing) is None

@@ -124,6 +124,9 @@ def test_contact_velocities_that_were_not_solved_for_are_seen() -> None:
     velocities = t.velocities.copy()
     velocities[t.contact_step[0] + 1] += [0.0, 1e-3, 0.0]
     assert audit(replace(t, velocities=velocities)).contact_velocity == pytest.approx(1e-3 / np.sqrt(9.81), rel=1e-6)
+    # A point that bears nothing may move as it likes.
+    forces = np.where((t.contact_step == t.contact_step[0])[:, None], 0.0, t.contact_force)
+    assert audit(replace(t, velocities=velocities, contact_force=forces)).contact_velocity < 1e-12
 
 
 def test_lost_momenta_are_seen_where_contact_and_drag_act() -> None:

@@ -132,6 +132,30 @@ def rough(creature: Creature) -> tuple[list[BodyState], np.ndarray, float]:
     return [starts[0], creature.start, starts[1]], signs * creature.muscles.bounds, dt
 
 
+def test_a_world_goes_on_with_what_its_last_step_has_handed_on(creature: Creature, jump: Trajectory) -> None:
+    """Its contacts and their forces, of two worlds that differ in them; the step after is as alone."""
+    dt, _ = solver_steps(creature.body)
+    begun = [BodyState(jump.positions[step], jump.velocities[step]) for step in (FIRST, FIRST + 1)]
+    steppers, memories, states, expected = [], [], [], []
+    for state, friction in zip(begun, FRICTIONS, strict=False):
+        steppers.append(alone(creature, friction))
+        state, memory, _ = steppers[-1].advance_held(state, steppers[-1].initial_memory(), jump.activations[FIRST], dt)
+        states.append(state)
+        memories.append(memory)
+        expected.append(steppers[-1].advance_held(state, memory, jump.activations[FIRST + 1], dt)[2])
+    beside = BatchStepper(*parts(creature), FRICTIONS[:2])
+    state = beside.start(states, memories)
+    for world, memory in enumerate(memories):
+        count = len(memory.points)
+        assert count > 4 and int(state.counts[world]) == count
+        assert np.array_equal(state.points[world, :count].numpy(), memory.points)
+        assert np.array_equal(state.forces[world, :count].numpy(), memory.forces)
+    _, done, _ = beside.advance(state, np.stack([jump.activations[FIRST + 1]] * 2), dt)
+    (step,) = done
+    for report, (other,) in zip(step.reports(), expected, strict=True):
+        check(creature, report, other)
+
+
 def test_what_does_not_converge_is_done_in_halves_as_alone(creature: Creature) -> None:
     starts, activations, dt = rough(creature)
     expected = runs_alone(creature, starts, activations[:1], dt)

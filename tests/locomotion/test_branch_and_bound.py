@@ -56,6 +56,20 @@ def test_a_limit_is_not_called_a_proof() -> None:
     assert exact_states(program, qp_limit=1) is None
 
 
+def test_a_search_that_is_cut_short_never_promises_too_much() -> None:
+    """Wherever it ends its bound is below the optimum, and the longer it goes on the nearer it is."""
+    for seed in range(5, 9):
+        program = small_problem(seed, contacts=3).program
+        whole = exact_states(program)
+        assert whole is not None
+        bounds = []
+        for limit in range(2, whole.qp_count + 1):
+            cut = exact_states(program, starts=(whole.states,), qp_limit=limit)
+            assert cut is not None and cut.bound <= whole.objective + 1e-6
+            bounds.append(cut.bound)
+        assert (np.diff(bounds) >= -1e-6).all() and bounds[0] < whole.objective - 1e-3
+
+
 @pytest.mark.parametrize("objective", [0.0, 0.3, -4.0, 1e3])
 def test_what_a_proof_may_leave_open(objective: float) -> None:
     """A millionth of the objective, or of one where that is more."""

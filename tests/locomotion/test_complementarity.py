@@ -167,3 +167,27 @@ def test_moves_name_the_contact_that_helps() -> None:
     sliding[lam] = 1.0
     assert moves(2, sliding, np.zeros(6), f_3=0.3) == [(0.3, 0, 4 + 2)]
     assert moves(4 + 0, sliding, zeros, w_1=0.3) == [(0.3, 0, 0)]
+
+
+def test_plain_moves_go_where_a_multiplier_s_row_is_free() -> None:
+    """Of a contact whose free side is nothing, and of none whose is not: each multiplier by itself."""
+    layout = ContactLayout(0, 1, 4)
+    zeros, one = np.zeros(6), np.eye(6)
+
+    def moves(state: int, x: np.ndarray, w: np.ndarray, **rows: float) -> list[Pivot]:
+        y = np.zeros(12)
+        for name, value in rows.items():
+            y[{"f_n": 0, "f_3": 4, "c": 6, "w_1": 8, "cone": 11}[name]] = value
+        return plain_pivots(layout, np.array([state]), x, w, y)
+
+    loaded, sliding = one[0], one[0] + one[5]
+    assert moves(STATIC, zeros, zeros, c=0.5) == [(0.5, 0, SEPARATE)]
+    assert moves(STATIC, loaded, one[5], c=0.5) == []
+    assert moves(STATIC, loaded + one[3], zeros, w_1=0.3) == [(0.3, 0, 2)]
+    assert moves(SEPARATE, zeros, zeros, f_n=0.2) == [(0.2, 0, STATIC)]
+    assert moves(SEPARATE, zeros, one[0], f_n=0.2) == []
+    assert moves(2, sliding, one[1] + one[2] + one[4], cone=0.4) == []
+    assert moves(2, loaded, one[1] + one[2] + one[4], cone=0.4) == [(0.4, 0, STATIC)]
+    assert moves(2, one[5], one[1] + one[2] + one[4], c=0.4) == [(0.4, 0, SEPARATE)]
+    assert moves(2, sliding, one[1] + one[2], f_3=0.3) == [(0.3, 0, 3)]
+    assert moves(2, sliding, one[1] + one[2] + one[4], c=0.4, f_3=0.3) == []

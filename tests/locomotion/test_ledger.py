@@ -13,7 +13,7 @@ from egs_warp.fem.body import BodyState
 from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion import ledger as module
-from egs_warp.locomotion.ledger import FLOWS, STORED, Ledger, ledger
+from egs_warp.locomotion.ledger import FLOWS, STORED, EnergySums, Ledger, ledger
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.muscles.tension import MuscleTension, shares_of_tension
 from tests.support.places import DT
@@ -133,6 +133,21 @@ def test_the_work_of_a_push_is_the_kinetic_energy_that_it_gives(trajectory: Traj
     after = before + trajectory.kick_velocity[0]
     gained = 0.5 * mass @ (after**2).sum(axis=1) - 0.5 * mass @ (before**2).sum(axis=1)
     assert books.pushes[8] == pytest.approx(gained, rel=1e-10)
+
+
+def test_the_sums_of_a_run_close_and_have_its_peaks(books: Ledger) -> None:
+    """Over m g H: what is gained is what all flows bring; the peaks are those of a state, found by looking at each."""
+    sums = EnergySums.of(books)
+    assert sums.unit_joules == books.unit and set(sums.flows) == set(FLOWS)
+    assert sums.gained == pytest.approx(sum(sums.flows.values()), abs=1e-8)
+    assert abs(sums.gained) > 1e-3
+    for peak, energies in (
+        (sums.peak_elastic, books.elastic),
+        (sums.peak_deformation, books.kinetic_deformation),
+        (sums.muscle_work, [books.muscle_work.sum()]),
+    ):
+        assert peak * books.unit == pytest.approx(max(energies)) and peak > 1e-6
+    assert sums.worst_residual == books.worst < 1e-9
 
 
 def test_each_stored_energy_counts(books: Ledger) -> None:

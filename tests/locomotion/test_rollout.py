@@ -117,3 +117,22 @@ def test_a_body_that_stands_still_is_settled_in_few_steps(
     more = made.stepper.passive_step(state, made.stepper.initial_memory(), 0.25 * body.time_unit)
     assert 0.25 * body.time_unit * np.abs(more.velocities).max() < 2e-4 * body.height
     assert more.forces[:, 0].sum() == pytest.approx(body.weight, rel=0.01)
+
+
+def test_a_body_over_nothing_is_not_followed_down(made: CoarseCreature) -> None:
+    """From rest, each step of sqrt(H / g) / 4 begun without velocity lets it fall by g dt^2 = H / 16: after two of them
+    its centre has gone more than 0.1 H, and it is returned."""
+    body, geometry = made.stepper.body, made.stepper.geometry
+    (floor,) = geometry.planes
+    below = replace(geometry, planes=(replace(floor, offset=floor.offset + 100.0),))
+    state = settle(LocomotionStepper(body, made.stepper.muscles, below, device="cpu"))
+    fallen = body.centre_of_mass(state.positions) - body.centre_of_mass(body.mesh.nodes)
+    np.testing.assert_allclose(fallen, [0.0, 0.0, -body.height / 8.0], atol=1e-6)
+
+
+def test_no_frames_are_nothing_done(made: CoarseCreature) -> None:
+    """As where there are activations for less than a frame: the start alone, at no step that could not be solved."""
+    sequence = MotionSequence(made.place, motion("jump").parts(made.place.body.height))
+    done = roll_out(made.stepper, made.stepper.geometry, made.start, sequence, frames=0)
+    assert not done.stopped and done.reports == () and done.frames.tolist() == [0]
+    assert len(done.trajectory.time) == 1

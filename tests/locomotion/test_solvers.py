@@ -82,6 +82,18 @@ def test_a_program_beside_one_that_is_solved_needs_no_iterations(monkeypatch: py
         assert none.status is QpStatus.INFEASIBLE
 
 
+def test_each_splitting_is_that_of_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Operator splitting as kernels needs no OSQP; what is called osqp does."""
+    P, q, A = random_program(0)
+    lower, upper = np.r_[0.0, np.full(29, -0.1)], np.r_[0.0, np.full(29, 0.2)]
+    expected = quadratic_program(P, q, A, solver="osqp").solve(lower, upper)
+    monkeypatch.setattr(splitting, "_answer", None)
+    found = quadratic_program(P, q, A, solver="admm").solve(lower, upper)
+    assert found.status is QpStatus.SOLVED and np.abs(found.x - expected.x).max() < 1e-3
+    with pytest.raises(TypeError):
+        quadratic_program(P, q, A, solver="osqp").solve(lower, upper)
+
+
 class Doubting:
     """A splitting whose iterations end with a loose certificate, as OSQP leaves them."""
 

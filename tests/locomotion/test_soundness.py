@@ -34,6 +34,7 @@ def _spoilt(name: str, value: float, row: int = -1) -> Any:
         (_spoilt("tets", 10_000), "tets points at what is not there"),
         (_spoilt("contact_step", -1), "contact_step points at what is not there"),
         (_spoilt("muscle_segments", 10_000), "muscle_segments points at what is not there"),
+        (lambda t: _spoilt("muscle_segments", len(t.muscle_end_starts) - 1)(t), "muscle_segments points at what"),
         (_spoilt("muscle_end_starts", 1, 0), "muscle_end_starts points at what is not there"),
         (_spoilt("positions", np.nan), "positions holds what is not finite or too large"),
         (_spoilt("velocities", 1e300), "velocities holds what is not finite or too large"),

@@ -13,10 +13,12 @@ import warp as wp
 from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.errors import UserError
 from egs_warp.locomotion.complementarity import STATIC
+from egs_warp.locomotion.contact_pieces import ContactModes, search_pieces
 from egs_warp.locomotion.program import ContactProgram
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.strategies import (
+    COSTLY,
     PATIENCE,
     Foreseen,
     SearchResult,
@@ -94,6 +96,12 @@ def test_the_limit_is_kept_and_more_qps_are_never_worse() -> None:
             found = search(program, Strategy.RELAXED, limit=limit)
             assert found.qp_count <= PATIENCE * limit and found.objective <= last + 1e-9
             last = found.objective
+
+
+def test_a_search_in_doubt_may_take_thrice_the_limit() -> None:
+    """As the docs say: some of many problems take all of it, none takes more."""
+    counts = [search(small_problem(seed, contacts=3).program, Strategy.RELAXED, limit=2).qp_count for seed in range(20)]
+    assert max(counts) == 6 and min(counts) <= 3
 
 
 def test_contact_under_given_activations_obeys_every_pair() -> None:
@@ -199,3 +207,37 @@ def test_strategies_and_solvers_are_chosen_by_name() -> None:
         LocomotionSettings(strategy="nonsense")
     with pytest.raises(UserError, match="QP solver 'nonsense' is not known; give one of osqp, admm, daqp"):
         LocomotionSettings(qp_solver="nonsense")
+
+
+def test_strategies_begin_where_they_say() -> None:
+    """The paper's in the states that are foreseen, which it only betters; the static one with all static, whatever is
+    foreseen."""
+    tried = 0
+    for seed in range(40):
+        program, foreseen = small_problem(seed).program, (0, 1)
+        values = optimum_of_each(program)
+        if foreseen in values and (STATIC, STATIC) in values:
+            tried += 1
+            static = search(program, Strategy.STATIC, predicted=np.array(foreseen))
+            assert static.states.tolist() == [STATIC, STATIC] and static.qp_count == 1
+            assert static.objective == pytest.approx(values[STATIC, STATIC][0], rel=1e-6, abs=1e-6)
+            paper = search(program, Strategy.PAPER, predicted=np.array(foreseen))
+            assert paper.objective <= values[foreseen][0] + 1e-6
+    assert tried >= 3
+
+
+@pytest.mark.parametrize("bound", [None, 1.0, 0.5])
+def test_pieces_are_searched_again_only_in_doubt(bound: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where what is found is within a fifth of what no contact can undercut, or that is not known, one QP more is all;
+    else there is a second search."""
+    pieces = small_problem(3, contacts=3, directions=8, freedoms=14).pieces
+    forces = np.zeros((3, 3))
+    foreseen = Foreseen(np.zeros(3), forces, forces)
+    start = np.zeros(12)
+    once = search_pieces(pieces, start, ContactModes.of(forces, FRICTION), qp_limit=8, solver=QpSolver.DAQP)
+    assert once.objective > COSTLY
+    relaxed = None if bound is None else (np.zeros(3), bound * once.objective)
+    monkeypatch.setattr("egs_warp.locomotion.strategies.solve_relaxed", lambda *given, **options: relaxed)
+    found = search_program(pieces, Strategy.PIECES, foreseen, directions=8, qp_limit=8, solver=QpSolver.DAQP)
+    assert found.objective <= once.objective
+    assert (found.qp_count > once.qp_count + 1) == (bound == 0.5)

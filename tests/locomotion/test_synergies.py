@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from egs_warp.fem.body import make_body
+from egs_warp.fem.body import BodyState, make_body
+from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.plane import Plane
+from egs_warp.locomotion import stepper as module
 from egs_warp.locomotion.synergies import find_synergies
 from egs_warp.muscles.muscle_set import automatic_muscles
+from egs_warp.muscles.tension import MuscleTension
+from tests.support.creatures import coarse_creature
 from tests.support.meshes import block_mesh
+from tests.support.places import FORWARD
 
 
 def test_alike_are_grouped_and_few_are_left_alone() -> None:
@@ -29,3 +35,24 @@ def test_alike_are_grouped_and_few_are_left_alone() -> None:
     assert np.array_equal(found.members @ np.arange(5.0), found.group_from_muscle)
     alone = find_synergies(muscles, effects, body.node_mass, most=count)
     assert alone.count == count and np.array_equal(alone.group_from_muscle, np.arange(count))
+
+
+def test_muscles_are_grouped_by_what_they_do_in_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of sqrt(H / g) / 19: velocities whose impulse, by central differences of the equation of that step, is along the
+    pull's.
+    """
+    given = []
+    monkeypatch.setattr(module, "find_synergies", lambda *rest: given.append(rest) or find_synergies(*rest))
+    stepper = coarse_creature(block_mesh(), forward=FORWARD, settled=False).stepper
+    ((muscles, effects, _),) = given
+    body = stepper.body
+    rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
+    problem, still = StepProblem(body, rest, body.time_unit / 19.0), rest.velocities
+    alone = problem.residual(still, None)
+    for k in range(0, muscles.segment_count, 7):
+        along = effects[:, k].reshape(still.shape) * (1e-4 * body.speed_unit / np.abs(effects[:, k]).max())
+        impulse = problem.residual(along, None) - problem.residual(-along, None)
+        pull = np.eye(muscles.segment_count)[k] * muscles.bounds
+        pulled = alone - problem.residual(still, MuscleTension.of(muscles, pull))
+        cosine = (impulse * pulled).sum() / np.linalg.norm(impulse) / np.linalg.norm(pulled)
+        assert cosine == pytest.approx(1.0, abs=1e-5)

@@ -42,6 +42,18 @@ def test_a_part_of_a_trajectory_is_measured_alone(flight: Trajectory) -> None:
     assert part.airborne_frames == pytest.approx(60.0 * 7 * DT)
 
 
+def test_what_was_reached_does_not_hang_on_where_up_is(flight: Trajectory) -> None:
+    """The whole world turned: the same way, height, heading, tilt and time in the air."""
+    expected = measure(flight)
+    for vector in ([0.5 * np.pi, 0.0, 0.0], [0.0, 0.5 * np.pi, 0.0], [0.4, -1.1, 0.7]):
+        turn = Rotation.from_rotvec(vector).as_matrix()
+        names = ("positions", "velocities", "rest_positions", "gravity")
+        turned = replace(flight, **{name: getattr(flight, name) @ turn.T for name in names})
+        found = measure(turned)
+        for name in expected.__dataclass_fields__:
+            assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-9, abs=1e-5), name
+
+
 def test_tilt_is_the_angle_to_the_normal(flight: Trajectory) -> None:
     leaned = flight.positions.copy()
     leaned[-1] = leaned[-1] @ Rotation.from_rotvec([0.3, 0.0, 0.0]).as_matrix().T

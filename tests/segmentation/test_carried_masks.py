@@ -14,10 +14,18 @@ from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.io import read_capture, write_ply
 from egs_warp.io.cameras import write_cameras
 from egs_warp.pipelines.locate_plane import locate_plane
-from egs_warp.segmentation.carried_masks import _in_sight, _innermost, _well_apart, masks_of_clicks, salient_masks
+from egs_warp.segmentation.carried_masks import (
+    _carried,
+    _in_sight,
+    _innermost,
+    _well_apart,
+    masks_of_clicks,
+    salient_masks,
+)
 from egs_warp.segmentation.clicks import click_at
 from egs_warp.segmentation.mask_model import SalientModel
 from egs_warp.segmentation.object_spec import ObjectSpec
+from egs_warp.segmentation.selection_masks import masks_from_selection
 from tests.support.click_network import alike
 from tests.support.clicking import balls
 from tests.support.scenes import FLOOR
@@ -76,6 +84,22 @@ def test_a_view_that_marks_something_else_is_left_out(cameras: list[Camera]) -> 
 
     masks = masks_of_clicks(cloud, [click], cameras, OnceEverything(), count=5)
     assert len(masks) == 3 and all(0.01 < mask.mask.mean() < 0.2 for mask in masks)
+
+
+@pytest.mark.parametrize(("times", "fits"), [(2.9, True), (3.1, False)])
+def test_a_mask_thrice_as_large_is_of_something_else(cameras: list[Camera], times: float, fits: bool) -> None:
+    """What the network marks from where the first mask was drawn, about its middle, larger by so many times."""
+    cloud = balls(TONES)
+    (first,) = masks_from_selection(cloud, np.arange(cloud.count) < 1500, cameras[:1])
+    places = np.indices(first.mask.shape).transpose(1, 2, 0)
+    away = np.linalg.norm(places - places[first.mask].mean(axis=0), axis=2)
+
+    class Swollen(ByTone):
+        def mask(self, picture: np.ndarray, points: np.ndarray, inside: np.ndarray) -> np.ndarray:
+            return away <= np.partition(away.ravel(), round(times * first.mask.sum()))[round(times * first.mask.sum())]
+
+    found = _carried(cloud, [first], [], cameras[0], Swollen())
+    assert (found is not None) is fits
 
 
 def test_clicks_beside_go_along_where_they_are_in_sight(cameras: list[Camera]) -> None:

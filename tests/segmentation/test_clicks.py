@@ -9,13 +9,14 @@ import pytest
 
 from egs_warp.commands.object_flag import read_object
 from egs_warp.errors import UserError
+from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.io import read_cameras
 from egs_warp.io.cameras import write_cameras
 from egs_warp.pipelines.locate_plane import locate_plane
-from egs_warp.segmentation.above_plane import AbovePlane, hanging_parts
-from egs_warp.segmentation.clicks import click_at
+from egs_warp.segmentation.above_plane import AbovePlane, clicked_parts, hanging_parts
+from egs_warp.segmentation.clicks import Click, click_at
 from egs_warp.segmentation.object_mask import segment
 from egs_warp.segmentation.object_spec import ObjectSpec
 from tests.support.clicking import balls, click, front
@@ -44,6 +45,51 @@ def test_haze_before_what_is_clicked_on_is_not_hit() -> None:
         turns, scales = np.tile([1.0, 0.0, 0.0, 0.0], (401, 1)), np.full((401, 3), np.log(0.04))
         cloud = GaussianCloud.from_numpy(means, turns, scales, logits, np.zeros((401, 1, 3)))
         assert (400 in click(cloud, (0.0, -0.5, 0.5)).hits) is hit
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_click_is_a_disc_about_its_pixel(axis: int, sign: float) -> None:
+    """At the edge of a sheet, whichever side it lies on, more than half of the disc shows it; three pixels off the edge
+    less than half.
+    """
+    eye, up = np.array([0.0, -5.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    camera = Camera.look_at(eye, np.zeros(3), up, width=1000, height=1000)
+    pixel = 5.0 / camera.fx
+    points = level((-0.5 * pixel, -0.2), (0.2, 0.2), 0.0, 0.005)[:, [0, 2, 1] if axis == 0 else [1, 2, 0]]
+    cloud = round_ones(sign * points + 0.5 * pixel * np.array([1.0, 0.0, -1.0]), 0.003)
+    for off, hit in ((0.0, True), (-3.0, False)):
+        u, v = 500.5 + off * sign * np.array([1.0, 0.0] if axis == 0 else [0.0, -1.0])
+        assert (click_at(cloud, camera, u, v) is not None) is hit
+
+
+def test_a_click_hits_what_lies_a_little_before_and_behind() -> None:
+    """Of five discs in a row along its ray the one that most of its light comes from, and those within 3 % of the
+    distance on both sides of it.
+    """
+    camera = front()
+    steps, opacities = np.array([4.5, 4.9, 5.0, 5.1, 5.6]), np.array([0.12, 0.12, 0.6, 0.6, 0.9])
+    means = camera.centre + steps[:, None] * camera.rotation[2]
+    turns, scales = np.tile([1.0, 0.0, 0.0, 0.0], (5, 1)), np.full((5, 3), np.log(0.1))
+    cloud = GaussianCloud.from_numpy(means, turns, scales, np.log(opacities / (1.0 - opacities)), np.zeros((5, 1, 3)))
+    found = click_at(cloud, camera, camera.cx, camera.cy)
+    assert found is not None and found.hits.tolist() == [1, 2, 3]
+    assert (found.point - camera.centre) @ camera.rotation[2] == pytest.approx(5.0)
+
+
+def test_a_click_that_just_misses_means_the_nearest_part() -> None:
+    """Within a tenth of the object's size; one further off means none, one that hits what it hits most of."""
+    parts = np.repeat([0, 1, 2], [1500, 1500, 100])
+    places = [shell() - [0.7, 0.0, 0.0], shell() + [0.7, 0.0, 0.0], 0.1 * shell(100) + [0.0, 0.9, 0.0]]
+    scene, indices = AbovePlane.of(round_ones(np.concatenate(places), 0.02), FLOOR), np.arange(3100)
+
+    def meant(point: tuple[float, float, float], hits: list[int]) -> list[int]:
+        at = Click(np.array(point), np.array(hits, int))
+        return clicked_parts(indices, parts, scene, [at], 1.7).tolist()
+
+    assert meant((-0.7, -0.65, 0.5), []) == [0] and meant((0.7, -0.65, 0.5), []) == [1]
+    assert meant((0.0, 0.8, 0.1), []) == [2] and meant((0.7, -0.75, 0.5), []) == []
+    assert meant((-0.7, -0.65, 0.5), [1600, 1601, 3050]) == [1]
 
 
 @pytest.mark.parametrize("opacity, through", [(0.2, True), (0.9, False)])
@@ -111,11 +157,13 @@ def test_leaves_that_hang_in_the_air_go_along_and_what_stands_beside_does_not() 
 
 
 def test_what_hangs_in_the_air_is_held_by_what_is_near() -> None:
-    """Within two of the 64 cells across the object; further off it is on its own, as is what reaches the floor."""
+    """Within two of the 64 cells across the object; further off it is on its own, as is what reaches the floor, however
+    near.
+    """
     thing, leaf = shell(800), np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]])
     size = 1.7
     near, far = (leaf + [0.5 + gap * size, 0.0, 0.5] for gap in (1.6 / 64.0, 2.6 / 64.0))
-    low = leaf + [0.0, 0.51, 0.05]
+    low = leaf + thing[np.argmin(np.abs(thing[:, 2] - 0.05))] * [1.08, 1.08, 1.0]
     scene = AbovePlane.of(round_ones(np.concatenate([thing, near, far + [0, 0, 0.3], low]), 0.01), FLOOR)
     parts = np.repeat([0, 1, 2, 3], [800, 2, 2, 2])
     assert hanging_parts(scene, np.arange(806), parts, np.array([0]), size).tolist() == [1]

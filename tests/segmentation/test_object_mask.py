@@ -63,6 +63,23 @@ def test_shreds_of_the_floor_do_not_go_along() -> None:
     assert (truth & (cloud.means.numpy()[:, 2] > 0.05) & ~found.object_mask[: cloud.count]).sum() == 0
 
 
+def test_fine_specks_in_the_floor_s_colour_are_no_shreds_of_it() -> None:
+    """Thrice as wide as others at the foot, but less than a hundredth of the object; those of a thirtieth are."""
+    thing, floor = shell(), level((-1.0, -1.0), (1.0, 1.0), 0.0, 0.05)
+    angles = np.linspace(0.0, 5.0, 6)
+    specks = np.column_stack([0.3 * np.cos(angles), 0.3 * np.sin(angles), np.full(6, 0.09)])
+    whole = joined(joined(round_ones(thing, 0.004), round_ones(specks[:3], 0.012)), round_ones(specks[3:], 0.06))
+    whole = joined(whole, lying(floor))
+    tones = np.where(np.arange(whole.count) < 1500, -1.0, 0.0)
+    whole = GaussianCloud.from_numpy(
+        *(each.numpy() for each in (whole.means, whole.rotations, whole.log_scales, whole.opacity_logits)),
+        tones[:, None, None] + np.zeros((1, 1, 3)),
+    )
+    mine = np.arange(whole.count) < 1506
+    found = floor_shreds.wisps(module.AbovePlane.of(whole, FLOOR), mine, np.sqrt(3.0))
+    assert np.flatnonzero(found).tolist() == [1503, 1504, 1505]
+
+
 @pytest.mark.parametrize("views", [1, 3])
 def test_masks_of_one_view_or_several(views: int) -> None:
     cloud, truth = ball_on_floor()

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from egs_warp.geometry.camera import Camera, camera_rays
+from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.plane_search import (
@@ -16,6 +17,7 @@ from egs_warp.segmentation.plane_search import (
     lies_along,
     plane_under,
     plane_views,
+    refine_plane,
 )
 from tests.support.grounds import level
 from tests.support.scenes import FLOOR, lying
@@ -101,3 +103,30 @@ def test_what_lets_half_of_the_light_through_is_no_plane_to_see() -> None:
     (view,) = plane_views(faint, FLOOR, [camera], centre=np.zeros(3), radius=1.0)
     seen = (camera.centre + view.depth[..., None] * camera_rays(camera))[view.mask]
     assert seen[:, 0].min() > -0.05 and seen[:, 0].max() > 0.7
+
+
+@pytest.mark.parametrize(("given", "taken"), [(8, 8), (9, 5), (20, 7)])
+def test_of_many_cameras_at_most_eight_look(given: int, taken: int) -> None:
+    """Evenly picked; those below the plane do not count."""
+    floor = lying(level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.05))
+    above = ring_cameras(FLOOR, np.zeros(3), 1.0, count=given, elevations=(40.0,), size=32)
+    below = Camera.look_at(np.array([0.0, 1.0, -2.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]), width=32, height=32)
+    views = plane_views(floor, FLOOR, [below, *above], centre=np.zeros(3), radius=1.0)
+    assert len(views) == taken
+    steps = np.diff([next(k for k, camera in enumerate(above) if camera is view.camera) for view in views])
+    assert len(set(steps.tolist())) == 1
+
+
+def test_a_plane_is_refined_alike_in_any_unit_of_length() -> None:
+    """The floor scatters by a hundredth of what is looked at, and a step of a twentieth on one side is none of it."""
+    points = level((-1.5, -1.5), (1.5, 1.5), 0.0, 0.03)
+    points[:, 2] = np.random.default_rng(1).normal(0.0, 0.01, len(points)) + 0.05 * (points[:, 0] > 0.6)
+    fits = []
+    for scale in (1.0, 10.0):
+        cameras = ring_cameras(FLOOR, np.zeros(3), scale, count=4, elevations=(40.0,), size=64)
+        start = Plane.from_coefficients(0.01, 0.0, 1.0, 0.0)
+        fit = refine_plane(lying(points).scaled(scale), start, cameras, centre=np.zeros(3), radius=scale)
+        fits.append(fit.plane)
+    np.testing.assert_allclose(fits[1].normal, fits[0].normal, atol=1e-4)
+    assert fits[1].offset == pytest.approx(10.0 * fits[0].offset, abs=1e-3)
+    assert abs(fits[0].offset) < 0.01

@@ -60,6 +60,39 @@ def test_a_box_rests_on_its_underside(off: float) -> None:
     assert abs(float(found.heights(np.zeros(3)))) < 0.01
 
 
+@pytest.mark.parametrize("off", [-9.0, -5.0, 5.0])
+def test_the_direction_is_found_more_finely_than_by_the_first_search(off: float) -> None:
+    """Which tries directions 1.4 degrees apart."""
+    cloud = round_ones(skin_of_box(), 0.008)
+    found = resting_plane(cloud, np.ones(cloud.count, bool), FLOOR, leaning(off), degrees=10.0, size=1.3)
+    assert degrees_between(found.normal, UP) < 0.15
+
+
+@pytest.mark.parametrize("mirror", [(-1.0, 1.0, 1.0), (1.0, -1.0, 1.0)])
+def test_what_is_mirrored_rests_on_the_mirrored_plane(mirror: tuple[float, float, float]) -> None:
+    """No side is preferred, whatever the shape."""
+    for seed in range(8):
+        points = np.random.default_rng(seed).normal(size=(600, 3)) * [0.3, 0.2, 0.1] + [0.0, 0.0, 0.5]
+        found, other = (
+            resting_plane(round_ones(each, 0.005), np.ones(600, bool), FLOOR, UP, degrees=20.0, size=1.3)
+            for each in (points, points * mirror)
+        )
+        np.testing.assert_allclose(other.normal, found.normal * mirror, atol=1e-9)
+        assert other.offset == pytest.approx(found.offset, abs=1e-9)
+
+
+def test_a_mirror_image_in_a_glossy_table_carries_nothing() -> None:
+    """A box that stands on feet 0.3 high, and as many Gaussians half its size below them."""
+    skin = skin_of_box() + [0.0, 0.0, 0.3]
+    feet = np.concatenate([skin_of_box(300) * [0.1, 0.1, 0.6] + [x, y, 0.0] for x in (-0.4, 0.4) for y in (-0.2, 0.2)])
+    image = skin_of_box() * [1.0, 1.0, -1.0] - [0.0, 0.0, 0.6]
+    cloud = round_ones(np.concatenate([skin, feet, image]), 0.008)
+    thing = np.arange(cloud.count) < len(skin) + len(feet)
+    found = resting_plane(cloud, thing, FLOOR, UP, degrees=10.0, size=1.3)
+    assert degrees_between(found.normal, UP) < 0.6
+    assert abs(float(found.heights(np.zeros(3)))) < 0.01
+
+
 def test_a_direction_beyond_what_is_allowed_is_not_taken() -> None:
     cloud = round_ones(skin_of_box(), 0.008)
     found = resting_plane(cloud, np.ones(cloud.count, bool), FLOOR, leaning(8.0), degrees=5.0, size=1.3)

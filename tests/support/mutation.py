@@ -3,7 +3,7 @@
 ``python -m tests.mutation --help``. Each process has its own copy of the package and of the tests, and its own cache of
 kernels. What is found is kept in a session as it comes, so that a run that was cut off goes on where it stopped; a
 result holds as long as the changed file stays as it is. Survivors that are no gap are listed with reasons in
-``tests/support/survivors.py``. Nothing is fetched: cosmic-ray's operators and pytest are all that it takes.
+``tests/support/survivors/``. Nothing is fetched: cosmic-ray's operators and pytest are all that it takes.
 """
 
 from __future__ import annotations
