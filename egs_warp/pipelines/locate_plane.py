@@ -21,7 +21,7 @@ from egs_warp.segmentation.object_mask import TOUCHING, segment
 from egs_warp.segmentation.object_spec import ObjectSpec, Segmentation
 from egs_warp.segmentation.plane_fit import PlaneFit
 from egs_warp.segmentation.plane_search import FoundPlane, find_planes, plane_under, refine_plane
-from egs_warp.segmentation.resting_plane import resting_plane
+from egs_warp.segmentation.resting_plane import resting_plane, without_fringe
 from egs_warp.segmentation.table_top import planes_below, surface_around
 from egs_warp.segmentation.votes import votes_of_masks
 
@@ -138,7 +138,7 @@ def locate_plane(
 
 def _laid(cloud: GaussianCloud, spec: ObjectSpec, plane: Plane, notes: tuple[str, ...]) -> LocatedPlane:
     """The object on the ``plane`` that was laid under it."""
-    found = segment(cloud, plane, spec, hover=_HOVERING)
+    found = without_fringe(cloud, plane, segment(cloud, plane, spec, hover=_HOVERING))
     note = f"{_said(plane)}: laid under the object's lowest parts, as no view tells where the ground is; see plane.png"
     return LocatedPlane(plane, None, _middle(cloud, found), found.size, found, (*notes, note), in_sight=False)
 

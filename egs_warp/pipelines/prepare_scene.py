@@ -137,6 +137,8 @@ def prepare_scene(
     filled, hole = None, hole_under(cloud, located.plane, located.segmentation)
     if options.inpaint and hole is None:
         notes = (*notes, "the object hangs above the ground, which is whole under it")
+    elif options.inpaint and not located.in_sight:
+        notes = (*notes, "what is under the object was not filled, as no view tells where the ground is")
     elif options.inpaint and hole is not None:
         progress("inpaint", 0.0)
         # torch may be missing, and with it the training that inpainting ends with.

@@ -127,7 +127,11 @@ def _of_size(
     object_mask = (chosen | at_foot | faint) & ~cut_off
     for click in spec.clicks:
         object_mask[click.hits] = click.inside & (scene.heights[click.hits] > 0.0) & ~cut_off[click.hits]
-    object_mask[_veils(scene, np.flatnonzero(object_mask), size)] = False
+    veils = _veils(scene, np.flatnonzero(object_mask), size)
+    object_mask[veils] = False
+    # Haze within the object has its colours, and would be left as a ghost of it.
+    within = np.zeros_like(object_mask)
+    within[veils] = enclosed(scene.means[veils], scene.means[object_mask & scene.solid], 2.0 * size / CELLS)
     lowest = float(np.quantile(scene.heights[object_mask], 0.002))
     if lowest > hover * size:
         raise UserError(
@@ -144,7 +148,7 @@ def _of_size(
             shreds[click.hits] = False
         object_mask &= ~shreds
         halo |= shreds
-    floaters = (halo | (claimed & above)) & ~object_mask & ~buried & ~cut_off
+    floaters = (halo | within | (claimed & above)) & ~object_mask & ~buried & ~cut_off
     return Segmentation(object_mask, buried, floaters, size)
 
 

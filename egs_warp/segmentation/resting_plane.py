@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.connectivity import close_to
+from egs_warp.segmentation.object_spec import Segmentation
 
 _FINE, _VISIBLE = 0.01, 0.1
 """Of the object's size, across, and of opacity: a thing has texture, and Gaussians as small; haze about it has none."""
@@ -17,6 +20,8 @@ _BELOW = 0.25
 """Of the object's size: so far below the plane that is known to be wrong it may reach."""
 _STRAYS = 0.005
 """Share of the Gaussians that may lie below: mirror images in a glossy table, and strays."""
+_FRINGE, _FOOT, _HAZE = 0.1, 0.05, 0.1
+"""Of the object's size: what is so near to it, no higher above its plane, and no wider is a shred of it."""
 _POINTS = 4000
 """That are looked at; of more, only so many, evenly."""
 _ROUNDS, _ACROSS = 4, 15
@@ -45,6 +50,16 @@ def resting_plane(
     points = points[:: -(-len(points) // _POINTS)]
     middle = points.mean(axis=0)
     return _lowest(points - middle, up / np.linalg.norm(up), np.tan(np.radians(degrees))).moved(middle)
+
+
+def without_fringe(cloud: GaussianCloud, plane: Plane, found: Segmentation) -> Segmentation:
+    """``found``, and with what is buried the shreds of the object's foot, of its shadow and its mirror image that lie
+    about it below the ``plane`` or hardly above: no floor is there that they could be part of."""
+    means = cloud.means.numpy()
+    low = found.background_mask & (plane.heights(means) < _FOOT * found.size)
+    low &= cloud.breadths() < _HAZE * found.size
+    low[low] = close_to(means[low], means[found.object_mask], _FRINGE * found.size)
+    return replace(found, buried_mask=found.buried_mask | low)
 
 
 def _lowest(points: np.ndarray, up: np.ndarray, reach: float) -> Plane:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import warp as wp
 
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera_ring import ring_cameras
 from egs_warp.geometry.gaussians import GaussianCloud, joined
 from egs_warp.geometry.plane import Plane
 from egs_warp.pipelines.locate_plane import LocatedPlane, locate_plane, on_its_ground
+from egs_warp.pipelines.prepare_scene import SceneOptions, prepare_scene
+from egs_warp.segmentation.clearance import Clearing
 from egs_warp.segmentation.object_mask import segment
 from egs_warp.segmentation.object_spec import ObjectSpec
 from egs_warp.segmentation.resting_plane import resting_plane
@@ -120,6 +125,43 @@ def test_where_what_is_seen_is_not_level_the_plane_is_laid_under_the_object() ->
     assert abs(float(laid.plane.heights(np.zeros(3)))) < 0.01
     assert degrees_between(seen.plane.normal, leaning(3.0)) < 0.6
     assert laid.ground is None
+
+
+def test_shreds_about_a_foot_on_haze_are_dropped_and_haze_stays() -> None:
+    """Near it and low; not what lies apart, and nothing where a table is in sight."""
+    at = np.array([[0.54, 0.1, 0.04], [0.52, -0.1, 0.03], [1.6, 0.9, 0.0]])
+    shreds = round_ones(at, 0.01)
+    for degrees, dropped in ((8.0, [True, True, False]), (3.0, [False, False, False])):
+        cloud = joined(box_on_haze(degrees), shreds)
+        found = found_on(cloud)
+        assert found.in_sight is not any(dropped)
+        segmentation = found.segmentation
+        if any(dropped):
+            assert (~segmentation.background_mask[-len(at) :]).tolist() == dropped
+        sheet_of_haze = np.arange(3000, cloud.count - len(at))
+        assert segmentation.background_mask[sheet_of_haze].mean() > 0.9
+
+
+def test_haze_is_not_filled() -> None:
+    """A floor where none was seen would be a patch in the air."""
+    cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.25]), 0.9, count=8, elevations=(20.0, 50.0), size=200)
+    spec = ObjectSpec(point=np.array([0.0, 0.0, 0.45]))
+    scene = prepare_scene(
+        box_on_haze(8.0), spec, cameras=cameras, options=SceneOptions(clearing=Clearing.SPLIT), plane=None
+    )
+    assert scene.filled is None and not scene.located.in_sight
+    assert "was not filled, as no view tells" in scene.notes[-1]
+
+
+def test_haze_within_an_object_is_dropped_with_it() -> None:
+    """It is not taken along, and left behind it would be a ghost of the object."""
+    cloud, truth = ball_on_floor()
+    where = np.array([[0.0, 0.1, 0.6], [0.1, 0.0, 0.4]])
+    haze = round_ones(where, 0.2)
+    haze = replace(haze, opacity_logits=wp.array(np.full(2, -1.5, np.float32)))
+    found = segment(joined(cloud, haze), FLOOR, ObjectSpec(point=np.array([0.0, 0.0, 0.5])))
+    assert found.floater_mask[-2:].all()
+    assert found.object_mask[: cloud.count][truth].mean() > 0.95
 
 
 def test_haze_about_an_object_is_not_taken_along() -> None:
