@@ -64,6 +64,12 @@ class AbovePlane:
         """(n,) bool: within the outline, seen along the normal, of what ``chosen`` has below ``height``."""
         return enclosed(self.flat, self.flat[chosen & (self.heights < height)], size / CELLS)
 
+    def within(self, these: np.ndarray, chosen: np.ndarray, size: float) -> np.ndarray:
+        """(m,) bool: which of ``these`` (m,) lie within what is ``chosen`` (n,), which the plane closes from below."""
+        upright = np.column_stack([self.flat, self.heights])
+        skin = upright[chosen]
+        return enclosed(upright[these], np.concatenate([skin, skin * [1.0, 1.0, 0.0]]), 2.0 * size / CELLS)
+
 
 def hanging_parts(
     scene: AbovePlane, indices: np.ndarray, parts: np.ndarray, meant: np.ndarray, size: float

@@ -7,9 +7,10 @@ from __future__ import annotations
 import contextlib
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from egs_warp.errors import UserError
-from egs_warp.geometry.gaussians import GaussianCloud
+from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.geometry.height_field import HeightField
 from egs_warp.geometry.plane import Plane
 from egs_warp.segmentation.above_plane import CELLS, AbovePlane, clicked_parts, hanging_parts
@@ -44,6 +45,10 @@ _HANGING = 0.5
 _VEIL, _USUAL, _FAINT = 0.05, 4.0, 0.3
 """Of the object's size, across, times what is usual on it, and of opacity: what is wider and fainter is haze about it,
 and would go along as a halo.
+"""
+_TINGED, _ALIKE, _SKIN = 0.05, 0.15, 16
+"""Of the object's size, of full brightness in each channel, and Gaussians of the object: haze so near to it, and in
+colour so like the nearest of it, is its own.
 """
 _FOOT = 0.015
 """Of the object's size: within this height above the plane, floor and object cannot be told apart by connection."""
@@ -129,9 +134,8 @@ def _of_size(
         object_mask[click.hits] = click.inside & (scene.heights[click.hits] > 0.0) & ~cut_off[click.hits]
     veils = _veils(scene, np.flatnonzero(object_mask), size)
     object_mask[veils] = False
-    # Haze within the object has its colours, and would be left as a ghost of it.
-    within = np.zeros_like(object_mask)
-    within[veils] = enclosed(scene.means[veils], scene.means[object_mask & scene.solid], 2.0 * size / CELLS)
+    ghosts = np.zeros_like(object_mask)
+    ghosts[veils] = _of_its_own(scene, veils, object_mask & scene.solid, size)
     lowest = float(np.quantile(scene.heights[object_mask], 0.002))
     if lowest > hover * size:
         raise UserError(
@@ -148,7 +152,7 @@ def _of_size(
             shreds[click.hits] = False
         object_mask &= ~shreds
         halo |= shreds
-    floaters = (halo | within | (claimed & above)) & ~object_mask & ~buried & ~cut_off
+    floaters = (halo | ghosts | (claimed & above)) & ~object_mask & ~buried & ~cut_off
     return Segmentation(object_mask, buried, floaters, size)
 
 
@@ -157,6 +161,20 @@ def _veils(scene: AbovePlane, thing: np.ndarray, size: float) -> np.ndarray:
     across = scene.cloud.breadths(thing)
     wide = across > max(_VEIL * size, _USUAL * float(np.median(across)))
     return thing[wide & (scene.opacity[thing] < _FAINT)]
+
+
+def _of_its_own(scene: AbovePlane, veils: np.ndarray, thing: np.ndarray, size: float) -> np.ndarray:
+    """(k,) bool: which of the ``veils`` (k,) lie within the ``thing`` (n,) bool, or near to it in its colours: left
+    behind, they would be a ghost of it."""
+    own = scene.within(veils, thing, size)
+    if len(veils) == 0 or not thing.any():
+        return own
+    solid = np.flatnonzero(thing)
+    away, nearest = KDTree(scene.means[solid]).query(scene.means[veils], k=min(_SKIN, len(solid)))
+    nearest = solid[np.reshape(nearest, (len(veils), -1))]
+    colours = 0.5 + SH_BAND_0 * scene.cloud.sh.numpy()[:, 0]
+    off = np.abs(colours[veils] - colours[nearest].mean(axis=1)).max(axis=1)
+    return own | ((np.reshape(away, (len(veils), -1))[:, 0] < _TINGED * size) & (off < _ALIKE))
 
 
 def _body(

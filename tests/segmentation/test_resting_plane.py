@@ -164,6 +164,22 @@ def test_haze_within_an_object_is_dropped_with_it() -> None:
     assert found.object_mask[: cloud.count][truth].mean() > 0.95
 
 
+def test_haze_at_an_object_in_its_colour_is_dropped_with_it() -> None:
+    """What has another colour, or is further away, is of the room."""
+    cloud, _ = ball_on_floor()
+    where = np.array([[0.55, 0.0, 0.5], [0.0, 0.55, 0.5], [0.75, 0.0, 0.5]])
+    haze = round_ones(where, 0.2)
+    grey, bright = 0.0, 1.6
+    haze = replace(
+        haze,
+        opacity_logits=wp.array(np.full(3, -1.5, np.float32)),
+        sh=wp.array(np.array([grey, bright, grey])[:, None, None] * np.ones((3, 1, 3)), dtype=wp.vec3),
+    )
+    found = segment(joined(cloud, haze), FLOOR, ObjectSpec(point=np.array([0.0, 0.0, 0.5])))
+    assert found.floater_mask[-3:].tolist() == [True, False, False]
+    assert not found.object_mask[-3:].any()
+
+
 def test_haze_about_an_object_is_not_taken_along() -> None:
     cloud, truth = ball_on_floor()
     random = np.random.default_rng(4)
