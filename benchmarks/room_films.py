@@ -34,7 +34,7 @@ from egs_warp.pipelines.front import mean_view
 from egs_warp.pipelines.ground_left import ground_left
 from egs_warp.pipelines.performance import simulate
 from egs_warp.pipelines.pictures import picture_cameras, plane_picture, segmentation_picture
-from egs_warp.pipelines.prepare_scene import PreparedScene, prepare_scene, viewing_direction
+from egs_warp.pipelines.prepare_scene import PreparedScene, prepare_scene, viewing_directions
 from egs_warp.pipelines.report import GaussianCounts, report_of_run
 from egs_warp.pipelines.train_capture import train
 from egs_warp.segmentation.object_spec import ObjectSpec
@@ -110,7 +110,7 @@ def film(
             name="film",
             size=512,
             background=scene.background,
-            view_from=viewing_direction(scene, cameras),
+            view_from=viewing_directions(scene, cameras),
             quiet=True,
         )
         simulation = performance.simulation

@@ -181,7 +181,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
     from egs_warp.io.video import ffmpeg_program
     from egs_warp.pipelines.animate import animate
     from egs_warp.pipelines.front import mean_view
-    from egs_warp.pipelines.prepare_scene import SceneOptions, viewing_direction
+    from egs_warp.pipelines.prepare_scene import SceneOptions, viewing_directions
 
     shot, behind = shot_of(chosen)
     if behind is not None:
@@ -212,7 +212,7 @@ def _animate_scene(chosen: argparse.Namespace) -> tuple[Report, str]:
             plane=scene.plane,
             ground=scene.ground,
             background=scene.background,
-            view_from=view_from if view_from is not None else viewing_direction(scene, given.cameras),
+            view_from=view_from if view_from is not None else viewing_directions(scene, given.cameras),
             seen_from=mean_view(given.cameras, scene.located.centre),
             notes=(*given.notes, *scene.notes),
             **asked,

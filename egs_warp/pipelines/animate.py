@@ -148,11 +148,12 @@ def animate(
     ``push``: what hits it meanwhile (``egs_warp.motions.push``); ``beats``: those of a dance, a tempo or a file;
     ``style``: how it jumps (``egs_warp.motions.style``).
     ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
-    the object to the camera; ``shot``: how it is filmed. ``ground``, ``muscles_file``, ``solids``, ``gravity_up``,
-    ``front``, ``seen_from``, ``settings``: see ``make_creature``. Returns what it wrote as ``report.json``
-    (docs/guide/report.md). A folder belongs to one run (``egs_warp.io.run_folder``): one with an earlier run is
-    refused, or that run moved aside (``overwrite``), or gone on with if it was cut off (``resume``): with the same
-    arguments to the same bits. Raises ``UserError`` for bad input, before any file of an earlier run is touched.
+    the object to the camera, of several (n, 3) the best is chosen; ``shot``: how it is filmed. ``ground``,
+    ``muscles_file``, ``solids``, ``gravity_up``, ``front``, ``seen_from``, ``settings``: see ``make_creature``. Returns
+    what it wrote as ``report.json`` (docs/guide/report.md). A folder belongs to one run (``egs_warp.io.run_folder``):
+    one with an earlier run is refused, or that run moved aside (``overwrite``), or gone on with if it was cut off
+    (``resume``): with the same arguments to the same bits. Raises ``UserError`` for bad input, before any file of an
+    earlier run is touched.
     """
     options, shot = options or AnimateOptions(), shot or Shot()
     shot.check()
@@ -217,7 +218,7 @@ def animate(
             shot,
             up=_numbers(up),
             plane=None if plane is None else (*_numbers(plane.normal), plane.offset),
-            view_from=_numbers(view_from),
+            view_from=_numbers(view_from if view_from is None or view_from.ndim == 1 else None),
             gravity_up=_numbers(gravity_up),
             front=_numbers(front),
             push=push,

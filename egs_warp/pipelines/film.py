@@ -81,7 +81,7 @@ def draw_film(
     is ``name``.mov.
 
     ``background`` (scene units) is drawn behind the object instead of the plain floor; ``view_from`` (3,) points from
-    the object to the camera, both in the capture's frame.
+    the object to the camera, both in the capture's frame; of several (n, 3) the best is chosen.
     """
     creature, simulation = performance.creature, performance.simulation
     trajectory, shot = simulation.trajectory, shot or Shot()

@@ -84,7 +84,7 @@ class Performance:
 
     def camera(self, size: int, view_from: np.ndarray | None = None, *, scene: GaussianCloud | None = None) -> Camera:
         """A fixed camera of ``size`` pixels both ways that holds the whole motion: ahead and to the right of it, or in
-        the direction ``view_from`` (3,) of the capture's frame.
+        the direction ``view_from`` (3,) of the capture's frame; of several (n, 3), in the one nearest to that.
 
         Where the ``scene``, in the frame of the body, has much between, it goes round to the nearest clearer side.
         """
@@ -97,7 +97,9 @@ class Performance:
         distance = float(np.linalg.norm(high - low))
         direction = np.array(FILMED_FROM) if scene is None else self._clear_side(scene, middle, _NEARER * distance)
         if view_from is not None:
-            direction = ground.axes @ (self.creature.frame.axes @ np.asarray(view_from, float))
+            ways = np.atleast_2d(view_from) @ (ground.axes @ self.creature.frame.axes).T
+            ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+            direction = ways[int(np.argmax(ways[:, :2] @ FILMED_FROM[:2]))]
         direction /= np.linalg.norm(direction)
         # From above or below, the way the body faces is up in the picture.
         upwards = ground.axes[0] if abs(direction[2]) > _STEEP else ground.axes[2]

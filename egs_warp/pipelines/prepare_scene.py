@@ -216,15 +216,16 @@ def _moved(cloud: GaussianCloud, to: Callable[[np.ndarray], np.ndarray]) -> Gaus
     return replace(cloud, means=wp.array(means, dtype=wp.vec3, device=cloud.device))
 
 
-def viewing_direction(scene: PreparedScene, cameras: Sequence[Camera]) -> np.ndarray | None:
-    """(3,) from the object to where a picture is best taken: where the capture's own cameras were; None where it has
+def viewing_directions(scene: PreparedScene, cameras: Sequence[Camera]) -> np.ndarray | None:
+    """(n, 3) from the object to where a picture is best taken: where the capture's own cameras were; None where it has
     none above the plane.
 
-    Captures look best from where they were taken; of those cameras it is the one of median height.
+    Captures look best from where they were taken; of those cameras it is the half of middling height.
     """
     normal, centre = scene.plane.normal, scene.located.centre
-    away = [camera.centre - centre for camera in cameras if scene.plane.heights(camera.centre) > 0.0]
-    if not away:
+    away = np.array([one.centre - centre for one in cameras if scene.plane.heights(one.centre) > 0.0]).reshape(-1, 3)
+    if len(away) == 0:
         return None
-    sines = np.array([direction @ normal / np.linalg.norm(direction) for direction in away])
-    return away[int(np.argsort(sines)[len(sines) // 2])]
+    by_height = np.argsort(away @ normal / np.linalg.norm(away, axis=1), kind="stable")
+    quarter = len(away) // 4
+    return away[np.sort(by_height[quarter : len(away) - quarter])]

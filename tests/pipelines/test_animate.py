@@ -120,6 +120,17 @@ def test_a_film_from_straight_above_or_below(performance: Performance, side: flo
     assert performance.place.ground.axes[0] @ -camera.rotation[1] > 0.999
 
 
+def test_of_several_sides_a_film_is_taken_from_the_one_nearest_to_the_usual(performance: Performance) -> None:
+    """The usual one shows the face and the way."""
+    first, second = thing().plane.tangents()
+    around = 2.0 * np.pi * (np.arange(7)[:, None] + 0.3) / 7
+    ways = np.cos(around) * first + np.sin(around) * second + 0.5 * thing().plane.normal
+    usual = performance.camera(64).rotation[2][:2]
+    each = [performance.camera(64, way).rotation[2] for way in ways]
+    best = int(np.argmax([looking[:2] @ usual for looking in each]))
+    np.testing.assert_allclose(performance.camera(64, ways).rotation[2], each[best], atol=1e-9)
+
+
 def test_no_ffmpeg_is_told_before_anything_is_done(
     run: Callable[..., Report], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,7 +16,7 @@ from egs_warp.inpainting.inpainters import OpenCvInpainter, OpenCvMethod
 from egs_warp.io import read_capture, write_ply
 from egs_warp.io.planes import read_planes
 from egs_warp.pipelines.creature import make_creature
-from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene, viewing_direction
+from egs_warp.pipelines.prepare_scene import PreparedScene, SceneOptions, prepare_scene, viewing_directions
 from egs_warp.segmentation.clearance import Clearing
 from egs_warp.segmentation.object_spec import ObjectSpec
 from tests.support.grounds import on_folds
@@ -214,11 +214,13 @@ def test_a_scene_is_prepared_whole_and_seen_from_where_it_was_taken() -> None:
     assert options.stages == {"plane": True, "ground": True, "segment": False}
     assert prepared.background is prepared.bare
     assert any("straddled the plane: split at it" in note for note in prepared.notes)
-    cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.9, count=3, elevations=(20.0, 40.0, 60.0))
-    direction = viewing_direction(prepared, cameras)
-    assert direction is not None
-    np.testing.assert_allclose(direction, cameras[1].centre - prepared.located.centre)
-    assert viewing_direction(prepared, []) is None
+    cameras = ring_cameras(FLOOR, np.array([0.0, 0.0, 0.5]), 0.9, count=12, elevations=(20.0, 40.0, 60.0))
+    found = viewing_directions(prepared, cameras)
+    assert found is not None and len(found) == 6
+    elevations = np.degrees(np.arcsin(found[:, 2] / np.linalg.norm(found, axis=1)))
+    assert np.sort(elevations) == pytest.approx([20.0, 40.0, 40.0, 40.0, 40.0, 60.0], abs=0.2)
+    assert all(any(np.allclose(way, camera.centre - prepared.located.centre) for camera in cameras) for way in found)
+    assert viewing_directions(prepared, []) is None
 
 
 def test_what_hangs_above_the_ground_leaves_no_hole(tmp_path: Path) -> None:
