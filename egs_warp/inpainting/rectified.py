@@ -28,6 +28,8 @@ _SMOOTHING = 1.0
 """Texels: of the heights that looks from all around are laid down at."""
 _DETAIL = 4.0
 """Texels, standard deviation of a blur: what is finer is detail."""
+_BLUR, _AT_ODDS = 2.0, 0.1
+"""Texels; of full brightness: where blurred looks differ by more from their median, they see something else."""
 _NOTHING = 1e-3
 """Opacity."""
 
@@ -188,12 +190,18 @@ def _from_all_around(
     places = window.points(np.stack([columns.ravel(), rows.ravel()], axis=1) + 0.5)
     places += level.reshape(-1, 1) * window.plane.normal
     looks = [_look(floor, window, places, 2.0 * np.pi * number / _LOOKS) for number in range(_LOOKS)]
-    opacity = np.mean([alpha for _, alpha in looks], axis=0)
-    mean = np.mean([colour for colour, _ in looks], axis=0) / np.maximum(opacity, _NOTHING)[..., None]
+    colours = [colour / np.maximum(alpha, _NOTHING)[..., None] for colour, alpha in looks]
+    # Past an edge some see what lies behind it.
+    broad = np.array([ndimage.gaussian_filter(colour, (_BLUR, _BLUR, 0.0)) for colour in colours])
+    odds = np.abs(broad - np.median(broad, axis=0)).mean(axis=-1)
+    agree = np.exp(-np.square(odds / _AT_ODDS))
+    weights = agree * np.array([alpha for _, alpha in looks])
+    opacity = weights.sum(axis=0)
+    mean = np.einsum("khw,khwc->hwc", weights, np.array(colours)) / np.maximum(opacity, _NOTHING)[..., None]
     # Their mean is blurred, for what lies higher or lower is elsewhere in each.
-    details = [_detail(colour / np.maximum(alpha, _NOTHING)[..., None], alpha * solid) for colour, alpha in looks]
+    details = [_detail(one, alpha * solid) for one, (_, alpha) in zip(colours, looks, strict=True)]
     middling = int(np.argsort([np.square(one).sum() for one in details])[_LOOKS // 2])
-    mean += details[middling] - _detail(mean, opacity * solid)
+    mean += agree[middling][..., None] * (details[middling] - _detail(mean, np.minimum(opacity, 1.0) * solid))
     return np.where((opacity > _NOTHING)[..., None], mean, otherwise)
 
 
