@@ -14,8 +14,9 @@ from egs_warp.geometry.bitmaps import depth_inside, distance_to
 from egs_warp.geometry.camera import Camera, camera_rays
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
-from egs_warp.inpainting.rectified import PlaneWindow, rectify
+from egs_warp.inpainting.rectified import PlaneWindow
 from egs_warp.io.planes import HoleOutline
+from egs_warp.render import render_gaussians
 from egs_warp.segmentation.above_plane import CELLS
 from egs_warp.segmentation.connectivity import enclosed
 from egs_warp.segmentation.object_spec import Segmentation
@@ -124,7 +125,8 @@ def footprint(thing: GaussianCloud, plane: Plane) -> Hole:
     first, second = plane.tangents()
     span = max(np.ptp(means[low] @ first), np.ptp(means[low] @ second)) + 2.0 * margin
     window = _window(plane, middle, float(span))
-    covered = np.pad(rectify(thing.subset(low), window, thickness=np.inf).alpha > 0.5, _TEXELS // 2)
+    above = render_gaussians(thing.subset(low), window.camera())
+    covered = np.pad(above.alpha.numpy() > 0.5, _TEXELS // 2)
     # Feet stay apart, but a sole is whole, though its Gaussians, which nobody has seen, are a sieve.
     reach = _BRIDGED * _TEXELS
     wide = distance_to(covered) <= reach

@@ -218,7 +218,7 @@ def animate(
             shot,
             up=_numbers(up),
             plane=None if plane is None else (*_numbers(plane.normal), plane.offset),
-            view_from=_numbers(view_from if view_from is None or view_from.ndim == 1 else None),
+            view_from=_numbers(view_from if view_from is None or np.asarray(view_from).ndim == 1 else None),
             gravity_up=_numbers(gravity_up),
             front=_numbers(front),
             push=push,
