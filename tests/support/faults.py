@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import resource
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -18,13 +19,17 @@ RENAMING = ("egs_warp.io.atomic", "egs_warp.pipelines.pose_photos")
 
 @contextmanager
 def largest_file(size: int) -> Iterator[None]:
-    """As on a full disk, no file grows beyond ``size`` bytes; programs that are started inherit it."""
+    """As on a full disk, no file grows beyond ``size`` bytes; programs that are started inherit it. No bytecode is
+    kept: that of a library which is first imported meanwhile would be cut short, and stay so."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "dont_write_bytecode", True)
+        patch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def assert_one_line(said: str, reason: str) -> None:
