@@ -97,14 +97,14 @@ class PlaneWindow:
             near=0.5 * distance,
         )
 
-    def camera_from(self, azimuth: float, *, pixels_per_texel: float) -> Camera:
+    def camera_from(self, azimuth: float) -> Camera:
         """A camera that sees all of the window from the side, from where floors are looked at; ``azimuth`` (radians)
         from the first tangent to the second."""
         first, second = self.plane.tangents()
         elevation = np.radians(_SEEN_FROM)
         level = np.cos(azimuth) * first + np.sin(azimuth) * second
         distance, to_corner = self.camera_distance, np.sqrt(2.0) * self.reach
-        side = int(np.ceil(pixels_per_texel * 2.0 * to_corner / self.texel))
+        side = int(np.ceil(_FINER * 2.0 * to_corner / self.texel))
         return Camera.look_at(
             self.centre + distance * (np.cos(elevation) * level + np.sin(elevation) * self.plane.normal),
             self.centre,
@@ -219,7 +219,7 @@ def _look(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colour times opacity (rows, columns, 3) and opacity (rows, columns) of the ``floor`` at ``places`` (rows *
     columns, 3), looked at from ``azimuth``."""
-    camera = window.camera_from(azimuth, pixels_per_texel=_FINER)
+    camera = window.camera_from(azimuth)
     image = render_gaussians(floor, camera, background=(0.0, 0.0, 0.0))
     x, y, z = camera.rotation @ places.T + camera.translation[:, None]
     shape = (window.rows, window.columns)

@@ -69,9 +69,7 @@ def _next_to(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndar
     floor = known & ~hole
     if not floor.any():
         return np.zeros_like(hole)
-    far = _far(floor, hole)
-    brightness = np.log(np.maximum(_blurred(colour, floor, _BLUR), _DARKEST))
-    off = brightness - _carried_on(_blurred(brightness, far, _BROAD), far)
+    far, brightness, off = _unexpected(floor, hole, colour, _BLUR)
     usual = 1.4826 * np.median(np.abs(off[far]), axis=0)
     dark = floor & ~far & (off < -np.maximum(_DARKER, _UNUSUAL * usual)).any(axis=-1)
     if not dark.any():
@@ -91,9 +89,7 @@ def shaded(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndarra
     floor = known & ~hole
     if not floor.any():
         return np.zeros_like(hole)
-    far = _far(floor, hole)
-    brightness = np.log(np.maximum(_blurred(colour, floor, _SHADE_BLUR), _DARKEST))
-    off = brightness - _carried_on(_blurred(brightness, far, _BROAD), far)
+    _, _, off = _unexpected(floor, hole, colour, _SHADE_BLUR)
     shade = floor & (off.mean(axis=-1) < -_SHADE)
     # A seam or a dark plank goes on as far as the floor does.
     parts, _ = connected_parts(shade)
@@ -101,10 +97,16 @@ def shaded(hole: np.ndarray, known: np.ndarray, colour: np.ndarray) -> np.ndarra
     return shade & ~np.isin(parts, np.unique(parts[shade & end]))
 
 
-def _far(floor: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    """(rows, columns) bool: the half of the ``floor`` (rows, columns) that is further from the ``hole``."""
+def _unexpected(
+    floor: np.ndarray, hole: np.ndarray, colour: np.ndarray, blur: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(rows, columns) bool: the half of the ``floor`` (rows, columns) that is further from the ``hole``; (rows,
+    columns, 3) natural logarithm of the ``colour`` (rows, columns, 3) after a ``blur`` (texels); and (rows, columns, 3)
+    how much that is above what the further half lets expect."""
     away = distance_to(hole)
-    return floor & (away >= np.median(away[floor]))
+    far = floor & (away >= np.median(away[floor]))
+    brightness = np.log(np.maximum(_blurred(colour, floor, blur), _DARKEST))
+    return far, brightness, brightness - _carried_on(_blurred(brightness, far, _BROAD), far)
 
 
 def _common(colours: np.ndarray, floor: np.ndarray) -> np.ndarray:
