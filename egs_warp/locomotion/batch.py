@@ -309,17 +309,6 @@ class BatchStepper:
         velocities, shift = problem.start(), solver.shift(contacts, problem.dt)
         with stages("factor"):
             lost = ~problem.factor(velocities, None)
-        with stages("elasticity"):
-            missing = problem.residual(velocities, tensions)
-        missing = missing - problem.dt * contacts.pushes(known, velocities.shape[1])
-        with stages("substitute"):
-            moved, _ = inverse_of(problem, missing.flatten(1)[:, :, None])
-        ahead = velocities - moved.view_as(velocities)
-        taken = indices(problem.feasible(ahead) & ~lost)
-        velocities[taken] = ahead[taken]
-        if len(taken) > 0:
-            with stages("factor"):
-                lost[taken] = ~problem.kept(taken).factor(velocities[taken], None)
         response = solver.respond(problem, contacts)
         looking, forces = indices(~lost), known.clone()
         for _ in range(LOOKS):

@@ -112,7 +112,7 @@ class LocomotionStepper:
             synergies,
             geometry.friction,
             self.settings,
-            factors_on(body.assembly.device, body.assembly.upper_pattern),
+            factors_on(body.assembly.device, body.assembly.upper_pattern, single=True),
         )
 
     def with_friction(self, friction: float) -> LocomotionStepper:
@@ -271,12 +271,6 @@ class LocomotionStepper:
         shift = self.solver.shift(contacts, problem.dt)
         # What tension adds to the stiffness is left to the solve: what is foreseen serves no better with it.
         tangent = problem.tangent(self._factors, velocities, None)
-        pushes = problem.dt * contacts.pushes(known)
-        missing = problem.residual(velocities, tension).ravel() - pushes
-        ahead = velocities - tangent.solve(missing).reshape(velocities.shape)
-        if problem.feasible(ahead):
-            velocities = ahead
-            tangent = problem.tangent(self._factors, velocities, None)
         response = ContactResponse.of(tangent, contacts)
         for _ in range(LOOKS):
             free = velocities.ravel() - tangent.solve(problem.residual(velocities, tension).ravel())

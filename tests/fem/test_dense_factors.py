@@ -72,6 +72,22 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
 
 
 @pytest.mark.parametrize("device", DEVICES)
+def test_single_precision_is_told_apart_inside_alone(device: str) -> None:
+    """Doubles go in and come out, right to single precision and no further; a quadratic form is double."""
+    upper = pattern(60)
+    entries, right = entries_of(upper, 1, 30.0), np.random.default_rng(7).normal(size=(60, 40))
+    exact = SparseFactors(upper)
+    assert exact.update(entries)
+    for factors in (DenseFactors(upper, device=device, single=True), SparseFactors(upper, single=True)):
+        assert factors.update(entries)
+        for given in (right, right[:, :3], right[:, 0]):
+            got, apart = factors.solve(given), np.abs(factors.solve(given) - exact.solve(given)).max()
+            assert got.dtype == np.float64 and got.shape == given.shape and 1e-10 < apart < 1e-6
+        own = factors.give(factors.quadratic(entries, factors.take(right)))
+        assert np.abs(own - exact.quadratic(entries, right)).max() < 1e-10
+
+
+@pytest.mark.parametrize("device", DEVICES)
 def test_what_is_not_finite_has_no_factors(device: str) -> None:
     upper = pattern(20)
     factors = DenseFactors(upper, device=device)
