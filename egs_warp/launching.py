@@ -14,7 +14,7 @@ import threading
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from functools import cache
 from itertools import pairwise
@@ -242,7 +242,9 @@ def beside(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
     try:
         done = first()
     except BaseException:
-        helper.cancel()
+        # What it works with may be used again at once.
+        if not helper.cancel():
+            wait([helper])
         raise
     # One that has not begun is done here; in a forked process none ever begins.
     return done, second() if helper.cancel() else helper.result()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -168,3 +169,23 @@ def test_beside_on_one_thread_is_one_after_the_other(told: str, monkeypatch: pyt
     used = beside(threading.get_ident, lambda: (threading.get_ident(), 7))
     assert used[0] == threading.get_ident() and used[1][1] == 7
     assert told == "" or used[1][0] == used[0]
+
+
+def test_what_goes_on_beside_an_error_has_ended_when_that_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What both work with may be used again at once."""
+    monkeypatch.setenv(THREADS, "")
+    begun, ended = threading.Event(), threading.Event()
+
+    def first() -> None:
+        assert begun.wait(10.0)
+        raise ValueError("over")
+
+    def second() -> None:
+        begun.set()
+        time.sleep(0.05)
+        ended.set()
+
+    if available_threads() > 1:
+        with pytest.raises(ValueError, match="over"):
+            beside(first, second)
+        assert ended.is_set()

@@ -19,8 +19,8 @@ class SparseFactors:
     """
 
     def __init__(self, upper_pattern: sparse.csc_matrix | sparse.csc_array, *, single: bool = False) -> None:
-        """``upper_pattern``: upper triangle with the diagonal, entries in the order of ``update``. ``single``: in single
-        precision, in two thirds of the time."""
+        """``upper_pattern``: upper triangle with the diagonal, entries in the order of ``update``. ``single``: factors
+        in single precision, in two thirds of the time."""
         self._kind = np.float32 if single else np.float64
         order = sparse.csc_matrix(
             (np.arange(1.0, upper_pattern.nnz + 1.0), upper_pattern.indices, upper_pattern.indptr), upper_pattern.shape

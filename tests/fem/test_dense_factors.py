@@ -7,7 +7,7 @@ import pytest
 import scipy.sparse as sparse
 import warp as wp
 
-from egs_warp.fem.factors import factors_on
+from egs_warp.fem.factors import Factors, factors_on
 from egs_warp.fem.sparse_factors import SparseFactors
 
 pytest.importorskip("torch")
@@ -78,7 +78,8 @@ def test_single_precision_is_told_apart_inside_alone(device: str) -> None:
     entries, right = entries_of(upper, 1, 30.0), np.random.default_rng(7).normal(size=(60, 40))
     exact = SparseFactors(upper)
     assert exact.update(entries)
-    for factors in (DenseFactors(upper, device=device, single=True), SparseFactors(upper, single=True)):
+    made: list[Factors] = [DenseFactors(upper, device=device, single=True), SparseFactors(upper, single=True)]
+    for factors in made:
         assert factors.update(entries)
         for given in (right, right[:, :3], right[:, 0]):
             got, apart = factors.solve(given), np.abs(factors.solve(given) - exact.solve(given)).max()

@@ -74,8 +74,8 @@ def rate_of(contacts: Contacts, i: int, scale: real):
 
 @wp.func
 def weighted(contacts: Contacts, weights: Vec3, n: int, column: int):
-    """Of a row of the derivative in a ``column``: ``weights`` of the contact's three rows of the Delassus operator, from
-    ``n`` on."""
+    """Of a row of the derivative in a ``column``: ``weights`` of the contact's three rows of the Delassus operator,
+    from ``n`` on."""
     return (
         weights[0] * contacts.delassus[n, column]
         + weights[1] * contacts.delassus[n + 1, column]
