@@ -306,7 +306,9 @@ class BatchStepper:
         """``LocomotionStepper.foresee``: response, velocities (c, N, 3), forces (c, K, 3), and (c,) bool, for which a
         tangent had no factors."""
         solver, stages = self.solver, self._stages
-        velocities, shift = problem.start(), solver.shift(contacts, problem.dt)
+        velocities, shift = problem.velocities.clone(), solver.shift(contacts, problem.dt)
+        inverted = indices(~problem.feasible(velocities))
+        velocities[inverted] = problem.kept(inverted).start()
         with stages("factor"):
             lost = ~problem.factor(velocities, None)
         response = solver.respond(problem, contacts)
