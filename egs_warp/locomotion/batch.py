@@ -306,11 +306,20 @@ class BatchStepper:
         """``LocomotionStepper.foresee``: response, velocities (c, N, 3), forces (c, K, 3), and (c,) bool, for which a
         tangent had no factors."""
         solver, stages = self.solver, self._stages
-        velocities, shift = problem.velocities.clone(), solver.shift(contacts, problem.dt)
-        inverted = indices(~problem.feasible(velocities))
-        velocities[inverted] = problem.kept(inverted).start()
+        velocities, shift = problem.start(), solver.shift(contacts, problem.dt)
         with stages("factor"):
             lost = ~problem.factor(velocities, None)
+        with stages("elasticity"):
+            missing = problem.residual(velocities, tensions)
+        missing = missing - problem.dt * contacts.pushes(known, velocities.shape[1])
+        with stages("substitute"):
+            moved, _ = inverse_of(problem, missing.flatten(1)[:, :, None])
+        ahead = velocities - moved.view_as(velocities)
+        taken = indices(problem.feasible(ahead) & ~lost)
+        velocities[taken] = ahead[taken]
+        if len(taken) > 0:
+            with stages("factor"):
+                lost[taken] = ~problem.kept(taken).factor(velocities[taken], None)
         response = solver.respond(problem, contacts)
         looking, forces = indices(~lost), known.clone()
         for _ in range(LOOKS):

@@ -266,15 +266,17 @@ class LocomotionStepper:
         self, problem: StepProblem, contacts: ContactSet, memory: StepMemory, activations: np.ndarray
     ) -> Prospect:
         """What ``activations`` (M,) metres, those of the step before, would bring."""
-        known = self.points.matched(contacts.points, memory.points, memory.forces)
+        velocities, known = problem.start, self.points.matched(contacts.points, memory.points, memory.forces)
         tension = MuscleTension.of(self.muscles, activations)
         shift = self.solver.shift(contacts, problem.dt)
-        # About where the body would be as it goes on: stiff legs bend too far in a step for a tangent of their start.
-        velocities = problem.state.velocities
-        if not problem.feasible(velocities):
-            velocities = problem.start
         # What tension adds to the stiffness is left to the solve: what is foreseen serves no better with it.
         tangent = problem.tangent(self._factors, velocities, None)
+        pushes = problem.dt * contacts.pushes(known)
+        missing = problem.residual(velocities, tension).ravel() - pushes
+        ahead = velocities - tangent.solve(missing).reshape(velocities.shape)
+        if problem.feasible(ahead):
+            velocities = ahead
+            tangent = problem.tangent(self._factors, velocities, None)
         response = ContactResponse.of(tangent, contacts)
         for _ in range(LOOKS):
             free = velocities.ravel() - tangent.solve(problem.residual(velocities, tension).ravel())
