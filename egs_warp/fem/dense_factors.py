@@ -16,21 +16,16 @@ class DenseFactors:
     with L^-1 a fiftieth of that.
     """
 
-    def __init__(
-        self, upper_pattern: sparse.csc_matrix | sparse.csc_array, *, device: str, single: bool = False
-    ) -> None:
-        """``upper_pattern``: upper triangle with the diagonal, entries in the order of ``update``. ``single``: factors
-        in single precision."""
+    def __init__(self, upper_pattern: sparse.csc_matrix | sparse.csc_array, *, device: str) -> None:
+        """``upper_pattern``: upper triangle with the diagonal, entries in the order of ``update``."""
         count = len(upper_pattern.indptr) - 1
         rows = np.asarray(upper_pattern.indices, dtype=np.int64)
         columns = np.repeat(np.arange(count), np.diff(upper_pattern.indptr))
         self._device = torch.device(device)
         self._upper = torch.from_numpy(rows * count + columns).to(self._device)
         self._lower = torch.from_numpy(columns * count + rows).to(self._device)
-        kind = torch.float32 if single else torch.float64
-        self._matrix = torch.zeros((count, count), dtype=kind, device=self._device)
-        self._identity = torch.eye(count, dtype=kind, device=self._device)
-        self._other = torch.zeros((count, count), dtype=torch.float64, device=self._device)
+        self._matrix, self._other = torch.zeros((2, count, count), dtype=torch.float64, device=self._device)
+        self._identity = torch.eye(count, dtype=torch.float64, device=self._device)
         self._finite = False
         self._factor: torch.Tensor | None = None
         self._inverse: torch.Tensor | None = None
@@ -50,8 +45,8 @@ class DenseFactors:
         """See ``Factors``; S keeps its own factor where the sum has none."""
         if not self._finite or not (np.isfinite(across).all() and np.isfinite(rates).all()):
             return False
-        directions, weights = (self.take(given).to(self._matrix.dtype) for given in (across, rates))
-        factor, info = torch.linalg.cholesky_ex(torch.addmm(self._matrix, directions * weights, directions.T))
+        directions = self.take(across)
+        factor, info = torch.linalg.cholesky_ex(torch.addmm(self._matrix, directions * self.take(rates), directions.T))
         if int(info) != 0:
             return False
         self._factor, self._inverse = factor, None
@@ -70,7 +65,7 @@ class DenseFactors:
         if inverse is None:
             assert self._factor is not None, "update() comes first"
             inverse = self._inverse = torch.linalg.solve_triangular(self._factor, self._identity, upper=False)
-        return (inverse.T @ (inverse @ right.to(inverse.dtype))).double()
+        return inverse.T @ (inverse @ right)
 
     def quadratic(self, entries: np.ndarray, moves: torch.Tensor) -> torch.Tensor:
         """See ``Factors``."""
@@ -86,6 +81,6 @@ class DenseFactors:
         return values.cpu().numpy()
 
     def _fill(self, matrix: torch.Tensor, entries: np.ndarray) -> None:
-        values, flat = self.take(entries).to(matrix.dtype), matrix.view(-1)
+        values, flat = self.take(entries), matrix.view(-1)
         flat[self._upper] = values
         flat[self._lower] = values

@@ -50,11 +50,8 @@ class Factors(Protocol):
         ...
 
 
-def factors_on(
-    device: wp.Device, upper_pattern: sparse.csc_matrix | sparse.csc_array, *, single: bool = False
-) -> Factors:
-    """Dense ones on a GPU, where torch sees it too; else sparse ones. ``single``: in single precision, from and to
-    double.
+def factors_on(device: wp.Device, upper_pattern: sparse.csc_matrix | sparse.csc_array) -> Factors:
+    """Dense ones on a GPU, where torch sees it too; else sparse ones.
 
     A dense Cholesky factor and its inverse take 2 ms for 541 nodes on an H100, and 10 for 2,000: there is no sparse
     solver in the packages that an installation brings along which a GPU would finish sooner.
@@ -63,9 +60,9 @@ def factors_on(
         try:
             import torch
         except ImportError:
-            return SparseFactors(upper_pattern, single=single)
+            return SparseFactors(upper_pattern)
         if torch.cuda.is_available():
             from egs_warp.fem.dense_factors import DenseFactors
 
-            return DenseFactors(upper_pattern, device=str(device), single=single)
-    return SparseFactors(upper_pattern, single=single)
+            return DenseFactors(upper_pattern, device=str(device))
+    return SparseFactors(upper_pattern)

@@ -18,10 +18,8 @@ class SparseFactors:
     same bits on any number of cores.
     """
 
-    def __init__(self, upper_pattern: sparse.csc_matrix | sparse.csc_array, *, single: bool = False) -> None:
-        """``upper_pattern``: upper triangle with the diagonal, entries in the order of ``update``. ``single``: factors
-        in single precision, in two thirds of the time."""
-        self._kind = np.float32 if single else np.float64
+    def __init__(self, upper_pattern: sparse.csc_matrix | sparse.csc_array) -> None:
+        """``upper_pattern``: upper triangle with the diagonal, entries in the order of ``update``."""
         order = sparse.csc_matrix(
             (np.arange(1.0, upper_pattern.nnz + 1.0), upper_pattern.indices, upper_pattern.indptr), upper_pattern.shape
         )
@@ -31,7 +29,7 @@ class SparseFactors:
         full = (order + sparse.triu(order, 1).T).tocsc()
         full.sort_indices()
         self._full_from_upper, self._full = full.data.astype(np.int64) - 1, (full.indices, full.indptr)
-        self._symbolic = rslab.analyze(full.astype(self._kind), path="ldlt", threads=1)
+        self._symbolic = rslab.analyze(full, path="ldlt", threads=1)
         self._factors: rslab.Ldlt | None = None
         self._added: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         """U, S^-1 U and the inverse of the capacitance matrix."""
@@ -46,7 +44,7 @@ class SparseFactors:
         if not np.isfinite(entries).all():
             return False
         try:
-            factors = self._symbolic.factor(entries[self._lower_from_upper].astype(self._kind))
+            factors = self._symbolic.factor(entries[self._lower_from_upper])
         except RuntimeError:  # numerically singular
             return False
         assert isinstance(factors, rslab.Ldlt), "the path is ldlt"
@@ -104,16 +102,16 @@ class SparseFactors:
         factors = self._factors
         assert factors is not None, "update() comes first"
         if right.ndim == 1:
-            return np.asarray(factors.solve(right.astype(self._kind)), np.float64)
+            return np.asarray(factors.solve(right))
         if right.shape[1] == 0:
             return right
         # Column by column in memory: as the factors take them.
-        right = np.asfortranarray(right, self._kind)
+        right = np.asfortranarray(right)
         if right.shape[1] < _SPLIT:
-            return np.asarray(factors.solve_many(right), np.float64)
+            return np.asarray(factors.solve_many(right))
         half = right.shape[1] // 2
-        parts = beside(lambda: factors.solve_many(right[:, :half]), lambda: factors.solve_many(right[:, half:]))
-        return np.hstack(parts, dtype=np.float64)
+        first, second = beside(lambda: factors.solve_many(right[:, :half]), lambda: factors.solve_many(right[:, half:]))
+        return np.hstack([first, second])
 
 
 def inverse_and_positives(symmetric: np.ndarray) -> tuple[int, np.ndarray]:

@@ -87,7 +87,7 @@ class StepPlanner:
     friction: float
     settings: LocomotionSettings
     factors: Factors
-    """Of the effort's horizon; single precision will do, since what they solve for is weighed in double."""
+    """Of the effort's horizon."""
 
     def plan(self, prospect: Prospect, last: np.ndarray, objectives: Sequence[AnyObjective], clock: StageClock) -> Plan:
         """Activations for what the ``objectives`` ask, after ``last`` (M,) metres of the step before."""

@@ -112,7 +112,7 @@ class LocomotionStepper:
             synergies,
             geometry.friction,
             self.settings,
-            factors_on(body.assembly.device, body.assembly.upper_pattern, single=True),
+            factors_on(body.assembly.device, body.assembly.upper_pattern),
         )
 
     def with_friction(self, friction: float) -> LocomotionStepper:

@@ -7,7 +7,7 @@ import pytest
 import scipy.sparse as sparse
 import warp as wp
 
-from egs_warp.fem.factors import Factors, factors_on
+from egs_warp.fem.factors import factors_on
 from egs_warp.fem.sparse_factors import SparseFactors
 
 pytest.importorskip("torch")
@@ -69,23 +69,6 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
         assert dense.add(np.eye(60), np.full(60, 40.0)) and thin.add(np.eye(60), np.full(60, 40.0)) and dense.ready
         assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-10
         assert np.abs((matrix + 40.0 * np.eye(60)) @ dense.solve(right) - right).max() < 1e-10
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_single_precision_is_told_apart_inside_alone(device: str) -> None:
-    """Doubles go in and come out, right to single precision and no further; a quadratic form is double."""
-    upper = pattern(60)
-    entries, right = entries_of(upper, 1, 30.0), np.random.default_rng(7).normal(size=(60, 40))
-    exact = SparseFactors(upper)
-    assert exact.update(entries)
-    made: list[Factors] = [DenseFactors(upper, device=device, single=True), SparseFactors(upper, single=True)]
-    for factors in made:
-        assert factors.update(entries)
-        for given in (right, right[:, :3], right[:, 0]):
-            got, apart = factors.solve(given), np.abs(factors.solve(given) - exact.solve(given)).max()
-            assert got.dtype == np.float64 and got.shape == given.shape and 1e-10 < apart < 1e-6
-        own = factors.give(factors.quadratic(entries, factors.take(right)))
-        assert np.abs(own - exact.quadratic(entries, right)).max() < 1e-10
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -171,23 +171,22 @@ def test_a_body_bobs_as_asked() -> None:
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda:0", marks=pytest.mark.cuda)])
 def test_a_gpu_s_factors_make_the_same_hop(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """30 steps in closed loop (10 on a CPU, where dense factors take their time), each with its own activations, with
-    a GPU's kernels on a GPU: within 1e-6 H of sparse factors, since effort is weighed by what single precision makes of
-    it. On four feet: of more, rounding chooses which press.
+    a GPU's kernels on a GPU: within 1e-8 H of sparse factors. On four feet: of more, rounding chooses which press.
     """
     steps, corners = 10 if device == "cpu" else 30, GRID[[0, 4, 20, 24]]
     dense_factors = pytest.importorskip("egs_warp.fem.dense_factors")
     expected, _ = run_hop(muscular_block(feet=corners), steps)
     made: list[object] = []
 
-    def dense(_: wp.Device, pattern: sparse.csc_matrix, *, single: bool = False) -> object:
-        made.append(dense_factors.DenseFactors(pattern, device=device, single=single))
+    def dense(_: wp.Device, pattern: sparse.csc_matrix) -> object:
+        made.append(dense_factors.DenseFactors(pattern, device=device))
         return made[-1]
 
     monkeypatch.setattr("egs_warp.locomotion.stepper.factors_on", dense)
     got, reports = run_hop(muscular_block(device, feet=corners), steps)
     assert len(made) == 2 and len(got) == len(expected) and max(len(one.forces) for one in reports) > 3
     for one, other in zip(got, expected, strict=True):
-        assert np.abs(one.positions - other.positions).max() < 1e-6
+        assert np.abs(one.positions - other.positions).max() < 1e-8
 
 
 def test_two_runs_are_bit_identical() -> None:

@@ -25,8 +25,8 @@ FEM = [
     ),
     Survivor(
         "fem/sparse_factors.py",
-        'self._symbolic = rslab.analyze(full.astype(self._kind), path="ldlt", threads=1)',
-        'self._symbolic = rslab.analyze(full.astype(self._kind), path="ldlt", threads= 2)',
+        'self._symbolic = rslab.analyze(full, path="ldlt", threads=1)',
+        'self._symbolic = rslab.analyze(full, path="ldlt", threads= 2)',
         "threads do not change the order that is found",
     ),
     Survivor(
