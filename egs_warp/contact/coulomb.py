@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -11,6 +9,7 @@ import warp as wp
 
 from egs_warp.kernels.contact import coulomb as kernels
 from egs_warp.kernels.contact.coulomb_equations import Contacts
+from egs_warp.launching import kept_by_thread
 from egs_warp.precision import Vec4, real
 
 
@@ -34,7 +33,7 @@ def coulomb_forces(
     count = len(shift)
     if count == 0:
         return start, 0.0
-    return _kept.room(count, tolerance, iteration_limit).found(delassus, free_velocity, shift, friction, start)
+    return _room(count, tolerance, iteration_limit).found(delassus, free_velocity, shift, friction, start)
 
 
 class _Room:
@@ -49,7 +48,7 @@ class _Room:
         given = [_shared(each) for each in (self._delassus, self._free, self._shifts, self._friction)]
         wanted = ((1, 5, size), real), ((1, 2, size), int), ((1, size, (size + 4) // 4), Vec4)
         scratch = [wp.zeros(shape, dtype=kind, device="cpu") for shape, kind in wanted]
-        self._launch = wp.launch(
+        self._launch: Any = wp.launch(
             kernels.coulomb_kernel,
             dim=(1, 1),
             inputs=[counts, *given, tolerance, iteration_limit, _shared(self._forces), *scratch],
@@ -68,16 +67,7 @@ class _Room:
         return self._forces.reshape(-1, 3).copy(), float(self._residual[0])
 
 
-class _Kept(threading.local):
-    """Of this thread."""
-
-    def __init__(self) -> None:
-        self.room = lru_cache(maxsize=_ROOMS)(_Room)
-
-
-_ROOMS = 32
-"""Counts of contacts that memory is kept for."""
-_kept = _Kept()
+_room = kept_by_thread(32)(_Room)
 
 
 def contacts_of(delassus: np.ndarray, free_velocity: np.ndarray, shift: np.ndarray, friction: float) -> Any:

@@ -5,15 +5,16 @@ The dual active-set method of Goldfarb and Idnani (1983), begun where a guess le
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.linalg as dense
 import warp as wp
 
 from egs_warp.kernels.locomotion import active_set as kernels
+from egs_warp.launching import kept_by_thread
 from egs_warp.precision import Vec4, real
 
 _PIVOTS = 600
@@ -108,7 +109,7 @@ class _Room:
         search.side, search.active = _shared(self._side), _shared(self._active)
         search.factor = wp.zeros((unknowns, unknowns), dtype=real, device="cpu")
         search.rates, search.across = (wp.zeros(unknowns, dtype=real, device="cpu") for _ in range(2))
-        self._launch = wp.launch(
+        self._launch: Any = wp.launch(
             kernels.optimum_kernel,
             1,
             inputs=[program, _PIVOTS, search],
@@ -137,16 +138,9 @@ class _Room:
         return int(self._ended[0]), active, self._side[active], self._pulls[: len(active)].copy()
 
 
-class _Kept(threading.local):
-    """Of this thread."""
-
-    def __init__(self) -> None:
-        self.room = lru_cache(maxsize=_ROOMS)(_Room)
-
-
-_ROOMS, _STEP = 16, 32
-"""How many sizes memory is kept for, and by how many rows these differ."""
-_kept = _Kept()
+_room = kept_by_thread(16)(_Room)
+_STEP = 32
+"""Rows by which the sizes differ that memory is kept for."""
 
 
 def _shared(values: np.ndarray) -> wp.array:
@@ -165,7 +159,7 @@ def optimum_near(
     """
     m, n = reduced.rows.shape
     side = np.where(low & np.isfinite(lower), 1, np.where(high & np.isfinite(upper), -1, 0))
-    how, active, sides, pulls = _kept.room(-(-m // _STEP) * _STEP, n).search(reduced, lower, upper, side)
+    how, active, sides, pulls = _room(-(-m // _STEP) * _STEP, n).search(reduced, lower, upper, side)
     multipliers = np.zeros(m)
     if how == kernels.ASTRAY:
         return None
