@@ -237,8 +237,7 @@ class BatchSolver:
         given_up = (~better & search.fresh) | (search.unanswered > UNANSWERED)
         search.active.copy_(~search.converged & ~given_up)
         search.fresh.fill_(False)
-        slow = ~better | ~whole | unanswered
-        return slow if first else slow | (search.size > SLOW * before)
+        return ~better | (search.size > SLOW * before) | ~whole | unanswered
 
 
 @dataclass(frozen=True)
