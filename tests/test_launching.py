@@ -173,7 +173,7 @@ def test_beside_on_one_thread_is_one_after_the_other(told: str, monkeypatch: pyt
 
 def test_what_goes_on_beside_an_error_has_ended_when_that_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """What both work with may be used again at once."""
-    monkeypatch.setenv(THREADS, "")
+    monkeypatch.setenv(THREADS, "2")
     begun, ended = threading.Event(), threading.Event()
 
     def first() -> None:
@@ -185,7 +185,6 @@ def test_what_goes_on_beside_an_error_has_ended_when_that_is_told(monkeypatch: p
         time.sleep(0.05)
         ended.set()
 
-    if available_threads() > 1:
-        with pytest.raises(ValueError, match="over"):
-            beside(first, second)
-        assert ended.is_set()
+    with pytest.raises(ValueError, match="over"):
+        beside(first, second)
+    assert ended.is_set()
