@@ -16,7 +16,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
-from functools import cache
+from functools import cache, lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -232,6 +232,23 @@ def _chunk_edges(row_count: int, threads: int, work: np.ndarray | None) -> list[
         done = np.concatenate([[0.0], np.cumsum(np.asarray(work, dtype=np.float64) + 1e-3)])
         inner = np.searchsorted(done, np.array(shares) * done[-1])
     return np.unique(np.concatenate([[0], inner, [row_count]]).astype(int)).tolist()
+
+
+def kept_by_thread(most: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
+    """A decorator: what was made for the last ``most`` different arguments is kept, by each thread for itself, as
+    memory must be that is written to."""
+
+    def decorated(make: Callable[..., T]) -> Callable[..., T]:
+        own = threading.local()
+
+        def kept(*arguments: Any) -> T:
+            if not hasattr(own, "made"):
+                own.made = lru_cache(maxsize=most)(make)
+            return own.made(*arguments)
+
+        return kept
+
+    return decorated
 
 
 def beside(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:

@@ -16,6 +16,7 @@ from egs_warp.launching import (
     available_threads,
     beside,
     empty_together,
+    kept_by_thread,
     launch_again,
     launch_rows,
     with_room,
@@ -188,3 +189,16 @@ def test_what_goes_on_beside_an_error_has_ended_when_that_is_told(monkeypatch: p
     with pytest.raises(ValueError, match="over"):
         beside(first, second)
     assert ended.is_set()
+
+
+def test_each_thread_keeps_its_own() -> None:
+    """The last few, by their arguments; another thread has others."""
+    make = kept_by_thread(2)(lambda *given: [*given])
+    first = make(1, 2)
+    assert first == [1, 2] and make(1, 2) is first and make(2, 1) is not first
+    assert make(3) == [3] and make(1, 2) is not first
+    own, others = make(1, 2), []
+    thread = threading.Thread(target=lambda: others.append(make(1, 2)))
+    thread.start()
+    thread.join()
+    assert others == [own] and others[0] is not own and make(1, 2) is own

@@ -237,7 +237,8 @@ class BatchSolver:
         given_up = (~better & search.fresh) | (search.unanswered > UNANSWERED)
         search.active.copy_(~search.converged & ~given_up)
         search.fresh.fill_(False)
-        return ~better | (search.size > SLOW * before) | ~whole | unanswered
+        slow = ~better | ~whole | unanswered
+        return slow if first else slow | (search.size > SLOW * before)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import warp as wp
 
 from egs_warp.kernels.contact import coulomb as kernels
 from egs_warp.kernels.contact.coulomb_equations import Contacts
-from egs_warp.launching import empty_together
+from egs_warp.launching import kept_by_thread
 from egs_warp.precision import Vec4, real
 
 
@@ -33,23 +33,41 @@ def coulomb_forces(
     count = len(shift)
     if count == 0:
         return start, 0.0
-    size = 3 * count
-    wanted = ((1, 5, size), real), ((1, 2, size), int), ((1, size, (size + 4) // 4), Vec4)
-    forces = np.array(start, dtype=np.float64, order="C")
-    residual = np.empty(1)
-    wp.launch(
-        kernels.coulomb_kernel,
-        dim=(1, 1),
-        inputs=[
-            wp.array(np.array([count], np.int32), dtype=int, device="cpu", copy=False),
-            *(_shared(given[None]) for given in (delassus, free_velocity, shift)),
-            *(_shared(np.array([friction])), tolerance, iteration_limit, _shared(forces.reshape(1, -1))),
-            *empty_together("cpu", *wanted),
-        ],
-        outputs=[_shared(residual)],
-        device="cpu",
-    )
-    return forces, float(residual[0])
+    return _room(count, tolerance, iteration_limit).found(delassus, free_velocity, shift, friction, start)
+
+
+class _Room:
+    """Memory for a problem of so many contacts, and a launch that is made again and again: a new one costs as much as
+    the forces of ten contacts."""
+
+    def __init__(self, count: int, tolerance: float, iteration_limit: int) -> None:
+        size = 3 * count
+        self._delassus, self._free, self._shifts = np.zeros((1, size, size)), np.zeros((1, size)), np.zeros((1, count))
+        self._friction, self._forces, self._residual = np.zeros(1), np.zeros((1, size)), np.zeros(1)
+        counts = wp.array(np.array([count], np.int32), dtype=int, device="cpu")
+        given = [_shared(each) for each in (self._delassus, self._free, self._shifts, self._friction)]
+        wanted = ((1, 5, size), real), ((1, 2, size), int), ((1, size, (size + 4) // 4), Vec4)
+        scratch = [wp.zeros(shape, dtype=kind, device="cpu") for shape, kind in wanted]
+        self._launch: Any = wp.launch(
+            kernels.coulomb_kernel,
+            dim=(1, 1),
+            inputs=[counts, *given, tolerance, iteration_limit, _shared(self._forces), *scratch],
+            outputs=[_shared(self._residual)],
+            device="cpu",
+            record_cmd=True,
+        )
+
+    def found(
+        self, delassus: np.ndarray, free_velocity: np.ndarray, shift: np.ndarray, friction: float, start: np.ndarray
+    ) -> tuple[np.ndarray, float]:
+        """See ``coulomb_forces``."""
+        self._delassus[0], self._free[0], self._shifts[0] = delassus, free_velocity, shift
+        self._friction[0], self._forces[0] = friction, start.ravel()
+        self._launch.launch()
+        return self._forces.reshape(-1, 3).copy(), float(self._residual[0])
+
+
+_room = kept_by_thread(32)(_Room)
 
 
 def contacts_of(delassus: np.ndarray, free_velocity: np.ndarray, shift: np.ndarray, friction: float) -> Any:

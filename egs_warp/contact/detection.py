@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -30,6 +31,8 @@ _SHORTENINGS = 40
 """Halvings in which an arm finds where it meets uneven ground."""
 _BEND = 1e-7
 """Of a tetrahedron's points: far above the rounding of a double, far below what makes a point of a grid a vertex."""
+_PLACES = 4
+"""Positions whose gaps are kept: a step ends where the next one starts, and asks for either several times."""
 _SLACK = 0.25
 """Of the grid: what is not deeper is in the plane once it is moved to the grid."""
 _FINE = 0.5
@@ -273,6 +276,7 @@ class ContactDetector:
         count = len(geometry.tet_from_point)
         self._gaps = wp.zeros(count, dtype=real, device=device)
         self._nearest = wp.zeros(count, dtype=int, device=device)
+        self._found: OrderedDict[bytes, tuple[np.ndarray, np.ndarray]] = OrderedDict()
 
     def gaps(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(P,) signed distance of every point at ``positions`` (N, 3) to the nearest solid, and (P,) its face's index.
@@ -280,6 +284,15 @@ class ContactDetector:
         Of a solid's faces the one counts that the point is furthest in front of, or least far behind; to ground that is
         not flat the distance is ``HeightField.gaps``.
         """
+        place = positions.tobytes()
+        if place not in self._found:
+            self._found[place] = self._find(positions)
+            while len(self._found) > _PLACES:
+                self._found.popitem(last=False)
+        gaps, nearest = self._found[place]
+        return gaps.copy(), nearest.copy()
+
+    def _find(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         put(self._positions, positions)
         launch_again(
             kernels.point_gaps_kernel,

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.linalg as dense
 import warp as wp
 
 from egs_warp.kernels.locomotion import active_set as kernels
-from egs_warp.launching import empty_together
+from egs_warp.launching import kept_by_thread
 from egs_warp.precision import Vec4, real
 
 _PIVOTS = 600
@@ -69,11 +70,6 @@ class ReducedRows:
         """(m,) by how much each row may break its bounds."""
         return _BROKEN * np.maximum(1.0, self.lengths)
 
-    @cached_property
-    def products(self) -> np.ndarray:
-        """(m, m) of the unit rows with each other."""
-        return self.units @ self.units.T
-
     def point(self, multipliers: np.ndarray) -> np.ndarray:
         """(n,) x that ``multipliers`` (m,) hold, positive where an upper bound pushes."""
         move = -self.units.T @ (self.lengths * multipliers)
@@ -92,12 +88,67 @@ class Optimum:
     """Whether any point satisfies the bounds; else ``x`` means nothing."""
 
 
-def by_fours(values: np.ndarray) -> wp.array:
-    """``values`` (..., k) with zeros to the next four, as vectors of four."""
-    count = values.shape[-1]
-    padded = np.zeros((*values.shape[:-1], -(-count // 4), 4))
-    padded.reshape(*values.shape[:-1], -1)[..., :count] = values
-    return wp.array(padded, dtype=Vec4, device="cpu", copy=False)
+class _Room:
+    """Memory for a program of so many rows and unknowns, and a launch that is made again and again: a new one takes
+    longer than the search."""
+
+    def __init__(self, rows: int, unknowns: int) -> None:
+        columns = -(-unknowns // 4) * 4
+        self._rows, self._products = np.zeros((rows, columns)), np.zeros((rows, rows))
+        self._free, self._at, self._outside = np.zeros(rows), np.zeros(rows), np.zeros(columns)
+        self._lower, self._upper, self._slack = np.zeros((3, rows))
+        self._most, self._pulls = np.zeros(1), np.zeros(unknowns)
+        self._side, self._active, self._ended = (np.zeros(count, np.int32) for count in (rows, unknowns, 1))
+        program, search = kernels.Program(), kernels.Search()
+        program.rows, program.products = _by_fours(self._rows), _by_fours(self._products)
+        program.free, search.at, search.outside = (
+            _by_fours(values) for values in (self._free, self._at, self._outside)
+        )
+        program.lower, program.upper, program.slack = map(_shared, (self._lower, self._upper, self._slack))
+        program.most, search.pulls = _shared(self._most), _shared(self._pulls)
+        search.side, search.active = _shared(self._side), _shared(self._active)
+        search.factor = wp.zeros((unknowns, unknowns), dtype=real, device="cpu")
+        search.rates, search.across = (wp.zeros(unknowns, dtype=real, device="cpu") for _ in range(2))
+        self._launch: Any = wp.launch(
+            kernels.optimum_kernel,
+            1,
+            inputs=[program, _PIVOTS, search],
+            outputs=[_shared(self._ended)],
+            device="cpu",
+            record_cmd=True,
+        )
+        # The launch has where these lie.
+        self._held = program, search
+
+    def search(
+        self, reduced: ReducedRows, lower: np.ndarray, upper: np.ndarray, side: np.ndarray
+    ) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
+        """How it ended, and of the rows that hold the numbers, the sides and the multipliers."""
+        m, n = reduced.rows.shape
+        self._rows[:m, :n], self._rows[m:] = reduced.units, 0.0
+        np.matmul(self._rows, self._rows.T, out=self._products)
+        self._free[:m], self._free[m:] = reduced.free / reduced.lengths, 0.0
+        self._lower[:m], self._lower[m:] = lower / reduced.lengths, -np.inf
+        self._upper[:m], self._upper[m:] = upper / reduced.lengths, np.inf
+        self._slack[:m], self._slack[m:] = reduced.slack / reduced.lengths, 0.0
+        self._side[:m], self._side[m:] = side, 0
+        self._most[0] = _HOPELESS * reduced.worth
+        self._launch.launch()
+        active = self._active[: np.count_nonzero(self._side)].copy()
+        return int(self._ended[0]), active, self._side[active], self._pulls[: len(active)].copy()
+
+
+_room = kept_by_thread(16)(_Room)
+_STEP = 32
+"""Rows by which the sizes differ that memory is kept for."""
+
+
+def _shared(values: np.ndarray) -> wp.array:
+    return wp.array(values, dtype=real if values.dtype == np.float64 else int, device="cpu", copy=False)
+
+
+def _by_fours(values: np.ndarray) -> wp.array:
+    return wp.array(values.reshape(*values.shape[:-1], -1, 4), dtype=Vec4, device="cpu", copy=False)
 
 
 def optimum_near(
@@ -107,31 +158,14 @@ def optimum_near(
     the search astray.
     """
     m, n = reduced.rows.shape
-    program, search = kernels.Program(), kernels.Search()
-    program.rows, program.products = by_fours(reduced.units), by_fours(reduced.products)
-    program.free = by_fours(reduced.free / reduced.lengths)
-    program.lower, program.upper, program.slack = (
-        wp.array(value / reduced.lengths, dtype=real, device="cpu", copy=False)
-        for value in (lower, upper, reduced.slack)
-    )
-    program.most = _HOPELESS * reduced.worth
-    side = np.where(low & np.isfinite(lower), 1, np.where(high & np.isfinite(upper), -1, 0)).astype(np.int32)
-    search.side = wp.array(side, dtype=int, device="cpu", copy=False)
-    fours = (-(-m // 4), Vec4), (-(-n // 4), Vec4)
-    search.active, ended, search.factor, search.at, search.outside, *vectors = empty_together(
-        "cpu", (n, int), (1, int), ((n, n), real), *fours, *((n, real),) * 3
-    )
-    search.pulls, search.rates, search.across = vectors
-    wp.launch(kernels.optimum_kernel, 1, inputs=[program, _PIVOTS, search], outputs=[ended], device="cpu")
-    how = int(ended.numpy()[0])
+    side = np.where(low & np.isfinite(lower), 1, np.where(high & np.isfinite(upper), -1, 0))
+    how, active, sides, pulls = _room(-(-m // _STEP) * _STEP, n).search(reduced, lower, upper, side)
     multipliers = np.zeros(m)
     if how == kernels.ASTRAY:
         return None
     if how == kernels.INFEASIBLE:
         return Optimum(np.zeros(n), multipliers, False)
-    count = int(np.count_nonzero(side))
-    active = search.active.numpy()[:count]
-    multipliers[active] = -side[active] * search.pulls.numpy()[:count] / reduced.lengths[active]
+    multipliers[active] = -sides * pulls / reduced.lengths[active]
     x = reduced.point(multipliers)
     at, slack = reduced.rows @ x, 10.0 * reduced.slack
     # Rows that contradict each other are met by none, whatever their multipliers.

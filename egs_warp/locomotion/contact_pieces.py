@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg as dense
 
 from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.launching import Device
@@ -239,19 +238,20 @@ def _forces_of(program: ContactPieces, modes: ContactModes) -> tuple[np.ndarray,
     """(3n,) and (3n, m): f = offset + slope a in the piece of ``modes``."""
     n, m = program.contacts, program.activations
     stick, slide = modes.kind == STICK, modes.kind == SLIDE
-    held = np.stack([stick | slide, stick, stick], axis=1).ravel()
-    spread = np.eye(3 * n)
-    sliding = np.flatnonzero(slide)
-    for t in (0, 1):
-        spread[3 * sliding + 1 + t, 3 * sliding] = -program.friction * modes.slip[sliding, t]
-    spread = spread[:, held]
-    operator = program.rows[held, m:] @ spread
-    if operator.size == 0:
-        return np.zeros(3 * n), np.zeros((3 * n, m))
-    operator[np.diag_indices_from(operator)] += _SINGULAR * np.abs(operator.diagonal()).mean()
-    right = -np.column_stack([program.offset[held], program.rows[held, :m]])
-    solved = spread @ dense.solve(operator, right, overwrite_a=True, overwrite_b=True, check_finite=False)
-    return solved[:, 0], solved[:, 1:]
+    held = np.flatnonzero(np.stack([stick | slide, stick, stick], axis=1))
+    sliding = 3 * np.flatnonzero(slide)
+    pull = -program.friction * modes.slip[slide]
+    forces = np.zeros((3 * n, 1 + m))
+    if len(held) > 0:
+        rows = program.rows[held]
+        operator = rows[:, m + held]
+        drawn = rows[:, m + sliding + 1] * pull[:, 0] + rows[:, m + sliding + 2] * pull[:, 1]
+        operator[:, np.searchsorted(held, sliding)] += drawn
+        operator[np.diag_indices_from(operator)] += _SINGULAR * np.abs(operator.diagonal()).mean()
+        forces[held] = np.linalg.solve(operator, -np.column_stack([program.offset[held], rows[:, :m]]))
+        for t in (0, 1):
+            forces[sliding + 1 + t] = pull[:, t, None] * forces[sliding]
+    return forces[:, 0], forces[:, 1:]
 
 
 def _bounds(

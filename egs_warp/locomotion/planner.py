@@ -12,10 +12,11 @@ import numpy as np
 from egs_warp.contact.coupled_step import ContactResponse
 from egs_warp.fem.body import SoftBody
 from egs_warp.fem.factors import Factors
+from egs_warp.launching import beside
 from egs_warp.locomotion.contact_pieces import ContactPieces
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.settings import LocomotionSettings
-from egs_warp.locomotion.step_cost import LinearStep, QuadraticCost, effort_cost, objectives_cost
+from egs_warp.locomotion.step_cost import Horizon, LinearStep, QuadraticCost, effort_cost, objectives_cost
 from egs_warp.locomotion.strategies import Foreseen, search_program
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.muscles.muscle_set import MuscleSet
@@ -126,7 +127,10 @@ class StepPlanner:
         impulses = np.empty((len(free), m + 1), order="F")
         impulses[:, :-1] = problem.dt * (members.T @ each.T).T
         impulses[:, -1] = free
-        solved = response.tangent.solve(impulses)
+        # What the kernels of elasticity are needed for goes on in one thread alone.
+        solved, horizon = beside(
+            lambda: response.tangent.solve(impulses), lambda: Horizon.of(problem, foreseen, self.factors)
+        )
         torques = problem.dt * weight * contacts.speeds(problem.turns).T
         linear = LinearStep(
             foreseen.ravel() - solved[:, -1],
@@ -136,7 +140,7 @@ class StepPlanner:
         previous = self.synergies.mean(last / self.muscles.bounds)
         cost = (
             objectives_cost(problem, linear, contacts, objectives, speed)
-            + effort_cost(problem, linear, foreseen.ravel(), self.factors)
+            + effort_cost(problem, linear, foreseen.ravel(), horizon)
             + self._activation_cost(problem.dt, previous, linear.columns.shape[1])
         )
         rows = np.hstack([contacts.speeds(solved[:, :-1]), weight * response.delassus]) / speed

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from egs_warp.contact.detection import ContactSet
+from egs_warp.fem.elasticity import Damping
 from egs_warp.fem.factors import Factors
 from egs_warp.fem.step_problem import StepProblem, UnsolvableStepError
 from egs_warp.locomotion.objectives import AnyObjective
@@ -82,42 +83,58 @@ def objectives_missed(
     return sum(objective.weight * float(gap @ gap) for objective, gap in zip(objectives, gaps, strict=True))
 
 
+@dataclass(frozen=True)
+class Horizon:
+    """A foreseen end of a step, and one implicit step from there on, of which what is stiff is slack."""
+
+    end: np.ndarray
+    """(N, 3) metres."""
+    time: float
+    """Seconds after the start of the step."""
+    damping: Damping
+    """Until then."""
+    entries: np.ndarray
+    """(nnz,) upper entries of the elements' stiffness at the end, made semi-definite."""
+    factors: Factors
+    """Of the step's matrix."""
+
+    @classmethod
+    def of(cls, problem: StepProblem, foreseen: np.ndarray, factors: Factors, *, horizon: float = HORIZON) -> Horizon:
+        """``horizon`` sqrt(H / g) after the start, from the end of ``foreseen`` (N, 3) m/s; ``factors`` take its
+        matrix."""
+        body = problem.body
+        assembly, time = body.assembly, max(horizon * body.time_unit, problem.dt)
+        end, damping = problem.end_positions(foreseen), assembly.damping(problem.state.positions, time)
+        entries = assembly.hessian_entries(end, damping, projected=True)
+        implicit = time**2 * entries
+        implicit[assembly.diagonal_entries] += np.repeat(body.node_mass, 3)
+        factors.update(implicit)
+        if not factors.ready:
+            raise UnsolvableStepError("the matrix of what is foreseen has no factors")
+        return cls(end, time, damping, entries, factors)
+
+
 def effort_cost(
-    problem: StepProblem,
-    linear: LinearStep,
-    foreseen: np.ndarray,
-    factors: Factors,
-    *,
-    weight: float = EFFORT,
-    horizon: float = HORIZON,
+    problem: StepProblem, linear: LinearStep, foreseen: np.ndarray, horizon: Horizon, *, weight: float = EFFORT
 ) -> QuadraticCost:
-    """``weight`` / (m g H) times the elastic energy and what damping takes, ``horizon`` sqrt(H / g) after the start if
-    the body goes on at its end velocity, around ``foreseen`` (3N,) m/s.
+    """``weight`` / (m g H) times the elastic energy and what damping takes, at the ``horizon`` if the body goes on at
+    its end velocity, around ``foreseen`` (3N,) m/s.
 
     Of all the shapes in which a body does what is asked, it takes the one that strains it least, and gives back what
     it has stored: without this, muscles work against each other. What is stiff goes on only until it is slack, as in
-    one implicit step over the horizon, whose matrix ``factors`` takes: carried on at its speed, what lets go would seem
-    to be strained the other way.
+    one implicit step over the horizon: carried on at its speed, what lets go would seem to be strained the other way.
     """
-    body = problem.body
-    time = max(horizon * body.time_unit, problem.dt)
-    end = problem.end_positions(foreseen.reshape(-1, 3))
-    assembly, damping = body.assembly, body.assembly.damping(problem.state.positions, time)
-    entries = assembly.hessian_entries(end, damping, projected=True)
-    implicit = time**2 * entries
-    implicit[assembly.diagonal_entries] += np.repeat(body.node_mass, 3)
-    factors.update(implicit)
-    if not factors.ready:
-        raise UnsolvableStepError("the matrix of what is foreseen has no factors")
+    body, assembly, factors = problem.body, problem.body.assembly, horizon.factors
     speeds = factors.take(np.column_stack([linear.columns, linear.base]))
     further = factors.solve(factors.take(np.repeat(body.node_mass, 3)[:, None]) * speeds)
-    moves = problem.dt * speeds + (time - problem.dt) * further
+    moves = problem.dt * speeds + (horizon.time - problem.dt) * further
     moves[:, -1] -= problem.dt * factors.take(foreseen)
-    quadratic = factors.give(factors.quadratic(entries, moves))
-    force = factors.give(factors.take(assembly.gradient(end, damping).ravel()) @ moves)
+    quadratic = factors.give(factors.quadratic(horizon.entries, moves))
+    gradient = assembly.gradient(horizon.end, horizon.damping)
+    force = factors.give(factors.take(gradient.ravel()) @ moves)
     unit = weight / (body.weight * body.height)
     return QuadraticCost(
         unit * quadratic[:-1, :-1],
         unit * (force[:-1] + quadratic[:-1, -1]),
-        unit * (assembly.energy(end, damping) + float(force[-1] + 0.5 * quadratic[-1, -1])),
+        unit * (assembly.energy(horizon.end, horizon.damping) + float(force[-1] + 0.5 * quadratic[-1, -1])),
     )

@@ -141,3 +141,14 @@ def test_many_points_under_a_soft_base_are_solved_from_rest() -> None:
         free = rows @ (random.normal(size=12) + np.tile([-1.0, 0.3, 0.0], 4))
         forces, size = coulomb_forces(delassus, free, np.zeros(25), 0.5, np.zeros((25, 3)))
         assert size < 1e-10 and np.abs(forces).sum() < 1e3
+
+
+def test_what_was_solved_before_changes_nothing() -> None:
+    """Memory is used again: the same bits after a problem without numbers, and after one that took all attempts."""
+    delassus, free, shift, start = problem(1)
+    expected, missed = coulomb_forces(delassus, free, shift, 0.4, start)
+    assert missed < 1e-10 and np.abs(expected).max() > 0.1
+    for other in (np.full_like(delassus, np.nan), np.zeros_like(delassus), -delassus):
+        coulomb_forces(other, free, shift, 0.7, start)
+        got, again = coulomb_forces(delassus, free, shift, 0.4, start)
+        assert np.array_equal(got, expected) and again == missed

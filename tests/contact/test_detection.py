@@ -321,3 +321,18 @@ def test_coulomb_forces_of_forty_points_under_a_rigid_base(regularisation: float
         assert residual < 1e-7
         assert_coulomb(delassus, free, np.zeros(40), 0.5, force, 1e-6)
         assert force[:, 0].sum() > 0.5 * mass * -twist[2]
+
+
+def test_gaps_are_those_of_the_place_asked_for(device: str) -> None:
+    """Over more places than are kept, in any order, a place changed in its own memory among them; what is given is the
+    caller's to write to."""
+    mesh = block_mesh()
+    geometry = contact_geometry(surface_cloud(mesh, 50, lowest=0.05), mesh, (FLOOR,), device=device)
+    kept, place = ContactDetector(geometry, device=device), mesh.nodes.copy()
+    for height in (0.0, 0.1, 0.0, 0.2, 0.3, 0.4, 0.5, 0.0, 0.1):
+        place[:, 2] = mesh.nodes[:, 2] + height
+        expected, faces = ContactDetector(geometry, device=device).gaps(place)
+        for _ in range(2):
+            gaps, nearest = kept.gaps(place)
+            assert np.array_equal(gaps, expected) and np.array_equal(nearest, faces)
+            gaps[:], nearest[:] = np.nan, -1

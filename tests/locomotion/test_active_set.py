@@ -116,3 +116,22 @@ def test_a_hessian_that_holds_no_number_has_no_optimum() -> None:
     P[1, 1] = np.nan
     nothing = np.zeros(len(A), bool)
     assert optimum_near(ReducedRows.of(P, q, A), lower, upper, nothing, nothing) is None
+
+
+def test_what_was_sought_before_changes_nothing() -> None:
+    """Memory is used again, by programs with more rows and with fewer: the same bits."""
+    programs = [random_program(seed) for seed in (4, 5, 6)]
+
+    def found(P: np.ndarray, q: np.ndarray, A: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> list[np.ndarray]:
+        reduced = ReducedRows.of(P, q, A)
+        best = optimum_near(reduced, lower, upper, reduced.free < lower, reduced.free > upper)
+        assert best is not None and best.feasible
+        return [best.x, best.multipliers]
+
+    for P, q, A, lower, upper in programs:
+        expected = found(P, q, A, lower, upper)
+        # Of as many unknowns: more rows, fewer, and rows that all hold.
+        found(P, -q, np.vstack([A, -A]), np.r_[lower, -upper], np.r_[upper, -lower])
+        found(P, 3.0 * q, A[: len(q) + 2], lower[: len(q) + 2], upper[: len(q) + 2])
+        for got, value in zip(found(P, q, A, lower, upper), expected, strict=True):
+            assert np.array_equal(got, value)

@@ -12,7 +12,7 @@ from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.objectives import LoadObjective, SpinObjective, centre_of_mass_velocity
-from egs_warp.locomotion.step_cost import LinearStep, QuadraticCost, effort_cost, objectives_cost
+from egs_warp.locomotion.step_cost import Horizon, LinearStep, QuadraticCost, effort_cost, objectives_cost
 from tests.support.meshes import block_mesh
 
 BODY = make_body(block_mesh(), Plane(np.array([0.0, 0.0, 1.0]), 0.0), device="cpu")
@@ -81,13 +81,15 @@ def test_effort_is_the_energy_ahead_and_convex() -> None:
     factors = SparseFactors(BODY.assembly.upper_pattern)
     damping = BODY.assembly.damping(problem.state.positions, time)
     unit = 0.1 / (BODY.weight * BODY.height)
-    cost = effort_cost(problem, linear, foreseen, factors, weight=0.1, horizon=horizon)
+    ahead = Horizon.of(problem, foreseen.reshape(-1, 3), factors, horizon=horizon)
+    cost = effort_cost(problem, linear, foreseen, ahead, weight=0.1)
     assert np.linalg.eigvalsh(cost.P).min() >= -1e-12 * np.abs(cost.P).max()
     # About the end that is foreseen the model is the energy, to second order.
     assert np.linalg.norm(cost.P) > 0.0
     still = LinearStep(0.0 * foreseen, 1e-2 * linear.columns, linear.torques)
     rest = np.zeros_like(foreseen)
-    modelled = effort_cost(problem, still, rest, factors, weight=0.1, horizon=horizon)
+    ahead = Horizon.of(problem, rest.reshape(-1, 3), factors, horizon=horizon)
+    modelled = effort_cost(problem, still, rest, ahead, weight=0.1)
 
     def energy(x: np.ndarray) -> float:
         return unit * BODY.assembly.energy(moved_on(problem, still, rest, time, x), damping)
@@ -111,6 +113,7 @@ def test_what_lets_go_is_foreseen_slack_not_strained_the_other_way() -> None:
     linear = LinearStep(back, np.zeros((back.size, 1)), np.zeros((3, 1)))
     factors = SparseFactors(BODY.assembly.upper_pattern)
     horizon = 3.0 * DT / np.sqrt(BODY.height / 9.81)
-    effort = effort_cost(problem, linear, back, factors, weight=1.0, horizon=horizon).constant
+    ahead = Horizon.of(problem, back.reshape(-1, 3), factors, horizon=horizon)
+    effort = effort_cost(problem, linear, back, ahead, weight=1.0).constant
     carried_on = nodes - 2.0 * stretch
     assert effort < 0.5 * BODY.assembly.energy(carried_on) / (BODY.weight * BODY.height)

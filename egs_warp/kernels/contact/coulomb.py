@@ -8,7 +8,7 @@ import warp as wp
 
 from egs_warp.kernels.block import wait_for_block
 from egs_warp.kernels.contact.coulomb_equations import Contacts, Newton, rate_of, solve_equations, write_equations
-from egs_warp.precision import Vec4, real
+from egs_warp.precision import Vec3, Vec4, real
 
 wp.set_module_options({"enable_backward": False})
 
@@ -41,20 +41,31 @@ _POLISHED = wp.constant(real(1e-2))
 
 
 @wp.func
+def speeds_of(contacts: Contacts, i: int, forces: wp.array[real]):
+    """That ``forces`` (3n,) give contact ``i``, m/s."""
+    n = 3 * i
+    normal = real(0.0)
+    first = real(0.0)
+    second = real(0.0)
+    for k in range(3 * contacts.count):
+        force = forces[k]
+        normal += contacts.delassus[n, k] * force
+        first += contacts.delassus[n + 1, k] * force
+        second += contacts.delassus[n + 2, k] * force
+    return Vec3(normal, first, second)
+
+
+@wp.func
 def sweep(contacts: Contacts, sweeps: int, forces: wp.array[real]):
     """``sweeps`` rounds over all contacts: each takes the force that its own normal and tangents ask for (Eq. 8, 9)."""
     count = contacts.count
     for _ in range(sweeps):
         for i in range(count):
             n = 3 * i
-            normal_speed = contacts.free[n]
-            first_speed = contacts.free[n + 1]
-            second_speed = contacts.free[n + 2]
-            for k in range(3 * count):
-                f = forces[k]
-                normal_speed += contacts.delassus[n, k] * f
-                first_speed += contacts.delassus[n + 1, k] * f
-                second_speed += contacts.delassus[n + 2, k] * f
+            speeds = speeds_of(contacts, i, forces)
+            normal_speed = speeds[0] + contacts.free[n]
+            first_speed = speeds[1] + contacts.free[n + 1]
+            second_speed = speeds[2] + contacts.free[n + 2]
             own = contacts.delassus[n, n]
             normal = wp.max(forces[n] - (normal_speed + contacts.shifts[i]) / own, real(0.0))
             change = normal - forces[n]
@@ -113,26 +124,24 @@ def find_step(contacts: Contacts, forces: wp.array[real], scale: real, short: re
     """A Newton step from the values at ``forces``, and what it changes of the velocities."""
     unknowns = write_equations(contacts, forces, scale, short, newton)
     solve_equations(unknowns, newton)
-    for k in range(newton.lane, 3 * contacts.count, wp.block_dim()):
-        speed = real(0.0)
-        for c in range(3 * contacts.count):
-            speed += contacts.delassus[k, c] * newton.step[c]
-        newton.change[k] = speed
+    for i in range(newton.lane, contacts.count, wp.block_dim()):
+        speeds = speeds_of(contacts, i, newton.step)
+        for t in range(3):
+            newton.change[3 * i + t] = speeds[t]
     wait_for_block()
 
 
 @wp.func
 def find_velocities(contacts: Contacts, forces: wp.array[real], newton: Newton):
     """Those at ``forces``; no step is left."""
-    for k in range(newton.lane, 3 * contacts.count, wp.block_dim()):
-        speed = contacts.free[k]
-        for c in range(3 * contacts.count):
-            speed += contacts.delassus[k, c] * forces[c]
-        if k % 3 == 0:
-            speed += contacts.shifts[k / 3]
-        newton.velocities[k] = speed
-        newton.step[k] = real(0.0)
-        newton.change[k] = real(0.0)
+    for i in range(newton.lane, contacts.count, wp.block_dim()):
+        n = 3 * i
+        speeds = speeds_of(contacts, i, forces)
+        for t in range(3):
+            newton.velocities[n + t] = speeds[t] + contacts.free[n + t]
+            newton.step[n + t] = real(0.0)
+            newton.change[n + t] = real(0.0)
+        newton.velocities[n] = newton.velocities[n] + contacts.shifts[i]
     wait_for_block()
 
 

@@ -41,7 +41,7 @@ class Newton:
     """(3n,) what the projection equations miss."""
     step: wp.array[real]
     change: wp.array[real]
-    """(3n,) of the velocities by a whole step; while one is sought, the shares of the pivot's row in others."""
+    """(3n,) of the velocities by a whole step."""
     best: wp.array[real]
     unknowns: wp.array[int]
     """(3n,) rows that the equations do not give at once."""
@@ -49,6 +49,19 @@ class Newton:
     """(3n,) in which of their columns each row has its pivot."""
     matrix: wp.array2d[Vec4]
     """(3n, >= (3n + 1) / 4) their linear equations, right sides last, columns by fours: taken at once."""
+
+
+@wp.struct
+class Pivots:
+    """Of the elimination so far."""
+
+    rank: int
+    """Rows that have one."""
+    largest: real
+    found: int
+    """In the last panel."""
+    parts: wp.vec4i
+    """In which of its columns."""
 
 
 @wp.func
@@ -60,17 +73,14 @@ def rate_of(contacts: Contacts, i: int, scale: real):
 
 
 @wp.func
-def equation_entry(contacts: Contacts, weights: Vec3, own: Vec3, n: int, column: int):
-    """Of a row of the derivative: ``weights`` of the contact's three rows of the Delassus operator, and what is added
-    in its ``own`` three columns, from ``n`` on."""
-    value = (
+def weighted(contacts: Contacts, weights: Vec3, n: int, column: int):
+    """Of a row of the derivative in a ``column``: ``weights`` of the contact's three rows of the Delassus operator,
+    from ``n`` on."""
+    return (
         weights[0] * contacts.delassus[n, column]
         + weights[1] * contacts.delassus[n + 1, column]
         + weights[2] * contacts.delassus[n + 2, column]
     )
-    if column >= n and column < n + 3:
-        value += own[column - n]
-    return value
 
 
 @wp.func
@@ -126,17 +136,32 @@ def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, sho
                 own[row - n] = own[row - n] + real(1.0)
         right = -newton.values[row]
         for c in range(3 * contacts.count):
-            if newton.step[c] != real(0.0):
-                right -= equation_entry(contacts, weights, own, n, c) * newton.step[c]
+            moved = newton.step[c]
+            if moved != real(0.0):
+                right -= weighted(contacts, weights, n, c) * moved
+                if c >= n and c < n + 3:
+                    right -= own[c - n] * moved
+        sliding = weights[row - n] != rate
         for quad in range((unknowns + 4) / 4):
             four = Vec4()
             for k in range(4):
                 b = 4 * quad + k
                 if b < unknowns:
-                    four[k] = equation_entry(contacts, weights, own, n, newton.unknowns[b])
+                    column = newton.unknowns[b]
+                    if sliding:
+                        four[k] = weighted(contacts, weights, n, column)
+                    else:
+                        four[k] = rate * contacts.delassus[row, column]
                 if b == unknowns:
                     four[k] = right
             newton.matrix[a, quad] = four
+        # Those of a contact that are unknown follow each other.
+        for t in range(3):
+            b = a + n + t - row
+            if own[t] != real(0.0) and newton.unknowns[wp.max(b, 0)] == n + t:
+                four = newton.matrix[a, b / 4]
+                four[b % 4] = four[b % 4] + own[t]
+                newton.matrix[a, b / 4] = four
     wait_for_block()
     return unknowns
 
@@ -148,46 +173,83 @@ def entry(matrix: wp.array2d[Vec4], row: int, column: int):
 
 
 @wp.func
+def eliminate_panel(panel: int, unknowns: int, pivots: Pivots, newton: Newton):
+    """Find pivots in the four columns of a ``panel``, which alone are worked on; a row has its shares of the pivots'
+    rows in their columns then."""
+    lanes = wp.block_dim()
+    pivots.found = 0
+    for part in range(4):
+        if 4 * panel + part < unknowns:
+            pivot = int(pivots.rank)
+            size = real(0.0)
+            for a in range(pivots.rank, unknowns):
+                candidate = wp.abs(newton.matrix[a, panel][part])
+                if candidate > size:
+                    size = candidate
+                    pivot = a
+            wait_for_block()
+            if size > _SINGULAR * pivots.largest:
+                pivots.largest = wp.max(pivots.largest, size)
+                if pivot != pivots.rank:
+                    for quad in range(panel + newton.lane, (unknowns + 4) / 4, lanes):
+                        kept = newton.matrix[pivots.rank, quad]
+                        newton.matrix[pivots.rank, quad] = newton.matrix[pivot, quad]
+                        newton.matrix[pivot, quad] = kept
+                wait_for_block()
+                top = newton.matrix[pivots.rank, panel]
+                for a in range(pivots.rank + 1 + newton.lane, unknowns, lanes):
+                    row = newton.matrix[a, panel]
+                    factor = row[part] / top[part]
+                    row[part] = factor
+                    for k in range(part + 1, 4):
+                        row[k] = row[k] - factor * top[k]
+                    newton.matrix[a, panel] = row
+                wait_for_block()
+                newton.pivots[pivots.rank] = 4 * panel + part
+                pivots.parts[pivots.found] = part
+                pivots.found += 1
+                pivots.rank += 1
+    return pivots
+
+
+@wp.func
 def solve_equations(unknowns: int, newton: Newton):
-    """Gaussian elimination, rows exchanged; unknowns that the others make redundant stay zero, which keeps the forces
-    bounded. The step has them in the end."""
+    """Gaussian elimination, rows exchanged, four columns at a time; unknowns that the others make redundant stay zero,
+    which keeps the forces bounded. The step has them in the end."""
     lanes = wp.block_dim()
     across = wp.min(lanes, _ACROSS)
-    rank = int(0)
-    largest = real(0.0)
     quads = (unknowns + 4) / 4
-    for j in range(unknowns):
-        pivot = int(rank)
-        size = real(0.0)
-        for a in range(rank, unknowns):
-            candidate = wp.abs(entry(newton.matrix, a, j))
-            if candidate > size:
-                size = candidate
-                pivot = a
+    pivots = Pivots()
+    for panel in range((unknowns + 3) / 4):
+        first = pivots.rank
+        pivots = eliminate_panel(panel, unknowns, pivots, newton)
+        # What the pivots' rows leave of each other in the columns to come, then of those below.
+        for quad in range(panel + 1 + newton.lane, quads, lanes):
+            for t in range(1, pivots.found):
+                left = newton.matrix[first + t, quad]
+                for s in range(t):
+                    left -= newton.matrix[first + t, panel][pivots.parts[s]] * newton.matrix[first + s, quad]
+                newton.matrix[first + t, quad] = left
         wait_for_block()
-        if size > _SINGULAR * largest:
-            largest = wp.max(largest, size)
-            if pivot != rank:
-                for quad in range(j / 4 + newton.lane, quads, lanes):
-                    kept = newton.matrix[rank, quad]
-                    newton.matrix[rank, quad] = newton.matrix[pivot, quad]
-                    newton.matrix[pivot, quad] = kept
-            wait_for_block()
-            own = entry(newton.matrix, rank, j)
-            for a in range(rank + 1 + newton.lane, unknowns, lanes):
-                newton.change[a] = entry(newton.matrix, a, j) / own
-            wait_for_block()
-            for a in range(rank + 1 + newton.lane / across, unknowns, lanes / across):
-                factor = newton.change[a]
-                if factor != real(0.0):
-                    for quad in range(j / 4 + newton.lane % across, quads, across):
-                        newton.matrix[a, quad] = newton.matrix[a, quad] - factor * newton.matrix[rank, quad]
-            wait_for_block()
-            newton.pivots[rank] = j
-            rank += 1
+        for a in range(pivots.rank + newton.lane / across, unknowns, lanes / across):
+            shares = newton.matrix[a, panel]
+            if pivots.found == 4:
+                for quad in range(panel + 1 + newton.lane % across, quads, across):
+                    newton.matrix[a, quad] = newton.matrix[a, quad] - (
+                        shares[0] * newton.matrix[first, quad]
+                        + shares[1] * newton.matrix[first + 1, quad]
+                        + shares[2] * newton.matrix[first + 2, quad]
+                        + shares[3] * newton.matrix[first + 3, quad]
+                    )
+            else:
+                for s in range(pivots.found):
+                    share = shares[pivots.parts[s]]
+                    for quad in range(panel + 1 + newton.lane % across, quads, across):
+                        newton.matrix[a, quad] = newton.matrix[a, quad] - share * newton.matrix[first + s, quad]
+        wait_for_block()
     # Each lane writes the same here.
-    for back in range(rank):
-        row = rank - 1 - back
+    for back in range(pivots.rank):
+        row = pivots.rank - 1 - back
         j = newton.pivots[row]
         value = entry(newton.matrix, row, unknowns)
         for b in range(j + 1, unknowns):

@@ -29,7 +29,8 @@ _DEPENDENT = wp.constant(real(1e-9))
 
 @wp.struct
 class Program:
-    """What is given. Columns of matrices lie by fours, which a processor takes at once, zeros after the last."""
+    """What is given. Columns of matrices lie by fours, which a processor takes at once, zeros after the last. Rows of
+    zeros without bounds may follow."""
 
     rows: wp.array2d[Vec4]
     """(m, n) R."""
@@ -41,8 +42,8 @@ class Program:
     upper: wp.array[real]
     slack: wp.array[real]
     """(m,) by how much a row may break its bounds."""
-    most: real
-    """Cost z^T z / 2 beyond which no point is looked for."""
+    most: wp.array[real]
+    """(1,) cost z^T z / 2 beyond which no point is looked for."""
 
 
 @wp.struct
@@ -335,7 +336,7 @@ def descend(program: Program, search: Search, active: int, pivots: int):
             return ASTRAY
         if count < 0:
             return INFEASIBLE
-        if cost_of(program, search, count) > program.most:
+        if cost_of(program, search, count) > program.most[0]:
             return INFEASIBLE
     return ASTRAY
 

@@ -42,12 +42,6 @@ LOCOMOTION = [
         "one neighbour fewer is looked at",
     ),
     Survivor(
-        "locomotion/contact_pieces.py",
-        "solved = spread @ dense.solve(operator, right, overwrite_a=True, overwrite_b=True, check_finite=False)",
-        "solved = spread @ dense.solve(operator, right, overwrite_a=False, overwrite_b=True, check_finite=False)",
-        "whether memory is written over: it is not read again",
-    ),
-    Survivor(
         "locomotion/lemke.py",
         "tableau = dger(-1.0, column, pivot_row, a=tableau, overwrite_a=True)",
         "tableau = dger(-1.0, column, pivot_row, a=tableau, overwrite_a=False)",
