@@ -189,7 +189,7 @@ def test_steps_converge_at_order_one(count: int) -> None:
     def law(shape: Shape, throw: Throw) -> None:
         body, smooth = shape.body(), replace(throw, noise=0.0)
         time, ends = 0.25 * np.sqrt(shape.sag) * body.time_unit, []
-        for steps in (32, 64, 128):
+        for steps in (64, 128, 256):
             flying = passive_body(body, state=smooth.state(body))
             for _ in range(steps):
                 _, result = flying.advance(time / steps)

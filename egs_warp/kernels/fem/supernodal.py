@@ -1,0 +1,346 @@
+"""Factors L D L^T of a sparse matrix by fronts, and solutions with them: dense arithmetic in vectors of four, on a CPU.
+
+See ``egs_warp/fem/sparse_factors.py``. Clang maps vectors and contracted products to what the processor has; four rows
+by eight columns of a product are what its registers hold.
+"""
+
+import warp as wp
+
+from egs_warp.precision import real
+
+wp.set_module_options({"enable_backward": False})
+
+BLOCK = 16
+"""Columns of a front that are eliminated, or solved for, at once; an inverse is kept of each such diagonal block."""
+PANEL = 16
+"""Right-hand sides of a panel, in a row of memory for each unknown."""
+PADDING = 8
+"""Numbers behind an array that may be read, not used."""
+
+_SHARED = f"""
+    #pragma clang fp contract(fast)
+    constexpr int BLOCK = {BLOCK}, PANEL = {PANEL};
+    typedef double v4 __attribute__((ext_vector_type(4), aligned(8)));
+    // y[4][8] -= l[4][k] x[k][8]
+    auto take_off = [](double* y0, double* y1, double* y2, double* y3, const double* l0, const double* l1,
+                       const double* l2, const double* l3, const double* x, int stride, int k) {{
+        #pragma clang fp contract(fast)
+        v4 a0 = *(v4*)y0, a1 = *(v4*)(y0 + 4), b0 = *(v4*)y1, b1 = *(v4*)(y1 + 4);
+        v4 c0 = *(v4*)y2, c1 = *(v4*)(y2 + 4), d0 = *(v4*)y3, d1 = *(v4*)(y3 + 4);
+        for (int j = 0; j < k; ++j, x += stride) {{
+            const v4 x0 = *(const v4*)x, x1 = *(const v4*)(x + 4);
+            a0 -= l0[j] * x0; a1 -= l0[j] * x1; b0 -= l1[j] * x0; b1 -= l1[j] * x1;
+            c0 -= l2[j] * x0; c1 -= l2[j] * x1; d0 -= l3[j] * x0; d1 -= l3[j] * x1;
+        }}
+        *(v4*)y0 = a0; *(v4*)(y0 + 4) = a1; *(v4*)y1 = b0; *(v4*)(y1 + 4) = b1;
+        *(v4*)y2 = c0; *(v4*)(y2 + 4) = c1; *(v4*)y3 = d0; *(v4*)(y3 + 4) = d1;
+    }};
+    // The same of one row.
+    auto take_off_one = [](double* y, const double* l, const double* x, int stride, int k) {{
+        #pragma clang fp contract(fast)
+        v4 a0 = *(v4*)y, a1 = *(v4*)(y + 4);
+        for (int j = 0; j < k; ++j, x += stride) {{
+            a0 -= l[j] * *(const v4*)x;
+            a1 -= l[j] * *(const v4*)(x + 4);
+        }}
+        *(v4*)y = a0; *(v4*)(y + 4) = a1;
+    }};
+"""
+
+
+@wp.struct
+class Fronts:
+    """What ``Supernodes`` says, and where the numbers of each block lie."""
+
+    first: wp.array[wp.int32]
+    widths: wp.array[wp.int32]
+    row_offsets: wp.array[wp.int32]
+    rows: wp.array[wp.int32]
+    in_parent: wp.array[wp.int32]
+    """Along ``rows``: the place of each row below in the parent's front."""
+    child_offsets: wp.array[wp.int32]
+    children: wp.array[wp.int32]
+    entry_offsets: wp.array[wp.int32]
+    entries: wp.array[wp.int32]
+    """Of each block those of the matrix in its columns, ..."""
+    entry_places: wp.array[wp.int32]
+    """... and their places in its front."""
+    factor_offsets: wp.array[wp.int32]
+    inverse_offsets: wp.array[wp.int32]
+    update_offsets: wp.array[wp.int32]
+    """On the stack of what is still to be added to a parent."""
+    place: wp.array[wp.int32]
+    """The permuted place of each row."""
+
+
+@wp.func_native(
+    _SHARED
+    + """
+    double* const F = front.data;
+    double* const T = F + front_size;
+    double u[BLOCK], reciprocal[BLOCK], X[BLOCK * BLOCK], P[4 * BLOCK];
+    int negative = 0;
+    for (int s = 0; s < count; ++s) {
+        const int begin = fronts.row_offsets.data[s], f = fronts.row_offsets.data[s + 1] - begin;
+        const int w = fronts.widths.data[s], r = f - w, ld = (f + 7) & ~7, column = fronts.first.data[s];
+        for (int i = 0; i < f * ld; ++i) F[i] = 0.0;
+        for (int e = fronts.entry_offsets.data[s]; e < fronts.entry_offsets.data[s + 1]; ++e)
+            F[fronts.entry_places.data[e]] = matrix.data[fronts.entries.data[e]];
+        for (int c = fronts.child_offsets.data[s]; c < fronts.child_offsets.data[s + 1]; ++c) {
+            const int child = fronts.children.data[c], end = fronts.row_offsets.data[child + 1];
+            const int from = fronts.row_offsets.data[child] + fronts.widths.data[child], k = end - from;
+            const int* to = fronts.in_parent.data + from;
+            const double* U = stack.data + fronts.update_offsets.data[child];
+            for (int a = 0; a < k; ++a, U += k) {
+                double* const row = F + to[a] * ld;
+                for (int b = 0; b <= a; ++b) row[to[b]] += U[b];
+            }
+        }
+        double* inverse = inverses.data + fronts.inverse_offsets.data[s];
+        for (int b = 0; b < w; b += BLOCK, inverse += BLOCK * BLOCK) {
+            const int nb = w - b < BLOCK ? w - b : BLOCK, next = b + nb;
+            for (int j = 0; j < nb; ++j) {
+                double* const pivot_row = F + (b + j) * ld + b;
+                const double d = pivot_row[j];
+                if (!(d > least || d < -least)) return -1;
+                negative += d < 0.0;
+                reciprocal[j] = 1.0 / d;
+                reciprocals.data[column + b + j] = reciprocal[j];
+                for (int i = j + 1; i < nb; ++i) u[i] = F[(b + i) * ld + b + j];
+                for (int i = j + 1; i < nb; ++i) {
+                    double* const row = F + (b + i) * ld + b;
+                    const double l = u[i] * reciprocal[j];
+                    for (int k = j + 1; k <= i; ++k) row[k] -= l * u[k];
+                    row[j] = l;
+                }
+            }
+            for (int i = 0; i < BLOCK * BLOCK; ++i) inverse[i] = X[i] = 0.0;
+            for (int i = 0; i < nb; ++i) {
+                double* const row = inverse + i * BLOCK;
+                const double* l = F + (b + i) * ld + b;
+                for (int m = 0; m < i; ++m)
+                    for (int k = 0; k <= m; ++k) row[k] -= l[m] * inverse[m * BLOCK + k];
+                row[i] = 1.0;
+                for (int k = 0; k <= i; ++k) X[k * BLOCK + i] = -row[k];
+            }
+            // The rows below times the inverse are L D: by rows divided by D, by columns as they are.
+            const int aligned = next & ~7;
+            for (int c = 0; c < nb; ++c) {
+                for (int i = aligned; i < next; ++i) T[c * ld + i] = 0.0;
+                for (int i = f; i < ld; ++i) T[c * ld + i] = 0.0;
+            }
+            for (int i = next; i < f; i += 4) {
+                const int rows = f - i < 4 ? f - i : 4;
+                double* const l = F + i * ld + b;
+                for (int k = 0; k < 4 * BLOCK; ++k) P[k] = 0.0;
+                if (rows == 4) {
+                    for (int c = 0; c < nb; c += 8)
+                        take_off(P + c, P + BLOCK + c, P + 2 * BLOCK + c, P + 3 * BLOCK + c, l, l + ld, l + 2 * ld,
+                                 l + 3 * ld, X + c, BLOCK, nb);
+                } else {
+                    for (int q = 0; q < rows; ++q)
+                        for (int c = 0; c < nb; c += 8) take_off_one(P + q * BLOCK + c, l + q * ld, X + c, BLOCK, nb);
+                }
+                for (int q = 0; q < rows; ++q)
+                    for (int c = 0; c < nb; ++c) {
+                        T[c * ld + i + q] = P[q * BLOCK + c];
+                        l[q * ld + c] = P[q * BLOCK + c] * reciprocal[c];
+                    }
+            }
+            for (int i = next; i < f; i += 4) {
+                double* const l = F + i * ld + b;
+                if (f - i >= 4) {
+                    for (int c = aligned; c < i + 4; c += 8) {
+                        double* const y = F + i * ld + c;
+                        take_off(y, y + ld, y + 2 * ld, y + 3 * ld, l, l + ld, l + 2 * ld, l + 3 * ld, T + c, ld, nb);
+                    }
+                } else {
+                    for (int q = 0; q < f - i; ++q)
+                        for (int c = aligned; c <= i + q; c += 8)
+                            take_off_one(F + (i + q) * ld + c, l + q * ld, T + c, ld, nb);
+                }
+            }
+        }
+        double* const L = factor.data + fronts.factor_offsets.data[s];
+        for (int i = 0; i < f; ++i)
+            for (int j = 0; j < w; ++j) L[i * w + j] = F[i * ld + j];
+        double* const U = stack.data + fronts.update_offsets.data[s];
+        for (int a = 0; a < r; ++a)
+            for (int b = 0; b <= a; ++b) U[a * r + b] = F[(w + a) * ld + w + b];
+    }
+    return negative;
+"""
+)
+def factored(
+    fronts: Fronts,
+    count: wp.int32,
+    matrix: wp.array[real],
+    least: real,
+    front: wp.array[real],
+    front_size: wp.int32,
+    stack: wp.array[real],
+    factor: wp.array[real],
+    inverses: wp.array[real],
+    reciprocals: wp.array[real],
+) -> wp.int32:
+    """How many pivots are negative, or -1 where one is as small as ``least``."""
+    ...
+
+
+@wp.func_native(
+    _SHARED
+    + """
+    const double* const given = (const double*)right;
+    double* const found = (double*)solution;
+    double* const x = room.data + (long long)panel * (unknowns + 4) * PANEL;
+    const int from = panel * PANEL, columns = count - from < PANEL ? count - from : PANEL;
+    const int width = columns <= 8 ? 8 : 16;
+    for (int i = 0; i < unknowns; ++i) {
+        double* const row = x + fronts.place.data[i] * PANEL;
+        const double* g = given + i * row_stride + from * column_stride;
+        for (int q = 0; q < columns; ++q) row[q] = g[q * column_stride];
+        for (int q = columns; q < width; ++q) row[q] = 0.0;
+    }
+    for (int s = 0; s < blocks; ++s) {
+        const int begin = fronts.row_offsets.data[s], f = fronts.row_offsets.data[s + 1] - begin;
+        const int w = fronts.widths.data[s], column = fronts.first.data[s];
+        const int* const rows = fronts.rows.data + begin;
+        const double* const L = factor.data + fronts.factor_offsets.data[s];
+        const double* inverse = inverses.data + fronts.inverse_offsets.data[s];
+        for (int b = 0; b < w; b += BLOCK, inverse += BLOCK * BLOCK) {
+            const int nb = w - b < BLOCK ? w - b : BLOCK;
+            for (int h = 0; h < width; h += 8) {
+                double* const own = x + (column + b) * PANEL + h;
+                for (int g = (nb - 1) & ~3; g >= 0; g -= 4) {
+                    double sums[32] = {0.0};
+                    const double* l = inverse + g * BLOCK;
+                    take_off(sums, sums + 8, sums + 16, sums + 24, l, l + BLOCK, l + 2 * BLOCK, l + 3 * BLOCK, own,
+                             PANEL, g + 4 < nb ? g + 4 : nb);
+                    for (int q = 0; q < 4 && g + q < nb; ++q)
+                        for (int c = 0; c < 8; ++c) own[(g + q) * PANEL + c] = -sums[8 * q + c];
+                }
+                int i = b + nb;
+                for (; i + 4 <= f; i += 4) {
+                    const double* l = L + i * w + b;
+                    take_off(x + rows[i] * PANEL + h, x + rows[i + 1] * PANEL + h, x + rows[i + 2] * PANEL + h,
+                             x + rows[i + 3] * PANEL + h, l, l + w, l + 2 * w, l + 3 * w, own, PANEL, nb);
+                }
+                for (; i < f; ++i) take_off_one(x + rows[i] * PANEL + h, L + i * w + b, own, PANEL, nb);
+            }
+        }
+    }
+    for (int i = 0; i < unknowns; ++i)
+        for (int q = 0; q < width; ++q) x[i * PANEL + q] *= reciprocals.data[i];
+    for (int s = blocks - 1; s >= 0; --s) {
+        const int begin = fronts.row_offsets.data[s], f = fronts.row_offsets.data[s + 1] - begin;
+        const int w = fronts.widths.data[s], column = fronts.first.data[s];
+        const int* const rows = fronts.rows.data + begin;
+        const double* const L = factor.data + fronts.factor_offsets.data[s];
+        for (int b = (w - 1) & ~(BLOCK - 1); b >= 0; b -= BLOCK) {
+            const int nb = w - b < BLOCK ? w - b : BLOCK;
+            const double* inverse = inverses.data + fronts.inverse_offsets.data[s] + b * BLOCK;
+            for (int h = 0; h < width; h += 8) {
+                double* const own = x + (column + b) * PANEL + h;
+                for (int g = 0; g < nb; g += 4) {
+                    double* const y = own + g * PANEL;
+                    v4 a0 = *(v4*)y, a1 = *(v4*)(y + 4), b0 = *(v4*)(y + PANEL), b1 = *(v4*)(y + PANEL + 4);
+                    v4 c0 = *(v4*)(y + 2 * PANEL), c1 = *(v4*)(y + 2 * PANEL + 4);
+                    v4 d0 = *(v4*)(y + 3 * PANEL), d1 = *(v4*)(y + 3 * PANEL + 4);
+                    const double* l = L + (b + nb) * w + b + g;
+                    for (int i = b + nb; i < f; ++i, l += w) {
+                        const double* const z = x + rows[i] * PANEL + h;
+                        const v4 x0 = *(const v4*)z, x1 = *(const v4*)(z + 4);
+                        a0 -= l[0] * x0; a1 -= l[0] * x1; b0 -= l[1] * x0; b1 -= l[1] * x1;
+                        c0 -= l[2] * x0; c1 -= l[2] * x1; d0 -= l[3] * x0; d1 -= l[3] * x1;
+                    }
+                    *(v4*)y = a0; *(v4*)(y + 4) = a1;
+                    if (g + 1 < nb) { *(v4*)(y + PANEL) = b0; *(v4*)(y + PANEL + 4) = b1; }
+                    if (g + 2 < nb) { *(v4*)(y + 2 * PANEL) = c0; *(v4*)(y + 2 * PANEL + 4) = c1; }
+                    if (g + 3 < nb) { *(v4*)(y + 3 * PANEL) = d0; *(v4*)(y + 3 * PANEL + 4) = d1; }
+                }
+                for (int g = 0; g < nb; g += 4) {
+                    v4 a0 = 0.0, a1 = 0.0, b0 = 0.0, b1 = 0.0, c0 = 0.0, c1 = 0.0, d0 = 0.0, d1 = 0.0;
+                    const double* l = inverse + g * BLOCK + g;
+                    for (int i = g; i < nb; ++i, l += BLOCK) {
+                        const double* const z = own + i * PANEL;
+                        const v4 x0 = *(const v4*)z, x1 = *(const v4*)(z + 4);
+                        a0 += l[0] * x0; a1 += l[0] * x1; b0 += l[1] * x0; b1 += l[1] * x1;
+                        c0 += l[2] * x0; c1 += l[2] * x1; d0 += l[3] * x0; d1 += l[3] * x1;
+                    }
+                    double* const y = own + g * PANEL;
+                    *(v4*)y = a0; *(v4*)(y + 4) = a1;
+                    if (g + 1 < nb) { *(v4*)(y + PANEL) = b0; *(v4*)(y + PANEL + 4) = b1; }
+                    if (g + 2 < nb) { *(v4*)(y + 2 * PANEL) = c0; *(v4*)(y + 2 * PANEL + 4) = c1; }
+                    if (g + 3 < nb) { *(v4*)(y + 3 * PANEL) = d0; *(v4*)(y + 3 * PANEL + 4) = d1; }
+                }
+            }
+        }
+    }
+    for (int i = 0; i < unknowns; ++i) {
+        const double* row = x + fronts.place.data[i] * PANEL;
+        double* const to = found + (long long)i * count + from;
+        for (int q = 0; q < columns; ++q) to[q] = row[q];
+    }
+"""
+)
+def solved_panel(
+    fronts: Fronts,
+    blocks: wp.int32,
+    unknowns: wp.int32,
+    factor: wp.array[real],
+    inverses: wp.array[real],
+    reciprocals: wp.array[real],
+    right: wp.uint64,
+    row_stride: wp.int32,
+    column_stride: wp.int32,
+    count: wp.int32,
+    panel: wp.int32,
+    room: wp.array[real],
+    solution: wp.uint64,
+) -> None:
+    """A panel of ``count`` right-hand sides; ``right`` and ``solution`` are addresses of numbers, the first with its
+    strides in them, the second row by row."""
+    ...
+
+
+@wp.kernel
+def factor_kernel(
+    fronts: Fronts,
+    count: wp.int32,
+    matrix: wp.array[real],
+    least: real,
+    front: wp.array[real],
+    front_size: wp.int32,
+    stack: wp.array[real],
+    factor: wp.array[real],
+    inverses: wp.array[real],
+    reciprocals: wp.array[real],
+    negative: wp.array[wp.int32],
+) -> None:
+    """See ``factored``."""
+    negative[0] = factored(
+        fronts, count, matrix, least, front, front_size, stack, factor, inverses, reciprocals
+    )
+
+
+@wp.kernel
+def solve_kernel(
+    first_panel: wp.int32,
+    fronts: Fronts,
+    blocks: wp.int32,
+    unknowns: wp.int32,
+    factor: wp.array[real],
+    inverses: wp.array[real],
+    reciprocals: wp.array[real],
+    right: wp.uint64,
+    row_stride: wp.int32,
+    column_stride: wp.int32,
+    count: wp.int32,
+    room: wp.array[real],
+    solution: wp.uint64,
+) -> None:
+    """One thread a panel, see ``solved_panel``."""
+    solved_panel(
+        fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, column_stride, count,
+        first_panel + wp.tid(), room, solution,
+    )  # fmt: skip
