@@ -6,6 +6,7 @@ A problem has a block of threads to itself, see ``kernels.contact.coulomb``; a t
 import warp as wp
 
 from egs_warp.kernels.block import wait_for_block
+from egs_warp.kernels.vectors import VECTORS
 from egs_warp.precision import Vec3, Vec4, real
 
 wp.set_module_options({"enable_backward": False})
@@ -212,10 +213,80 @@ def eliminate_panel(panel: int, unknowns: int, pivots: Pivots, newton: Newton):
     return pivots
 
 
+@wp.func_native(
+    VECTORS
+    + """
+#if !defined(__CUDA_ARCH__)
+    constexpr int PANEL = 16;
+    double* const M = (double*)matrix.data;
+    const int stride = matrix.strides[0] / 8, columns = (unknowns + 4) & ~3;
+    int rank = 0, chosen[PANEL];
+    double largest = 0.0, shares[4 * PANEL];
+    for (int begin = 0; begin < unknowns; begin += PANEL) {
+        const int end = unknowns - begin < PANEL ? unknowns : begin + PANEL, next = (end + 3) & ~3, first = rank;
+        int found = 0;
+        for (int j = begin; j < end; ++j) {
+            int pivot = rank;
+            double size = 0.0;
+            for (int a = rank; a < unknowns; ++a) {
+                const double candidate = __builtin_fabs(M[a * stride + j]);
+                if (candidate > size) { size = candidate; pivot = a; }
+            }
+            if (!(size > singular * largest)) continue;
+            largest = size > largest ? size : largest;
+            double *const top = M + rank * stride, *const other = M + pivot * stride;
+            if (pivot != rank)
+                for (int c = begin; c < columns; ++c) { const double kept = top[c]; top[c] = other[c]; other[c] = kept; }
+            for (int a = rank + 1; a < unknowns; ++a) {
+                double* const row = M + a * stride;
+                const double factor = row[j] / top[j];
+                row[j] = factor;
+                for (int c = j + 1; c < next; ++c) row[c] -= factor * top[c];
+            }
+            pivots.data[rank++] = j;
+            chosen[found++] = j;
+        }
+        for (int t = 1; t < found; ++t)
+            for (int s = 0; s < t; ++s) {
+                double *const row = M + (first + t) * stride, *const by = M + (first + s) * stride;
+                const double share = row[chosen[s]];
+                for (int c = next; c < columns; c += 4) *(v4*)(row + c) -= share * *(const v4*)(by + c);
+            }
+        for (int a = rank; a < unknowns; a += 4) {
+            const int rows = unknowns - a < 4 ? unknowns - a : 4;
+            for (int q = 0; q < rows; ++q)
+                for (int s = 0; s < found; ++s) shares[q * PANEL + s] = M[(a + q) * stride + chosen[s]];
+            double* const row = M + a * stride;
+            const double* const by = M + first * stride;
+            int c = next;
+            if (rows == 4)
+                for (; c + 8 <= columns; c += 8)
+                    take_off(row + c, row + stride + c, row + 2 * stride + c, row + 3 * stride + c, shares,
+                             shares + PANEL, shares + 2 * PANEL, shares + 3 * PANEL, by + c, stride, found);
+            for (int q = 0; q < rows; ++q)
+                for (int d = c; d < columns; d += 4) {
+                    v4 left = *(v4*)(row + q * stride + d);
+                    for (int s = 0; s < found; ++s) left -= shares[q * PANEL + s] * *(const v4*)(by + s * stride + d);
+                    *(v4*)(row + q * stride + d) = left;
+                }
+        }
+    }
+    return rank;
+#else
+    return 0;
+#endif
+"""
+)
+def eliminate_alone(
+    unknowns: int, singular: real, pivots: wp.array[int], matrix: wp.array2d[Vec4]
+) -> int:
+    """Gaussian elimination by one thread of a CPU, sixteen columns at a time; the rank."""
+    ...
+
+
 @wp.func
-def solve_equations(unknowns: int, newton: Newton):
-    """Gaussian elimination, rows exchanged, four columns at a time; unknowns that the others make redundant stay zero,
-    which keeps the forces bounded. The step has them in the end."""
+def eliminate(unknowns: int, newton: Newton):
+    """The same by a block of threads, four columns at a time."""
     lanes = wp.block_dim()
     across = wp.min(lanes, _ACROSS)
     quads = (unknowns + 4) / 4
@@ -247,6 +318,18 @@ def solve_equations(unknowns: int, newton: Newton):
                     for quad in range(panel + 1 + newton.lane % across, quads, across):
                         newton.matrix[a, quad] = newton.matrix[a, quad] - share * newton.matrix[first + s, quad]
         wait_for_block()
+    return pivots
+
+
+@wp.func
+def solve_equations(unknowns: int, newton: Newton):
+    """Gaussian elimination, rows exchanged; unknowns that the others make redundant stay zero,
+    which keeps the forces bounded. The step has them in the end."""
+    pivots = Pivots()
+    if wp.block_dim() == 1:
+        pivots.rank = eliminate_alone(unknowns, _SINGULAR, newton.pivots, newton.matrix)
+    else:
+        pivots = eliminate(unknowns, newton)
     # Each lane writes the same here.
     for back in range(pivots.rank):
         row = pivots.rank - 1 - back

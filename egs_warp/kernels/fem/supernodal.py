@@ -1,11 +1,11 @@
 """Factors L D L^T of a sparse matrix by fronts, and solutions with them: dense arithmetic in vectors of four, on a CPU.
 
-See ``egs_warp/fem/sparse_factors.py``. Clang maps vectors and contracted products to what the processor has; four rows
-by eight columns of a product are what its registers hold.
+See ``egs_warp/fem/sparse_factors.py``.
 """
 
 import warp as wp
 
+from egs_warp.kernels.vectors import VECTORS
 from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
@@ -17,34 +17,8 @@ PANEL = 16
 PADDING = 8
 """Numbers behind an array that may be read, not used."""
 
-_SHARED = f"""
-    #pragma clang fp contract(fast)
+_SIZES = f"""
     constexpr int BLOCK = {BLOCK}, PANEL = {PANEL};
-    typedef double v4 __attribute__((ext_vector_type(4), aligned(8)));
-    // y[4][8] -= l[4][k] x[k][8]
-    auto take_off = [](double* y0, double* y1, double* y2, double* y3, const double* l0, const double* l1,
-                       const double* l2, const double* l3, const double* x, int stride, int k) {{
-        #pragma clang fp contract(fast)
-        v4 a0 = *(v4*)y0, a1 = *(v4*)(y0 + 4), b0 = *(v4*)y1, b1 = *(v4*)(y1 + 4);
-        v4 c0 = *(v4*)y2, c1 = *(v4*)(y2 + 4), d0 = *(v4*)y3, d1 = *(v4*)(y3 + 4);
-        for (int j = 0; j < k; ++j, x += stride) {{
-            const v4 x0 = *(const v4*)x, x1 = *(const v4*)(x + 4);
-            a0 -= l0[j] * x0; a1 -= l0[j] * x1; b0 -= l1[j] * x0; b1 -= l1[j] * x1;
-            c0 -= l2[j] * x0; c1 -= l2[j] * x1; d0 -= l3[j] * x0; d1 -= l3[j] * x1;
-        }}
-        *(v4*)y0 = a0; *(v4*)(y0 + 4) = a1; *(v4*)y1 = b0; *(v4*)(y1 + 4) = b1;
-        *(v4*)y2 = c0; *(v4*)(y2 + 4) = c1; *(v4*)y3 = d0; *(v4*)(y3 + 4) = d1;
-    }};
-    // The same of one row.
-    auto take_off_one = [](double* y, const double* l, const double* x, int stride, int k) {{
-        #pragma clang fp contract(fast)
-        v4 a0 = *(v4*)y, a1 = *(v4*)(y + 4);
-        for (int j = 0; j < k; ++j, x += stride) {{
-            a0 -= l[j] * *(const v4*)x;
-            a1 -= l[j] * *(const v4*)(x + 4);
-        }}
-        *(v4*)y = a0; *(v4*)(y + 4) = a1;
-    }};
 """
 
 
@@ -74,7 +48,8 @@ class Fronts:
 
 
 @wp.func_native(
-    _SHARED
+    VECTORS
+    + _SIZES
     + """
     double* const F = front.data;
     double* const T = F + front_size;
@@ -188,7 +163,8 @@ def factored(
 
 
 @wp.func_native(
-    _SHARED
+    VECTORS
+    + _SIZES
     + """
     const double* const given = (const double*)right;
     double* const found = (double*)solution;
