@@ -6,7 +6,7 @@ Three tables. Newton's iterations: as the jump took them, and done again from wh
 with the true Hessian of the elements and with the projected one in its place. Contact speeds: by how much what the
 tangent expects of a step's activations misses what is then solved, with the tangent where the body goes on rigidly and
 where the step is foreseen to end (rms and largest over the loaded contacts of all steps, m/s; the pawn is 1 m tall).
-Factors: a step's matrix factored, and solved for a right-hand side per muscle and contact row, by rslab and by scipy's
+Factors: a step's matrix factored, and solved for a right-hand side per muscle and contact row, by ours and by scipy's
 SuperLU. No aim is named for this benchmark.
 """
 
@@ -83,7 +83,7 @@ def contact_errors(creature: Creature, before: StepReport, step: StepReport) -> 
 
 
 def factor_times(creature: Creature, repeats: int) -> list[Row]:
-    """Milliseconds of rslab and SuperLU."""
+    """Milliseconds of ours and SuperLU."""
     assembly, body = creature.body.assembly, creature.body
     entries = assembly.hessian_entries(creature.start.positions, factor=(1.0 / 60.0) ** 2)
     entries[assembly.diagonal_entries] += np.repeat(body.node_mass, 3)
@@ -94,8 +94,8 @@ def factor_times(creature: Creature, repeats: int) -> list[Row]:
     ours.update(entries)
     milliseconds = median_ms(
         {
-            "rslab factor": lambda: ours.update(entries),
-            "rslab solve": lambda: ours.solve(right),
+            "ours factor": lambda: ours.update(entries),
+            "ours solve": lambda: ours.solve(right),
             "SuperLU factor": lambda: splu(full),
             "SuperLU solve": lambda: theirs.solve(right),
         },
@@ -109,7 +109,7 @@ def factor_times(creature: Creature, repeats: int) -> list[Row]:
             "factor": milliseconds[f"{solver} factor"],
             "solve": milliseconds[f"{solver} solve"],
         }
-        for solver in ("rslab", "SuperLU")
+        for solver in ("ours", "SuperLU")
     ]
 
 

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import scipy.linalg as dense
 import scipy.sparse as sparse
 import warp as wp
 
-from egs_warp.fem.supernodes import Supernodes
+from egs_warp.fem.front_layout import Layout, indices_of
+from egs_warp.fem.supernodes import Supernodes, first_of_alike
+from egs_warp.kernels.fem import products as products_kernels
 from egs_warp.kernels.fem import supernodal as kernels
 from egs_warp.launching import beside, launch_again
 from egs_warp.precision import real
 
 _SINGULAR = 1e-14
 """Of the largest diagonal entry: pivots that are as small have no reciprocal worth the name."""
+_FIRST_PART = 0.42
+"""Of the columns of a symmetric product."""
 _CPU = wp.get_device("cpu")
 
 
@@ -34,69 +36,29 @@ class SparseFactors:
         )
         full = (upper + sparse.triu(upper, 1).T).tocsc()
         full.sort_indices()
-        self._full_from_upper, self._full = full.data.astype(np.int64) - 1, (full.indices, full.indptr)
+        self._full_from_upper = full.data.astype(np.int64) - 1
+        self._full_values, self._full_array = _shared_zeros(full.nnz)
+        self._full = [indices_of(full.indptr), indices_of(full.indices), indices_of(first_of_alike(full))]
         self._diagonal = upper.indptr[1:] - 1
-        self._unknowns = upper.shape[0]
-        self._lay_out(Supernodes.of(upper), upper)
+        self._unknowns = len(upper.indptr) - 1
+        blocks = Supernodes.of(upper)
+        self.place = blocks.place
+        """(n,) of each row in the order of elimination."""
+        self._layout = Layout.of(blocks, upper)
+        self._entries, self._matrix = _shared_zeros(upper.nnz)
+        layout = self._layout
+        sizes = layout.front + layout.scratch, layout.stack, layout.factor, layout.inverses, self._unknowns
+        self._front, self._stack, self._factor, self._inverses, self._reciprocals = (
+            _shared_zeros(size + kernels.PADDING)[1] for size in sizes
+        )
+        self._negative = np.zeros(1, np.int32)
+        self._negative_array = wp.array(self._negative, dtype=int, device="cpu", copy=False)
+        self._room = _shared_zeros(0)[1]
         self._ready = False
         self._added: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         """U, S^-1 U and the inverse of the capacitance matrix."""
         self.negative_pivots = 0
         """Negative eigenvalues of the last matrix."""
-
-    def _lay_out(self, blocks: Supernodes, upper: sparse.csc_matrix) -> None:
-        """Where the numbers of each block lie."""
-        widths, heights, parents = (part.astype(np.int64) for part in (blocks.widths, blocks.heights, blocks.parents))
-        below = heights - widths
-        strides = -(-heights // 8) * 8
-        in_front = _places_in_fronts(blocks)
-        # An entry lies in the columns of the block that is eliminated first.
-        rows, columns = blocks.place[upper.indices], blocks.place[np.repeat(np.arange(self._unknowns), np.diff(upper.indptr))]
-        lower, higher = np.minimum(rows, columns), np.maximum(rows, columns)
-        block = np.repeat(np.arange(blocks.count), widths)[lower]
-        order = np.argsort(block, kind="stable")
-        places = in_front(block, higher) * strides[block] + lower - blocks.first[block]
-        has_parent = np.flatnonzero(parents >= 0)
-        children = has_parent[np.argsort(parents[has_parent], kind="stable")]
-        inside = np.repeat(parents, heights)
-        is_below = np.arange(len(blocks.rows)) - np.repeat(blocks.row_offsets[:-1], heights) >= np.repeat(widths, heights)
-        in_parent = np.zeros(len(blocks.rows), dtype=np.int64)
-        in_parent[is_below] = in_front(inside[is_below], blocks.rows[is_below])
-        updates, depth = _stacked(below, parents)
-        fronts = kernels.Fronts()
-        for name, values in {
-            "first": blocks.first,
-            "widths": blocks.widths,
-            "row_offsets": blocks.row_offsets,
-            "rows": blocks.rows,
-            "in_parent": in_parent,
-            "child_offsets": _offsets(np.bincount(parents[has_parent], minlength=blocks.count)),
-            "children": children,
-            "entry_offsets": _offsets(np.bincount(block, minlength=blocks.count)),
-            "entries": order,
-            "entry_places": places[order],
-            "factor_offsets": _offsets(heights * widths),
-            "inverse_offsets": _offsets(-(-widths // kernels.BLOCK) * kernels.BLOCK**2),
-            "update_offsets": updates,
-            "place": blocks.place,
-        }.items():
-            setattr(fronts, name, wp.array(np.asarray(values, dtype=np.int32), dtype=int, device="cpu"))
-        front_size = int((heights * strides).max())
-        self._fronts, self._blocks, self._front_size = fronts, blocks.count, front_size
-        self._entries, self._matrix = _shared_zeros(upper.nnz)
-        sizes = (
-            front_size + kernels.BLOCK * int(strides.max()),
-            depth,
-            int((heights * widths).sum()),
-            int((-(-widths // kernels.BLOCK)).sum()) * kernels.BLOCK**2,
-            self._unknowns,
-        )
-        self._front, self._stack, self._factor, self._inverses, self._reciprocals = (
-            _shared_zeros(size + kernels.PADDING)[1] for size in sizes
-        )
-        self._negative, self._negative_array = np.zeros(1, np.int32), None
-        self._negative_array = wp.array(self._negative, dtype=int, device="cpu", copy=False)
-        self._room = _shared_zeros(0)[1]
 
     def update(self, entries: np.ndarray) -> bool:
         """See ``Factors``. The factors of an indefinite matrix can be solved with all the same; without any, ``solve``
@@ -110,12 +72,12 @@ class SparseFactors:
             kernels.factor_kernel,
             1,
             inputs=[
-                self._fronts,
-                self._blocks,
+                self._layout.fronts,
+                len(self._layout.fronts.first),
                 self._matrix,
                 _SINGULAR * float(np.abs(entries[self._diagonal]).max()),
                 self._front,
-                self._front_size,
+                self._layout.front,
                 self._stack,
                 self._factor,
                 self._inverses,
@@ -160,11 +122,27 @@ class SparseFactors:
 
     def quadratic(self, entries: np.ndarray, moves: np.ndarray) -> np.ndarray:
         """See ``Factors``."""
-        matrix = sparse.csr_matrix((entries[self._full_from_upper], *self._full), shape=(len(moves), len(moves)))
+        self._full_values[:] = entries[self._full_from_upper]
         moves = np.ascontiguousarray(moves)
-        half = moves.shape[1] // 2
-        parts = beside(lambda: moves.T @ (matrix @ moves[:, :half]), lambda: moves.T @ (matrix @ moves[:, half:]))
-        return np.hstack(parts)
+        products, count = np.empty_like(moves), moves.shape[1]
+        strips = -(-count // products_kernels.STRIP)
+        inputs = [self._unknowns, *self._full, self._full_array, moves.ctypes.data, count, products.ctypes.data]
+
+        def part(first: int, last: int) -> np.ndarray:
+            """The columns of some strips, from their own rows on: the rest is their mirror image."""
+            launch_again(
+                products_kernels.product_kernel, last - first, inputs=[first, *inputs], outputs=[], device=_CPU
+            )
+            begin, end = first * products_kernels.STRIP, min(last * products_kernels.STRIP, count)
+            return moves[:, begin:].T @ products[:, begin:end]
+
+        # The first has more rows: less than half of them are as much work.
+        half = max(1, int(_FIRST_PART * strips))
+        first, second = beside(lambda: part(0, half), lambda: part(half, strips)) if strips > 1 else (part(0, 1), None)
+        if second is None:
+            return first
+        inside = first.shape[1]
+        return np.block([[first[:inside], first[inside:].T], [first[inside:], second]])
 
     def take(self, values: np.ndarray) -> np.ndarray:
         """See ``Factors``."""
@@ -184,8 +162,8 @@ class SparseFactors:
         if self._room.size < panels * (self._unknowns + 4) * kernels.PANEL:
             self._room = _shared_zeros(panels * (self._unknowns + 4) * kernels.PANEL)[1]
         inputs = [
-            self._fronts,
-            self._blocks,
+            self._layout.fronts,
+            len(self._layout.fronts.first),
             self._unknowns,
             self._factor,
             self._inverses,
@@ -208,39 +186,9 @@ class SparseFactors:
         return solution
 
 
-def _offsets(counts: np.ndarray) -> np.ndarray:
-    return np.concatenate([[0], np.cumsum(counts)])
-
-
 def _shared_zeros(size: int) -> tuple[np.ndarray, wp.array]:
     values = np.zeros(size)
     return values, wp.array(values, dtype=real, device="cpu", copy=False)
-
-
-def _places_in_fronts(blocks: Supernodes) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Where permuted rows lie in the fronts of given blocks."""
-    owner = np.repeat(np.arange(blocks.count, dtype=np.int64), blocks.heights)
-    keys = owner * len(blocks.place) + blocks.rows
-
-    def found(block: np.ndarray, row: np.ndarray) -> np.ndarray:
-        return np.searchsorted(keys, block * len(blocks.place) + row) - blocks.row_offsets[block]
-
-    return found
-
-
-def _stacked(below: np.ndarray, parents: np.ndarray) -> tuple[np.ndarray, int]:
-    """(S,) where on a stack each block leaves what its parent is still to take, and how much room all need: a block
-    takes its children's off before it leaves its own."""
-    waiting: list[int] = []
-    where, top, most = np.zeros(len(below), dtype=np.int64), 0, 0
-    for block, size in enumerate(below):
-        while waiting and parents[waiting[-1]] == block:
-            top -= int(below[waiting.pop()]) ** 2
-        where[block] = top
-        top += int(size) ** 2
-        most = max(most, top)
-        waiting.append(block)
-    return where, most
 
 
 def inverse_and_positives(symmetric: np.ndarray) -> tuple[int, np.ndarray]:

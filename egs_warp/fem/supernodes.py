@@ -7,6 +7,7 @@ the same rows are kept as one dense block.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sparse
@@ -52,7 +53,9 @@ class Supernodes:
     @classmethod
     def of(cls, upper: sparse.csc_matrix) -> Supernodes:
         """Of a symmetric matrix with a pattern whose upper triangle is ``upper``, its diagonal included."""
-        groups = _alike(upper)
+        full = (upper + upper.T).tocsc()
+        full.sort_indices()
+        groups = np.cumsum(first_of_alike(full)) - 1
         sizes = np.bincount(groups)
         thin = _between_groups(upper, groups, len(sizes))
         order = _ordered(thin)
@@ -65,11 +68,15 @@ class Supernodes:
         within = np.argsort(where[groups], kind="stable")
         place = np.empty(len(groups), dtype=np.int32)
         place[within] = np.arange(len(groups))
-        fronts = [np.concatenate([np.arange(starts[c], starts[c + 1]) for c in (*own, *below)]) for own, below in blocks]
+        fronts = [
+            np.concatenate([np.arange(starts[c], starts[c + 1]) for c in (*own, *below)]) for own, below in blocks
+        ]
         widths = np.array([starts[own[-1] + 1] - starts[own[0]] for own, _ in blocks], dtype=np.int32)
         first = np.array([starts[own[0]] for own, _ in blocks], dtype=np.int32)
         block_of = np.repeat(np.arange(len(blocks)), widths)
-        parents = [block_of[front[width]] if len(front) > width else -1 for front, width in zip(fronts, widths, strict=True)]
+        parents = [
+            block_of[front[width]] if len(front) > width else -1 for front, width in zip(fronts, widths, strict=True)
+        ]
         offsets = np.concatenate([[0], np.cumsum([len(front) for front in fronts])])
         return cls(
             place,
@@ -81,21 +88,19 @@ class Supernodes:
         )
 
 
-def _alike(upper: sparse.csc_matrix) -> np.ndarray:
-    """(n,) numbers of groups of rows that reach the same ones, as the three of a node do; those of one group follow one
-    another."""
-    full = (upper + upper.T).tocsc()
-    full.sort_indices()
-    keys = [full.indices[a:b].tobytes() for a, b in zip(full.indptr[:-1], full.indptr[1:], strict=True)]
-    new = [True, *(key != last for last, key in zip(keys[:-1], keys[1:], strict=True))]
-    return np.cumsum(new) - 1
+def first_of_alike(full: sparse.csc_matrix) -> np.ndarray:
+    """(n,) whether a row of a symmetric pattern, both triangles of it, sorted, reaches others than the row before; the
+    three of a node reach the same."""
+    keys = [full.indices[a:b].tobytes() for a, b in pairwise(full.indptr)]
+    return np.array([True, *(key != last for last, key in pairwise(keys))])
 
 
 def _between_groups(upper: sparse.csc_matrix, groups: np.ndarray, count: int) -> sparse.csc_matrix:
     """(G, G) the pattern of both triangles, diagonally dominant."""
     entries = upper.tocoo()
     rows, columns = groups[entries.row], groups[entries.col]
-    thin = sparse.coo_matrix((np.ones(2 * len(rows)), (np.r_[rows, columns], np.r_[columns, rows])), (count, count)).tocsc()
+    both = np.concatenate([rows, columns]), np.concatenate([columns, rows])
+    thin = sparse.csc_matrix((np.ones(2 * len(rows)), both), (count, count))
     thin.sum_duplicates()
     thin.data[:] = -1.0
     thin.setdiag(1.0 + np.diff(thin.indptr))
@@ -161,7 +166,7 @@ def _fundamental(columns: list[np.ndarray]) -> tuple[list[tuple[int, int]], list
 def _merged(
     runs: list[tuple[int, int]], below: list[np.ndarray], sizes: np.ndarray, count: int
 ) -> list[tuple[range, np.ndarray]]:
-    """Columns and rows below of blocks: a run joins the block after it, whose child it is, where that adds few zeros."""
+    """Columns and rows below of blocks: a run joins the one after it, whose child it is, where that adds few zeros."""
     starts = np.concatenate([[0], np.cumsum(sizes)])
 
     def area(first: int, last: int, rows: np.ndarray) -> float:

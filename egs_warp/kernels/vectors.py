@@ -3,8 +3,7 @@
 Clang maps vectors and contracted products to what the processor has.
 """
 
-VECTORS = """
-#if !defined(__CUDA_ARCH__)
+_PRODUCTS = """
     #pragma clang fp contract(fast)
     typedef double v4 __attribute__((ext_vector_type(4), aligned(8)));
     // y[4][8] -= l[4][k] x[k][8]
@@ -31,5 +30,10 @@ VECTORS = """
         }
         *(v4*)y = a0; *(v4*)(y + 4) = a1;
     };
-#endif
 """
+
+
+def on_cpu(body: str, *, elsewhere: str = "") -> str:
+    """``body``, which may use ``v4``, ``take_off`` and ``take_off_one``, on a CPU; on a GPU, which never comes there,
+    ``elsewhere``."""
+    return f"#if !defined(__CUDA_ARCH__)\n{_PRODUCTS}{body}\n#else\n{elsewhere}\n#endif\n"

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 SCHEMA_VERSION = 1
-MECHANICS = ("warp-lang", "numpy", "scipy", "osqp", "rslab", "pytetwild")
+MECHANICS = ("warp-lang", "numpy", "scipy", "osqp", "pytetwild")
 """Packages that decide how a body moves."""
 NO_METADATA = "no metadata"
 """In place of the version of a package that is missing, or was copied without its ``dist-info``."""

@@ -7,6 +7,8 @@ import pytest
 import scipy.sparse as sparse
 
 from egs_warp.fem.sparse_factors import SparseFactors, inverse_and_positives
+from egs_warp.launching import THREADS
+from tests.support.sparse_patterns import PATTERNS, upper_of
 
 
 def random_matrix(count: int, shift: float) -> sparse.csc_matrix:
@@ -14,12 +16,6 @@ def random_matrix(count: int, shift: float) -> sparse.csc_matrix:
     random = np.random.default_rng(3)
     half = sparse.csc_matrix(np.where(random.random((count, count)) < 0.1, random.standard_normal((count, count)), 0.0))
     return sparse.csc_matrix(half + half.T + shift * sparse.eye(count))
-
-
-def upper_of(matrix: sparse.csc_matrix) -> sparse.csc_matrix:
-    upper = sparse.csc_matrix(sparse.triu(matrix))
-    upper.sort_indices()
-    return upper
 
 
 @pytest.mark.parametrize("shift", [12.0, 0.7])
@@ -50,6 +46,72 @@ def test_what_cannot_be_factored_is_told() -> None:
     singular = sparse.csc_matrix(np.ones((2, 2)))
     factors = SparseFactors(upper_of(singular))
     assert not factors.update(np.ones(3)) and not factors.ready
+
+
+@pytest.mark.parametrize("name", PATTERNS)
+def test_every_pattern_and_number_of_right_sides(name: str) -> None:
+    """To rounding, whatever their order in memory; the bits of each do not hang on how many there are with it, but for
+    one alone."""
+    matrix = PATTERNS[name]
+    factors, count = SparseFactors(upper_of(matrix)), len(matrix.indptr) - 1
+    assert factors.update(upper_of(matrix).data) and factors.negative_pivots == 0
+    right = np.random.default_rng(5).standard_normal((count, 70))
+    whole = factors.solve(right)
+    assert np.abs(matrix @ whole - right).max() < 1e-12 * np.abs(right).max() * count
+    for width in (2, 3, 8, 9, 15, 16, 17, 33):
+        np.testing.assert_array_equal(factors.solve(right[:, :width]), whole[:, :width])
+    np.testing.assert_array_equal(factors.solve(np.asfortranarray(right)), whole)
+    np.testing.assert_array_equal(factors.solve(right[:, ::-2]), whole[:, ::-2])
+    np.testing.assert_allclose(factors.solve(right[:, 3]), whole[:, 3], atol=1e-13)
+    np.testing.assert_array_equal(factors.solve(right[:, [3]])[:, 0], factors.solve(right[:, 3].copy()))
+
+
+@pytest.mark.parametrize("name", PATTERNS)
+def test_a_quadratic_form_of_many_moves(name: str) -> None:
+    """X^T H X of a matrix of the same pattern, which none is factored for."""
+    matrix = PATTERNS[name]
+    factors, random = SparseFactors(upper_of(matrix)), np.random.default_rng(6)
+    for width in (1, 4, 8, 13, 16, 41):
+        moves = random.standard_normal((len(matrix.indptr) - 1, width))
+        expected = moves.T @ (matrix @ moves)
+        for given in (moves, np.asfortranarray(moves)):
+            found = factors.quadratic(upper_of(matrix).data, given)
+            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
+
+
+def test_the_same_bits_on_any_number_of_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    matrix, found = PATTERNS["grid of nodes"], []
+    right = np.random.default_rng(7).standard_normal((len(matrix.indptr) - 1, 50))
+    for threads in ("1", "2"):
+        monkeypatch.setenv(THREADS, threads)
+        factors = SparseFactors(upper_of(matrix))
+        factors.update(upper_of(matrix).data)
+        found.append((factors.solve(right), factors.quadratic(upper_of(matrix).data, right)))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_pivot_next_to_nothing_has_no_factors() -> None:
+    """In the middle of a block as at its start; what is only indefinite has."""
+    matrix = PATTERNS["full, of fifty"].toarray()
+    whole = upper_of(sparse.csc_matrix(matrix))
+    factors = SparseFactors(whole)
+    # The matrix whose Schur complement at the last of k rows, in the order of elimination, is so much of the diagonal.
+    place = np.argsort(factors.place)
+    for k in (1, 17, 50):
+        inside, last = place[: k - 1], place[k - 1]
+        schur = matrix[last, inside] @ np.linalg.solve(matrix[np.ix_(inside, inside)], matrix[inside, last])
+        for share, ready in ((1e-16, False), (-0.1, True)):
+            changed = matrix.copy()
+            changed[last, last] = schur + share * matrix[last, last]
+            data = upper_of(sparse.csc_matrix(np.where(changed == 0.0, 1e-300, changed))).data
+            assert not factors.update(data) and factors.ready == ready
+            if ready:
+                assert factors.negative_pivots == 1
+                np.testing.assert_allclose(
+                    changed @ factors.solve(matrix[:, :3]), matrix[:, :3], atol=1e-9 * matrix.max()
+                )
+    assert factors.update(whole.data)
 
 
 @pytest.mark.parametrize("size", [2, 7, 60])

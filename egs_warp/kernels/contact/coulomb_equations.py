@@ -6,7 +6,7 @@ A problem has a block of threads to itself, see ``kernels.contact.coulomb``; a t
 import warp as wp
 
 from egs_warp.kernels.block import wait_for_block
-from egs_warp.kernels.vectors import VECTORS
+from egs_warp.kernels.vectors import on_cpu
 from egs_warp.precision import Vec3, Vec4, real
 
 wp.set_module_options({"enable_backward": False})
@@ -214,9 +214,8 @@ def eliminate_panel(panel: int, unknowns: int, pivots: Pivots, newton: Newton):
 
 
 @wp.func_native(
-    VECTORS
-    + """
-#if !defined(__CUDA_ARCH__)
+    on_cpu(
+        """
     constexpr int PANEL = 16;
     double* const M = (double*)matrix.data;
     const int stride = matrix.strides[0] / 8, columns = (unknowns + 4) & ~3;
@@ -235,8 +234,11 @@ def eliminate_panel(panel: int, unknowns: int, pivots: Pivots, newton: Newton):
             if (!(size > singular * largest)) continue;
             largest = size > largest ? size : largest;
             double *const top = M + rank * stride, *const other = M + pivot * stride;
-            if (pivot != rank)
-                for (int c = begin; c < columns; ++c) { const double kept = top[c]; top[c] = other[c]; other[c] = kept; }
+            for (int c = begin; pivot != rank && c < columns; ++c) {
+                const double kept = top[c];
+                top[c] = other[c];
+                other[c] = kept;
+            }
             for (int a = rank + 1; a < unknowns; ++a) {
                 double* const row = M + a * stride;
                 const double factor = row[j] / top[j];
@@ -272,14 +274,11 @@ def eliminate_panel(panel: int, unknowns: int, pivots: Pivots, newton: Newton):
         }
     }
     return rank;
-#else
-    return 0;
-#endif
-"""
+""",
+        elsewhere="return 0;",
+    )
 )
-def eliminate_alone(
-    unknowns: int, singular: real, pivots: wp.array[int], matrix: wp.array2d[Vec4]
-) -> int:
+def eliminate_alone(unknowns: int, singular: real, pivots: wp.array[int], matrix: wp.array2d[Vec4]) -> int:
     """Gaussian elimination by one thread of a CPU, sixteen columns at a time; the rank."""
     ...
 

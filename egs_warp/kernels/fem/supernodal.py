@@ -5,7 +5,7 @@ See ``egs_warp/fem/sparse_factors.py``.
 
 import warp as wp
 
-from egs_warp.kernels.vectors import VECTORS
+from egs_warp.kernels.vectors import on_cpu
 from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
@@ -14,7 +14,7 @@ BLOCK = 16
 """Columns of a front that are eliminated, or solved for, at once; an inverse is kept of each such diagonal block."""
 PANEL = 16
 """Right-hand sides of a panel, in a row of memory for each unknown."""
-PADDING = 8
+PADDING = 16
 """Numbers behind an array that may be read, not used."""
 
 _SIZES = f"""
@@ -48,9 +48,9 @@ class Fronts:
 
 
 @wp.func_native(
-    VECTORS
-    + _SIZES
-    + """
+    on_cpu(
+        _SIZES
+        + """
     double* const F = front.data;
     double* const T = F + front_size;
     double u[BLOCK], reciprocal[BLOCK], X[BLOCK * BLOCK], P[4 * BLOCK];
@@ -144,7 +144,9 @@ class Fronts:
             for (int b = 0; b <= a; ++b) U[a * r + b] = F[(w + a) * ld + w + b];
     }
     return negative;
-"""
+""",
+        elsewhere="return 0;",
+    )
 )
 def factored(
     fronts: Fronts,
@@ -163,9 +165,9 @@ def factored(
 
 
 @wp.func_native(
-    VECTORS
-    + _SIZES
-    + """
+    on_cpu(
+        _SIZES
+        + """
     const double* const given = (const double*)right;
     double* const found = (double*)solution;
     double* const x = room.data + (long long)panel * (unknowns + 4) * PANEL;
@@ -258,6 +260,7 @@ def factored(
         for (int q = 0; q < columns; ++q) to[q] = row[q];
     }
 """
+    )
 )
 def solved_panel(
     fronts: Fronts,
@@ -279,6 +282,84 @@ def solved_panel(
     ...
 
 
+@wp.func_native(
+    on_cpu(
+        _SIZES
+        + """
+    const double* const given = (const double*)right;
+    double* const found = (double*)solution;
+    double* const x = room.data;
+    auto sum_of = [](v4 v) { return (v[0] + v[1]) + (v[2] + v[3]); };
+    for (int i = 0; i < unknowns; ++i) x[fronts.place.data[i]] = given[i * row_stride];
+    for (int s = 0; s < blocks; ++s) {
+        const int begin = fronts.row_offsets.data[s], f = fronts.row_offsets.data[s + 1] - begin;
+        const int w = fronts.widths.data[s], column = fronts.first.data[s];
+        const int* const rows = fronts.rows.data + begin;
+        const double* const L = factor.data + fronts.factor_offsets.data[s];
+        const double* inverse = inverses.data + fronts.inverse_offsets.data[s];
+        for (int b = 0; b < w; b += BLOCK, inverse += BLOCK * BLOCK) {
+            const int nb = w - b < BLOCK ? w - b : BLOCK, fours = (nb + 3) >> 2;
+            double* const own = x + column + b;
+            double kept[BLOCK] = {0.0};
+            for (int j = 0; j < nb; ++j) kept[j] = own[j];
+            for (int i = 0; i < nb; ++i) {
+                v4 a = 0.0;
+                for (int k = 0; k < fours; ++k) a += *(const v4*)(inverse + i * BLOCK + 4 * k) * *(v4*)(kept + 4 * k);
+                own[i] = sum_of(a);
+            }
+            for (int j = 0; j < nb; ++j) kept[j] = own[j];
+            // What is behind a row's end is multiplied by zero.
+            const double* l = L + (b + nb) * w + b;
+            for (int i = b + nb; i < f; ++i, l += w) {
+                v4 a = *(const v4*)l * *(v4*)kept;
+                for (int k = 1; k < fours; ++k) a += *(const v4*)(l + 4 * k) * *(v4*)(kept + 4 * k);
+                x[rows[i]] -= sum_of(a);
+            }
+        }
+    }
+    for (int i = 0; i < unknowns; ++i) x[i] *= reciprocals.data[i];
+    for (int s = blocks - 1; s >= 0; --s) {
+        const int begin = fronts.row_offsets.data[s], f = fronts.row_offsets.data[s + 1] - begin;
+        const int w = fronts.widths.data[s], column = fronts.first.data[s];
+        const int* const rows = fronts.rows.data + begin;
+        const double* const L = factor.data + fronts.factor_offsets.data[s];
+        for (int b = (w - 1) & ~(BLOCK - 1); b >= 0; b -= BLOCK) {
+            const int nb = w - b < BLOCK ? w - b : BLOCK, fours = (nb + 3) >> 2;
+            const double* const inverse = inverses.data + fronts.inverse_offsets.data[s] + b * BLOCK;
+            double* const own = x + column + b;
+            v4 a[4] = {0.0, 0.0, 0.0, 0.0}, c[4] = {0.0, 0.0, 0.0, 0.0};
+            const double* l = L + (b + nb) * w + b;
+            for (int i = b + nb; i < f; ++i, l += w) {
+                const double by = x[rows[i]];
+                for (int k = 0; k < fours; ++k) a[k] += *(const v4*)(l + 4 * k) * by;
+            }
+            for (int i = 0; i < nb; ++i) {
+                const double by = own[i] - a[i >> 2][i & 3];
+                for (int k = 0; k < fours; ++k) c[k] += *(const v4*)(inverse + i * BLOCK + 4 * k) * by;
+            }
+            for (int i = 0; i < nb; ++i) own[i] = c[i >> 2][i & 3];
+        }
+    }
+    for (int i = 0; i < unknowns; ++i) found[i] = x[fronts.place.data[i]];
+"""
+    )
+)
+def solved_one(
+    fronts: Fronts,
+    blocks: wp.int32,
+    unknowns: wp.int32,
+    factor: wp.array[real],
+    inverses: wp.array[real],
+    reciprocals: wp.array[real],
+    right: wp.uint64,
+    row_stride: wp.int32,
+    room: wp.array[real],
+    solution: wp.uint64,
+) -> None:
+    """The same of one right-hand side alone."""
+    ...
+
+
 @wp.kernel
 def factor_kernel(
     fronts: Fronts,
@@ -294,9 +375,7 @@ def factor_kernel(
     negative: wp.array[wp.int32],
 ) -> None:
     """See ``factored``."""
-    negative[0] = factored(
-        fronts, count, matrix, least, front, front_size, stack, factor, inverses, reciprocals
-    )
+    negative[0] = factored(fronts, count, matrix, least, front, front_size, stack, factor, inverses, reciprocals)
 
 
 @wp.kernel
@@ -316,6 +395,9 @@ def solve_kernel(
     solution: wp.uint64,
 ) -> None:
     """One thread a panel, see ``solved_panel``."""
+    if count == 1:
+        solved_one(fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, room, solution)
+        return
     solved_panel(
         fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, column_stride, count,
         first_panel + wp.tid(), room, solution,

@@ -24,22 +24,10 @@ FEM = [
         "one offset more, the last one again, which bounds nothing",
     ),
     Survivor(
-        "fem/sparse_factors.py",
-        'self._symbolic = rslab.analyze(full, path="ldlt", threads=1)',
-        'self._symbolic = rslab.analyze(full, path="ldlt", threads= 2)',
-        "threads do not change the order that is found",
-    ),
-    Survivor(
         "fem/factors.py",
         "@property",
         "",
         "of a Protocol, which nothing runs",
-    ),
-    Survivor(
-        "fem/sparse_factors.py",
-        "if right.shape[1] < _SPLIT:",
-        "if right.shape[1] == _SPLIT:",
-        "which right-hand sides have a second thread; the bits are the same",
     ),
     Survivor(
         "kernels/fem/elasticity.py",

@@ -1,0 +1,50 @@
+"""The symbolic analysis: blocks hold all that a factor has, in an order in which they can be eliminated."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sparse
+
+from egs_warp.fem.supernodes import Supernodes, first_of_alike
+from tests.support.sparse_patterns import PATTERNS, upper_of
+
+
+@pytest.mark.parametrize("name", PATTERNS)
+def test_blocks_hold_the_factor(name: str) -> None:
+    """Of a matrix with that pattern, every entry of L that is not zero lies in a block; blocks tile the columns."""
+    matrix = PATTERNS[name]
+    blocks, count = Supernodes.of(upper_of(matrix)), len(matrix.indptr) - 1
+    assert np.array_equal(np.sort(blocks.place), np.arange(count))
+    assert np.array_equal(blocks.first, np.cumsum([0, *blocks.widths[:-1]])) and blocks.widths.sum() == count
+    order = np.argsort(blocks.place)
+    factor = np.linalg.cholesky(matrix.toarray()[np.ix_(order, order)])
+    held = np.zeros((count, count), dtype=bool)
+    for s in range(blocks.count):
+        front = blocks.rows[blocks.row_offsets[s] : blocks.row_offsets[s + 1]]
+        own = np.arange(blocks.first[s], blocks.first[s] + blocks.widths[s])
+        assert np.array_equal(front[: len(own)], own) and (np.diff(front) > 0).all()
+        held[np.ix_(front, own)] = True
+        # What is below is taken in by the parent, which comes later.
+        below, parent = front[len(own) :], blocks.parents[s]
+        assert (parent < 0) == (len(below) == 0)
+        if parent >= 0:
+            assert parent > s
+            assert np.isin(below, blocks.rows[blocks.row_offsets[parent] : blocks.row_offsets[parent + 1]]).all()
+    assert not (np.abs(factor) > 0.0)[~held].any()
+
+
+def test_blocks_of_a_mesh_are_wide_and_nearly_full() -> None:
+    """The three rows of a node are one; of what the blocks of a grid of nodes hold, most is not zero."""
+    matrix = PATTERNS["grid of nodes"]
+    full = sparse.csc_matrix(matrix)
+    full.sort_indices()
+    assert np.array_equal(np.flatnonzero(first_of_alike(full)), np.arange(0, len(full.indptr) - 1, 3))
+    blocks = Supernodes.of(upper_of(matrix))
+    assert (blocks.widths % 3 == 0).all() and blocks.count < len(full.indptr) / 6
+    order = np.argsort(blocks.place)
+    factor = np.linalg.cholesky(matrix.toarray()[np.ix_(order, order)])
+    held = (blocks.widths * (blocks.heights - 0.5 * (blocks.widths - 1.0))).sum()
+    assert held < 1.35 * np.count_nonzero(np.abs(factor) > 1e-14)
+    # An order as it comes would hold half as much again.
+    assert held < np.count_nonzero(np.abs(np.linalg.cholesky(matrix.toarray())) > 1e-14) / 1.5
