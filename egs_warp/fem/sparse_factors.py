@@ -31,6 +31,9 @@ class SparseFactors:
 
     def __init__(self, upper_pattern: sparse.csc_matrix | sparse.csc_array) -> None:
         """``upper_pattern``: upper triangle with the diagonal, entries in the order of ``update``."""
+        # Two threads at once cannot load them.
+        for kernel in (kernels.solve_kernel, products_kernels.product_kernel):
+            kernel.module.load(_CPU, block_dim=1)
         upper = sparse.csc_matrix(
             (np.arange(1.0, upper_pattern.nnz + 1.0), upper_pattern.indices, upper_pattern.indptr), upper_pattern.shape
         )
