@@ -8,6 +8,7 @@ import warp as wp
 
 from egs_warp.kernels.block import wait_for_block
 from egs_warp.kernels.contact.coulomb_equations import Contacts, Newton, rate_of, solve_equations, write_equations
+from egs_warp.kernels.vectors import on_cpu
 from egs_warp.precision import Vec3, Vec4, real
 
 wp.set_module_options({"enable_backward": False})
@@ -40,19 +41,50 @@ _POLISHED = wp.constant(real(1e-2))
 """Of the tolerance: what is so near is left as it is."""
 
 
+@wp.func_native(
+    on_cpu(
+        """
+    const int n = 3 * i, stride = delassus.strides[0] / 8;
+    const double *const g = (const double*)delassus.data + n * stride, *const f = forces.data;
+    v4 a = 0.0, b = 0.0, c = 0.0;
+    int k = 0;
+    for (; k + 4 <= size; k += 4) {
+        const v4 by = *(const v4*)(f + k);
+        a += *(const v4*)(g + k) * by;
+        b += *(const v4*)(g + stride + k) * by;
+        c += *(const v4*)(g + 2 * stride + k) * by;
+    }
+    double normal = (a[0] + a[1]) + (a[2] + a[3]), first = (b[0] + b[1]) + (b[2] + b[3]);
+    double second = (c[0] + c[1]) + (c[2] + c[3]);
+    for (; k < size; ++k) {
+        normal += g[k] * f[k];
+        first += g[stride + k] * f[k];
+        second += g[2 * stride + k] * f[k];
+    }
+    return wp::vec_t<3, double>(normal, first, second);
+""",
+        elsewhere="""
+    const int n = 3 * i, stride = delassus.strides[0] / 8;
+    const double *const g = (const double*)delassus.data + n * stride, *const f = forces.data;
+    double normal = 0.0, first = 0.0, second = 0.0;
+    for (int k = 0; k < size; ++k) {
+        normal += g[k] * f[k];
+        first += g[stride + k] * f[k];
+        second += g[2 * stride + k] * f[k];
+    }
+    return wp::vec_t<3, double>(normal, first, second);
+""",
+    )
+)
+def speeds_by(delassus: wp.array2d[real], size: int, i: int, forces: wp.array[real]) -> Vec3:
+    """See ``speeds_of``."""
+    ...
+
+
 @wp.func
 def speeds_of(contacts: Contacts, i: int, forces: wp.array[real]):
     """That ``forces`` (3n,) give contact ``i``, m/s."""
-    n = 3 * i
-    normal = real(0.0)
-    first = real(0.0)
-    second = real(0.0)
-    for k in range(3 * contacts.count):
-        force = forces[k]
-        normal += contacts.delassus[n, k] * force
-        first += contacts.delassus[n + 1, k] * force
-        second += contacts.delassus[n + 2, k] * force
-    return Vec3(normal, first, second)
+    return speeds_by(contacts.delassus, 3 * contacts.count, i, forces)
 
 
 @wp.func

@@ -73,15 +73,47 @@ def rate_of(contacts: Contacts, i: int, scale: real):
     return scale * real(3.0) / trace
 
 
-@wp.func
-def weighted(contacts: Contacts, weights: Vec3, n: int, column: int):
-    """Of a row of the derivative in a ``column``: ``weights`` of the contact's three rows of the Delassus operator,
-    from ``n`` on."""
-    return (
-        weights[0] * contacts.delassus[n, column]
-        + weights[1] * contacts.delassus[n + 1, column]
-        + weights[2] * contacts.delassus[n + 2, column]
-    )
+@wp.func_native("""
+    const int n = row - row % 3, stride = delassus.strides[0] / 8;
+    const double* const g = (const double*)delassus.data + n * stride;
+    double* const out = (double*)((char*)matrix.data + a * matrix.strides[0]);
+    const double w0 = weights[0], w1 = weights[1], w2 = weights[2];
+    double right = -values.data[row];
+    for (int c = 0; c < size; ++c) {
+        const double moved = step.data[c];
+        if (moved != 0.0) right -= (w0 * g[c] + w1 * g[stride + c] + w2 * g[2 * stride + c]) * moved;
+    }
+    for (int t = 0; t < 3; ++t) right -= own[t] * step.data[n + t];
+    if (unknowns == size) {
+        for (int c = 0; c < size; ++c) out[c] = w0 * g[c] + w1 * g[stride + c] + w2 * g[2 * stride + c];
+        for (int t = 0; t < 3; ++t) out[n + t] += own[t];
+    } else {
+        for (int b = 0; b < unknowns; ++b) {
+            const int c = columns.data[b];
+            out[b] = w0 * g[c] + w1 * g[stride + c] + w2 * g[2 * stride + c];
+            if (c >= n && c < n + 3) out[b] += own[c - n];
+        }
+    }
+    out[unknowns] = right;
+    for (int b = unknowns + 1; b & 3; ++b) out[b] = 0.0;
+""")
+def write_row(
+    delassus: wp.array2d[real],
+    step: wp.array[real],
+    values: wp.array[real],
+    columns: wp.array[int],
+    size: int,
+    unknowns: int,
+    a: int,
+    row: int,
+    weights: Vec3,
+    own: Vec3,
+    matrix: wp.array2d[Vec4],
+):
+    """Row ``a`` of the equations, that of ``row`` of the derivative: ``weights`` of its contact's three rows of the
+    Delassus operator and its ``own`` three entries, in the ``columns`` that are unknown; its right side, less what the
+    others' steps move."""
+    ...
 
 
 @wp.func
@@ -135,34 +167,10 @@ def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, sho
                 weights = Vec3(real(0.0), rate * along[0], rate * along[1])
                 own = Vec3(-contacts.friction * mine, -along[0], -along[1])
                 own[row - n] = own[row - n] + real(1.0)
-        right = -newton.values[row]
-        for c in range(3 * contacts.count):
-            moved = newton.step[c]
-            if moved != real(0.0):
-                right -= weighted(contacts, weights, n, c) * moved
-                if c >= n and c < n + 3:
-                    right -= own[c - n] * moved
-        sliding = weights[row - n] != rate
-        for quad in range((unknowns + 4) / 4):
-            four = Vec4()
-            for k in range(4):
-                b = 4 * quad + k
-                if b < unknowns:
-                    column = newton.unknowns[b]
-                    if sliding:
-                        four[k] = weighted(contacts, weights, n, column)
-                    else:
-                        four[k] = rate * contacts.delassus[row, column]
-                if b == unknowns:
-                    four[k] = right
-            newton.matrix[a, quad] = four
-        # Those of a contact that are unknown follow each other.
-        for t in range(3):
-            b = a + n + t - row
-            if own[t] != real(0.0) and newton.unknowns[wp.max(b, 0)] == n + t:
-                four = newton.matrix[a, b / 4]
-                four[b % 4] = four[b % 4] + own[t]
-                newton.matrix[a, b / 4] = four
+        write_row(
+            contacts.delassus, newton.step, newton.values, newton.unknowns, 3 * contacts.count, unknowns, a, row,
+            weights, own, newton.matrix,
+        )  # fmt: skip
     wait_for_block()
     return unknowns
 
@@ -273,13 +281,25 @@ def eliminate_panel(panel: int, unknowns: int, pivots: Pivots, newton: Newton):
                 }
         }
     }
-    return rank;
+    for (int back = rank - 1; back >= 0; --back) {
+        const double* const row = M + back * stride;
+        const int j = pivots.data[back];
+        double value = row[unknowns];
+        for (int b = j + 1; b < unknowns; ++b) value -= row[b] * step.data[places.data[b]];
+        step.data[places.data[j]] = value / row[j];
+    }
 """,
-        elsewhere="return 0;",
     )
 )
-def eliminate_alone(unknowns: int, singular: real, pivots: wp.array[int], matrix: wp.array2d[Vec4]) -> int:
-    """Gaussian elimination by one thread of a CPU, sixteen columns at a time; the rank."""
+def solve_alone(
+    unknowns: int,
+    singular: real,
+    pivots: wp.array[int],
+    places: wp.array[int],
+    matrix: wp.array2d[Vec4],
+    step: wp.array[real],
+):
+    """``solve_equations`` by one thread of a CPU, sixteen columns at a time."""
     ...
 
 
@@ -324,11 +344,10 @@ def eliminate(unknowns: int, newton: Newton):
 def solve_equations(unknowns: int, newton: Newton):
     """Gaussian elimination, rows exchanged; unknowns that the others make redundant stay zero,
     which keeps the forces bounded. The step has them in the end."""
-    pivots = Pivots()
     if wp.block_dim() == 1:
-        pivots.rank = eliminate_alone(unknowns, _SINGULAR, newton.pivots, newton.matrix)
-    else:
-        pivots = eliminate(unknowns, newton)
+        solve_alone(unknowns, _SINGULAR, newton.pivots, newton.unknowns, newton.matrix, newton.step)
+        return
+    pivots = eliminate(unknowns, newton)
     # Each lane writes the same here.
     for back in range(pivots.rank):
         row = pivots.rank - 1 - back
