@@ -17,7 +17,7 @@ from egs_warp.muscles.tension import MuscleTension
 ITERATIONS = 60
 SLOW = 0.7
 """A tangent is made anew where the residual falls by less than this factor, but in the first step of a round, in which
-forces of contacts that are new come about. It takes as long as a dozen steps by an old one."""
+forces of contacts that are new come about. It takes as long as many steps by an old one."""
 SHORTEST = 1e-3
 MEMORY = 3
 """Residuals of which the largest must be undercut."""

@@ -18,7 +18,6 @@ _SINGULAR = 1e-14
 """Of the largest diagonal entry: pivots that are as small have no reciprocal worth the name."""
 _FIRST_PART = 0.42
 """Of the columns of a symmetric product."""
-_CPU = wp.get_device("cpu")
 
 
 class SparseFactors:
@@ -31,9 +30,10 @@ class SparseFactors:
 
     def __init__(self, upper_pattern: sparse.csc_matrix | sparse.csc_array) -> None:
         """``upper_pattern``: upper triangle with the diagonal, entries in the order of ``update``."""
+        self._device = wp.get_device("cpu")
         # Two threads at once cannot load them.
         for kernel in (kernels.solve_kernel, products_kernels.product_kernel):
-            kernel.module.load(_CPU, block_dim=1)
+            kernel.module.load(self._device, block_dim=1)
         upper = sparse.csc_matrix(
             (np.arange(1.0, upper_pattern.nnz + 1.0), upper_pattern.indices, upper_pattern.indptr), upper_pattern.shape
         )
@@ -87,7 +87,7 @@ class SparseFactors:
                 self._reciprocals,
             ],
             outputs=[self._negative_array],
-            device=_CPU,
+            device=self._device,
         )
         self._ready, self.negative_pivots = bool(self._negative[0] >= 0), int(self._negative[0])
         return self.negative_pivots == 0
@@ -134,7 +134,7 @@ class SparseFactors:
         def part(first: int, last: int) -> np.ndarray:
             """The columns of some strips, from their own rows on: the rest is their mirror image."""
             launch_again(
-                products_kernels.product_kernel, last - first, inputs=[first, *inputs], outputs=[], device=_CPU
+                products_kernels.product_kernel, last - first, inputs=[first, *inputs], outputs=[], device=self._device
             )
             begin, end = first * products_kernels.STRIP, min(last * products_kernels.STRIP, count)
             return moves[:, begin:].T @ products[:, begin:end]
@@ -180,7 +180,7 @@ class SparseFactors:
         ]
 
         def solve(first: int, last: int) -> None:
-            launch_again(kernels.solve_kernel, last - first, inputs=[first, *inputs], outputs=[], device=_CPU)
+            launch_again(kernels.solve_kernel, last - first, inputs=[first, *inputs], outputs=[], device=self._device)
 
         if panels < 2:
             solve(0, panels)
