@@ -281,7 +281,7 @@ def eliminate_panel(panel: int, unknowns: int, pivots: Pivots, newton: Newton):
                 }
         }
     }
-    for (int back = rank - 1; back >= 0; --back) {
+    for (int back = rank - 1; back >= 0; back -= 1) {
         const double* const row = M + back * stride;
         const int j = pivots.data[back];
         double value = row[unknowns];

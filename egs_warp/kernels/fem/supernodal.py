@@ -209,7 +209,7 @@ def factored(
     }
     for (int i = 0; i < unknowns; ++i)
         for (int q = 0; q < width; ++q) x[i * PANEL + q] *= reciprocals.data[i];
-    for (int s = blocks - 1; s >= 0; --s) {
+    for (int s = blocks - 1; s >= 0; s -= 1) {
         const int begin = fronts.row_offsets.data[s], f = fronts.row_offsets.data[s + 1] - begin;
         const int w = fronts.widths.data[s], column = fronts.first.data[s];
         const int* const rows = fronts.rows.data + begin;
@@ -318,7 +318,7 @@ def solved_panel(
         }
     }
     for (int i = 0; i < unknowns; ++i) x[i] *= reciprocals.data[i];
-    for (int s = blocks - 1; s >= 0; --s) {
+    for (int s = blocks - 1; s >= 0; s -= 1) {
         const int begin = fronts.row_offsets.data[s], f = fronts.row_offsets.data[s + 1] - begin;
         const int w = fronts.widths.data[s], column = fronts.first.data[s];
         const int* const rows = fronts.rows.data + begin;
