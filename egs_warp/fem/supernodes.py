@@ -13,10 +13,10 @@ import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
-_NARROW = 16
-"""Columns up to which a supernode joins the next one, if that ..."""
+_NARROW, _THIN = 16, 6
+"""Columns up to which two blocks together, or the first alone, join if that ..."""
 _FILL = 0.3
-"""... adds at most this share of zeros to both; of wider ones a third of it."""
+"""... makes at most this share of both zeros; others if it is a third of it."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,7 @@ class Supernodes:
         sizes = np.bincount(groups)
         thin = _between_groups(upper, groups, len(sizes))
         order = _ordered(thin)
-        columns = _columns(thin, order)
-        blocks = _merged(*_fundamental(columns), sizes[order], len(sizes))
+        blocks = _merged(*_fundamental(_structures(thin, order)[0]), sizes[order])
         # From groups to rows.
         starts = np.concatenate([[0], np.cumsum(sizes[order])])
         where = np.empty(len(sizes), dtype=np.int64)
@@ -115,10 +114,6 @@ def _ordered(thin: sparse.csc_matrix) -> np.ndarray:
     return order[_postorder(parents)]
 
 
-def _columns(thin: sparse.csc_matrix, order: np.ndarray) -> list[np.ndarray]:
-    return _structures(thin, order)[0]
-
-
 def _structures(thin: sparse.csc_matrix, order: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
     """Of each column of the factor of ``thin`` in ``order`` the rows below its diagonal, ascending, and its parent in
     the elimination tree or -1."""
@@ -163,9 +158,7 @@ def _fundamental(columns: list[np.ndarray]) -> tuple[list[tuple[int, int]], list
     return runs, [columns[last - 1] for _, last in runs]
 
 
-def _merged(
-    runs: list[tuple[int, int]], below: list[np.ndarray], sizes: np.ndarray, count: int
-) -> list[tuple[range, np.ndarray]]:
+def _merged(runs: list[tuple[int, int]], below: list[np.ndarray], sizes: np.ndarray) -> list[tuple[range, np.ndarray]]:
     """Columns and rows below of blocks: a run joins the one after it, whose child it is, where that adds few zeros."""
     starts = np.concatenate([[0], np.cumsum(sizes)])
 
@@ -181,7 +174,7 @@ def _merged(
         while blocks and len(blocks[-1][2]) > 0 and blocks[-1][2][0] < last and blocks[-1][2][0] >= first:
             before, _, _, needed = blocks[-1]
             joined = area(before, last, rows)
-            narrow = starts[last] - starts[before] <= _NARROW or starts[first] - starts[before] <= 6
+            narrow = starts[last] - starts[before] <= _NARROW or starts[first] - starts[before] <= _THIN
             if joined - own - needed > (_FILL if narrow else _FILL / 3.0) * joined:
                 break
             blocks.pop()
