@@ -133,7 +133,8 @@ def risen(degrees: float, sideways: bool) -> tuple[FallWatch, list[StepReport], 
     ]
     watch = FallWatch(MotionSequence(made.place, parts), made.place, gets_up=True)
     state, memory, reports = start, made.stepper.initial_memory(), []
-    for _ in range(600):
+    # Time for all of its tries.
+    for _ in range(1800):
         wishes = watch.objectives(state, reports[-1] if reports else None, DT)
         state, memory, fresh = made.stepper.advance(state, memory, wishes, DT)
         reports += fresh
