@@ -12,6 +12,7 @@ import warp as wp
 
 from egs_warp.fem.supernodes import Supernodes
 from egs_warp.kernels.fem import supernodal as kernels
+from egs_warp.kernels.vectors import BLOCK
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class Layout:
     def of(cls, blocks: Supernodes, upper: sparse.csc_matrix) -> Layout:
         """Of ``blocks``, into which the entries of ``upper`` (n, n) go in the order of its columns."""
         widths, heights, parents = (part.astype(np.int64) for part in (blocks.widths, blocks.heights, blocks.parents))
-        strides, inverses = -(-heights // 8) * 8, -(-widths // kernels.BLOCK) * kernels.BLOCK**2
+        strides, inverses = -(-heights // 8) * 8, -(-widths // BLOCK) * BLOCK**2
         place_in = _places_in_fronts(blocks)
         # An entry lies in the columns of the block that is eliminated first.
         ends = (
@@ -73,7 +74,7 @@ class Layout:
         return cls(
             fronts,
             int((heights * strides).max()),
-            kernels.BLOCK * int(strides.max()),
+            BLOCK * int(strides.max()),
             stack,
             int((heights * widths).sum()),
             int(inverses.sum()),

@@ -1,7 +1,10 @@
-"""C++ of dense products on a CPU, for native functions: four rows by eight columns are what the registers hold.
+"""C++ of dense algebra on a CPU, for native functions: four rows by eight columns are what the registers hold.
 
 Clang maps vectors and contracted products to what the processor has.
 """
+
+BLOCK = 16
+"""Columns that are eliminated at once; an inverse is kept of each such diagonal block of a symmetric matrix."""
 
 _PRODUCTS = """
     #pragma clang fp contract(fast)
@@ -30,10 +33,164 @@ _PRODUCTS = """
         }
         *(v4*)y = a0; *(v4*)(y + 4) = a1;
     };
+    // y[rows][columns] -= l[rows][k] x[k][columns], columns by eights, each matrix with its own stride.
+    auto take_off_all = [&](double* y, int y_stride, int rows, const double* l, int l_stride, const double* x,
+                            int x_stride, int columns, int k) {
+        int i = 0;
+        for (; i + 4 <= rows; i += 4, y += 4 * y_stride, l += 4 * l_stride)
+            for (int c = 0; c < columns; c += 8)
+                take_off(y + c, y + y_stride + c, y + 2 * y_stride + c, y + 3 * y_stride + c, l, l + l_stride,
+                         l + 2 * l_stride, l + 3 * l_stride, x + c, x_stride, k);
+        for (; i < rows; ++i, y += y_stride, l += l_stride)
+            for (int c = 0; c < columns; c += 8) take_off_one(y + c, l, x + c, x_stride, k);
+    };
+"""
+
+_SIZES = f"""
+    constexpr int BLOCK = {BLOCK};
+"""
+ROW_ELIMINATION = """
+    // Rows of unknowns columns with right sides behind, a multiple of four columns in all, made triangular with rows
+    // exchanged: how many have a pivot, and in which column. One below a share of the largest so far is none.
+    auto eliminate_rows = [&](double* M, int stride, int unknowns, int columns, double singular, int* pivots) {
+        #pragma clang fp contract(fast)
+        int rank = 0, chosen[BLOCK];
+        double largest = 0.0, shares[4 * BLOCK];
+        for (int begin = 0; begin < unknowns; begin += BLOCK) {
+            const int end = unknowns - begin < BLOCK ? unknowns : begin + BLOCK, next = (end + 3) & ~3, first = rank;
+            int found = 0;
+            for (int j = begin; j < end; ++j) {
+                int pivot = rank;
+                double size = 0.0;
+                for (int a = rank; a < unknowns; ++a) {
+                    const double candidate = __builtin_fabs(M[a * stride + j]);
+                    if (candidate > size) { size = candidate; pivot = a; }
+                }
+                if (!(size > singular * largest)) continue;
+                largest = size > largest ? size : largest;
+                double *const top = M + rank * stride, *const other = M + pivot * stride;
+                for (int c = begin; pivot != rank && c < columns; ++c) {
+                    const double kept = top[c];
+                    top[c] = other[c];
+                    other[c] = kept;
+                }
+                for (int a = rank + 1; a < unknowns; ++a) {
+                    double* const row = M + a * stride;
+                    const double factor = row[j] / top[j];
+                    row[j] = factor;
+                    for (int c = j + 1; c < next; ++c) row[c] -= factor * top[c];
+                }
+                pivots[rank++] = j;
+                chosen[found++] = j;
+            }
+            for (int t = 1; t < found; ++t)
+                for (int s = 0; s < t; ++s) {
+                    double *const row = M + (first + t) * stride, *const by = M + (first + s) * stride;
+                    const double share = row[chosen[s]];
+                    for (int c = next; c < columns; c += 4) *(v4*)(row + c) -= share * *(const v4*)(by + c);
+                }
+            for (int a = rank; a < unknowns; a += 4) {
+                const int rows = unknowns - a < 4 ? unknowns - a : 4;
+                for (int q = 0; q < rows; ++q)
+                    for (int s = 0; s < found; ++s) shares[q * BLOCK + s] = M[(a + q) * stride + chosen[s]];
+                double* const row = M + a * stride;
+                const double* const by = M + first * stride;
+                int c = next;
+                if (rows == 4)
+                    for (; c + 8 <= columns; c += 8)
+                        take_off(row + c, row + stride + c, row + 2 * stride + c, row + 3 * stride + c, shares,
+                                 shares + BLOCK, shares + 2 * BLOCK, shares + 3 * BLOCK, by + c, stride, found);
+                for (int q = 0; q < rows; ++q)
+                    for (int d = c; d < columns; d += 4) {
+                        v4 left = *(v4*)(row + q * stride + d);
+                        for (int s = 0; s < found; ++s) left -= shares[q * BLOCK + s] * *(const v4*)(by + s * stride + d);
+                        *(v4*)(row + q * stride + d) = left;
+                    }
+            }
+        }
+        return rank;
+    };
+"""
+
+FRONT_ELIMINATION = """
+    // The first w of the f columns of a symmetric front F, of which the lower triangle counts: unit columns of L with
+    // the pivots on the diagonal, what is left behind them, the inverses of diagonal blocks of L and the pivots'
+    // reciprocals. T is room for BLOCK rows. How many pivots are negative, -1 where one is as small as least.
+    auto eliminate_front = [&](double* F, int f, int w, int ld, double* T, double least, double* inverse,
+                               double* reciprocals) {
+        #pragma clang fp contract(fast)
+        double u[BLOCK], reciprocal[BLOCK], X[BLOCK * BLOCK], P[4 * BLOCK];
+        int negative = 0;
+        for (int b = 0; b < w; b += BLOCK, inverse += BLOCK * BLOCK) {
+            const int nb = w - b < BLOCK ? w - b : BLOCK, next = b + nb;
+            for (int j = 0; j < nb; ++j) {
+                double* const pivot_row = F + (b + j) * ld + b;
+                const double d = pivot_row[j];
+                if (!(d > least || d < -least)) return -1;
+                negative += d < 0.0;
+                reciprocal[j] = 1.0 / d;
+                reciprocals[b + j] = reciprocal[j];
+                for (int i = j + 1; i < nb; ++i) u[i] = F[(b + i) * ld + b + j];
+                for (int i = j + 1; i < nb; ++i) {
+                    double* const row = F + (b + i) * ld + b;
+                    const double l = u[i] * reciprocal[j];
+                    for (int k = j + 1; k <= i; ++k) row[k] -= l * u[k];
+                    row[j] = l;
+                }
+            }
+            for (int i = 0; i < BLOCK * BLOCK; ++i) inverse[i] = X[i] = 0.0;
+            for (int i = 0; i < nb; ++i) {
+                double* const row = inverse + i * BLOCK;
+                const double* l = F + (b + i) * ld + b;
+                for (int m = 0; m < i; ++m)
+                    for (int k = 0; k <= m; ++k) row[k] -= l[m] * inverse[m * BLOCK + k];
+                row[i] = 1.0;
+                for (int k = 0; k <= i; ++k) X[k * BLOCK + i] = -row[k];
+            }
+            // The rows below times the inverse are L D: by rows divided by D, by columns as they are.
+            const int aligned = next & ~7;
+            for (int c = 0; c < nb; ++c) {
+                for (int i = aligned; i < next; ++i) T[c * ld + i] = 0.0;
+                for (int i = f; i < ld; ++i) T[c * ld + i] = 0.0;
+            }
+            for (int i = next; i < f; i += 4) {
+                const int rows = f - i < 4 ? f - i : 4;
+                double* const l = F + i * ld + b;
+                for (int k = 0; k < 4 * BLOCK; ++k) P[k] = 0.0;
+                if (rows == 4) {
+                    for (int c = 0; c < nb; c += 8)
+                        take_off(P + c, P + BLOCK + c, P + 2 * BLOCK + c, P + 3 * BLOCK + c, l, l + ld, l + 2 * ld,
+                                 l + 3 * ld, X + c, BLOCK, nb);
+                } else {
+                    for (int q = 0; q < rows; ++q)
+                        for (int c = 0; c < nb; c += 8) take_off_one(P + q * BLOCK + c, l + q * ld, X + c, BLOCK, nb);
+                }
+                for (int q = 0; q < rows; ++q)
+                    for (int c = 0; c < nb; ++c) {
+                        T[c * ld + i + q] = P[q * BLOCK + c];
+                        l[q * ld + c] = P[q * BLOCK + c] * reciprocal[c];
+                    }
+            }
+            for (int i = next; i < f; i += 4) {
+                double* const l = F + i * ld + b;
+                if (f - i >= 4) {
+                    for (int c = aligned; c < i + 4; c += 8) {
+                        double* const y = F + i * ld + c;
+                        take_off(y, y + ld, y + 2 * ld, y + 3 * ld, l, l + ld, l + 2 * ld, l + 3 * ld, T + c, ld, nb);
+                    }
+                } else {
+                    for (int q = 0; q < f - i; ++q)
+                        for (int c = aligned; c <= i + q; c += 8)
+                            take_off_one(F + (i + q) * ld + c, l + q * ld, T + c, ld, nb);
+                }
+            }
+        }
+        return negative;
+    };
 """
 
 
 def on_cpu(body: str, *, elsewhere: str = "") -> str:
-    """``body``, which may use ``v4``, ``take_off`` and ``take_off_one``, on a CPU; on a GPU, which never comes there,
-    ``elsewhere``."""
-    return f"#if !defined(__CUDA_ARCH__)\n{_PRODUCTS}{body}\n#else\n{elsewhere}\n#endif\n"
+    """``body``, which may use ``BLOCK``, ``v4`` and what takes products off, on a CPU; on a GPU, which never comes
+    there, ``elsewhere``."""
+    return f"#if !defined(__CUDA_ARCH__)\n{_PRODUCTS}{_SIZES}{body}\n#else\n{elsewhere}\n#endif\n"

@@ -10,10 +10,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy.linalg as dense
 import warp as wp
 
 from egs_warp.kernels.locomotion import active_set as kernels
+from egs_warp.kernels.locomotion.reduced_rows import STEP, Reduced, reduce_kernel, room_of
 from egs_warp.launching import kept_by_thread
 from egs_warp.precision import Vec4, real
 
@@ -26,54 +26,45 @@ _HOPELESS = 1e6
 
 @dataclass(frozen=True)
 class ReducedRows:
-    """The rows A of min 1/2 x^T P x + q^T x in coordinates z = L^T (x - x0), P = L L^T, in which distances from the
-    minimum x0 are costs."""
+    """The rows A of min 1/2 x^T P x + q^T x in coordinates z = D^1/2 L^T (x - x0), P = L D L^T, in which distances from
+    the minimum x0 are costs."""
 
-    factor: np.ndarray
-    """(n, n) L."""
+    P: np.ndarray
+    """(n, n)."""
+    q: np.ndarray
+    """(n,)."""
+    rows: np.ndarray
+    """(m, n) A."""
     minimum: np.ndarray
     """(n,) x0, without any bounds."""
     free: np.ndarray
     """(m,) A x0."""
-    rows: np.ndarray
-    """(m, n) A."""
+    lengths: np.ndarray
+    """(m,) of the rows by z, 1 for those without any."""
     worth: float
     """By how much the objective is lower at x0 than at 0, or 1 if that is less."""
 
     @classmethod
     def of(cls, P: np.ndarray, q: np.ndarray, A: np.ndarray) -> ReducedRows:
-        """Of P (n, n), positive definite, q (n,) and A (m, n)."""
-        factor = dense.cholesky(P, lower=True, check_finite=False)
-        minimum = dense.cho_solve((factor, True), -q, check_finite=False)
-        return cls(factor, minimum, A @ minimum, A, max(1.0, -0.5 * float(q @ minimum)))
-
-    @cached_property
-    def _by_z(self) -> tuple[np.ndarray, np.ndarray]:
-        """(m, n) the rows by z, each of length 1 or 0, and their lengths (m,), 1 for those without any."""
-        scaled = dense.solve_triangular(self.factor, self.rows.T, lower=True, check_finite=False).T
-        lengths = np.linalg.norm(scaled, axis=1)
-        lengths[lengths == 0.0] = 1.0
-        return np.ascontiguousarray(scaled / lengths[:, None]), lengths
+        """Of P (n, n), q (n,) and A (m, n). Raises ``numpy.linalg.LinAlgError`` where P is not positive definite; of one
+        that holds no number there is no minimum."""
+        P, q, A = (np.asarray(each, dtype=np.float64) for each in (P, q, A))
+        minimum, free, lengths = _room_for(A).reduce(P, q, A)
+        return cls(P, q, A, minimum, free, lengths, max(1.0, -0.5 * float(q @ minimum)))
 
     @property
     def units(self) -> np.ndarray:
-        """(m, n) the rows by z, each of length 1 or 0."""
-        return self._by_z[0]
+        """(m, n) the rows by z, each of length 1 or 0; as long as no others of as many are made."""
+        return _room_for(self.rows).units(self)
 
-    @property
-    def lengths(self) -> np.ndarray:
-        """(m,) of the rows by z."""
-        return self._by_z[1]
+    def place(self, x: np.ndarray) -> np.ndarray:
+        """(n,) z of ``x`` (n,)."""
+        return _room_for(self.rows).place(self, x)
 
     @cached_property
     def slack(self) -> np.ndarray:
         """(m,) by how much each row may break its bounds."""
         return _BROKEN * np.maximum(1.0, self.lengths)
-
-    def point(self, multipliers: np.ndarray) -> np.ndarray:
-        """(n,) x that ``multipliers`` (m,) hold, positive where an upper bound pushes."""
-        move = -self.units.T @ (self.lengths * multipliers)
-        return self.minimum + dense.solve_triangular(self.factor, move, lower=True, trans=1, check_finite=False)
 
 
 @dataclass(frozen=True)
@@ -89,58 +80,112 @@ class Optimum:
 
 
 class _Room:
-    """Memory for a program of so many rows and unknowns, and a launch that is made again and again: a new one takes
-    longer than the search."""
+    """Memory for a program of so many rows and unknowns, and launches that are made again and again: a new one takes
+    longer than the search. It has the rows of one program at a time, the last that was asked for."""
 
     def __init__(self, rows: int, unknowns: int) -> None:
-        columns = -(-unknowns // 4) * 4
-        self._rows, self._products = np.zeros((rows, columns)), np.zeros((rows, rows))
-        self._free, self._at, self._outside = np.zeros(rows), np.zeros(rows), np.zeros(columns)
+        wide = -(-unknowns // 8) * 8
+        self._minimum, self._free, self._lengths = np.zeros(unknowns), np.zeros(rows), np.zeros(rows)
+        self._units, self._unknowns = np.zeros((rows, wide)), unknowns
+        reduced = Reduced()
+        self._transpose, self._roots = np.zeros((unknowns, wide)), np.zeros(unknowns)
+        reduced.lower, reduced.columns = _zeros((unknowns, wide)), _zeros((unknowns, rows))
+        reduced.upper, reduced.roots = _shared(self._transpose), _shared(self._roots)
+        reduced.scratch = _zeros((room_of(unknowns, wide),))
+        reduced.minimum, reduced.free, reduced.lengths = map(_shared, (self._minimum, self._free, self._lengths))
+        reduced.rows, reduced.products = map(_by_fours, (self._units, np.zeros((rows, rows))))
+        reduced.known = wp.zeros(rows, dtype=int, device="cpu")
+        self._definite, self._at_zero = np.zeros(1, np.int32), np.zeros(rows)
         self._lower, self._upper, self._slack = np.zeros((3, rows))
         self._most, self._pulls = np.zeros(1), np.zeros(unknowns)
-        self._side, self._active, self._ended = (np.zeros(count, np.int32) for count in (rows, unknowns, 1))
+        self._side, self._active, self._ended = (np.zeros(count, np.int32) for count in (rows, unknowns, 2))
         program, search = kernels.Program(), kernels.Search()
-        program.rows, program.products = _by_fours(self._rows), _by_fours(self._products)
-        program.free, search.at, search.outside = (
-            _by_fours(values) for values in (self._free, self._at, self._outside)
-        )
+        program.reduced, program.free = reduced, _by_fours(self._at_zero)
         program.lower, program.upper, program.slack = map(_shared, (self._lower, self._upper, self._slack))
         program.most, search.pulls = _shared(self._most), _shared(self._pulls)
         search.side, search.active = _shared(self._side), _shared(self._active)
-        search.factor = wp.zeros((unknowns, unknowns), dtype=real, device="cpu")
-        search.rates, search.across = (wp.zeros(unknowns, dtype=real, device="cpu") for _ in range(2))
-        self._launch: Any = wp.launch(
-            kernels.optimum_kernel,
+        search.at, search.outside = _by_fours(np.zeros(rows)), _by_fours(np.zeros(wide))
+        search.factor = _zeros((unknowns, unknowns))
+        search.rates, search.across = _zeros((unknowns,)), _zeros((unknowns,))
+        self._reducing: Any = wp.launch(
+            reduce_kernel,
             1,
-            inputs=[program, _PIVOTS, search],
-            outputs=[_shared(self._ended)],
+            inputs=[0, 0, 0, 0, 0, 0],
+            outputs=[reduced, _shared(self._definite)],
             device="cpu",
             record_cmd=True,
         )
-        # The launch has where these lie.
-        self._held = program, search
+        self._searching: Any = wp.launch(
+            kernels.optimum_kernel,
+            1,
+            inputs=[program, _PIVOTS, search],
+            outputs=[_shared(self._ended), 0],
+            device="cpu",
+            record_cmd=True,
+        )
+        # The launches have where these lie.
+        self._held = reduced, program, search
+        self._has: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+
+    def reduce(self, P: np.ndarray, q: np.ndarray, A: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Minimum, rows at it and their lengths: see ``ReducedRows``."""
+        P, q, A = (each if each.strides[-1] == 8 else np.ascontiguousarray(each) for each in (P, q, A))
+        given = P.ctypes.data, P.strides[0] // 8, q.ctypes.data, A.ctypes.data, A.strides[0] // 8, len(A)
+        for place, value in enumerate(given):
+            self._reducing.set_param_at_index_from_ctype(place, value)
+        self._reducing.launch()
+        self._has = P, q, A
+        if not self._definite[0]:
+            if np.isfinite(P).all():
+                raise np.linalg.LinAlgError("the Hessian is not positive definite")
+            self._minimum[:], self._free[:], self._lengths[:] = np.nan, np.nan, 1.0
+        return self._minimum.copy(), self._free[: len(A)].copy(), self._lengths[: len(A)].copy()
+
+    def units(self, reduced: ReducedRows) -> np.ndarray:
+        """See ``ReducedRows``."""
+        self._take(reduced)
+        return self._units[: len(reduced.rows), : self._unknowns]
+
+    def place(self, reduced: ReducedRows, x: np.ndarray) -> np.ndarray:
+        """See ``ReducedRows``."""
+        self._take(reduced)
+        away = x - reduced.minimum
+        return (away + self._transpose[:, : self._unknowns] @ away) / self._roots
+
+    def _take(self, reduced: ReducedRows) -> None:
+        wanted = reduced.P, reduced.q, reduced.rows
+        if self._has is None or any(one is not other for one, other in zip(self._has, wanted, strict=True)):
+            self.reduce(*wanted)
+            self._has = wanted
 
     def search(
         self, reduced: ReducedRows, lower: np.ndarray, upper: np.ndarray, side: np.ndarray
-    ) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
-        """How it ended, and of the rows that hold the numbers, the sides and the multipliers."""
-        m, n = reduced.rows.shape
-        self._rows[:m, :n], self._rows[m:] = reduced.units, 0.0
-        np.matmul(self._rows, self._rows.T, out=self._products)
-        self._free[:m], self._free[m:] = reduced.free / reduced.lengths, 0.0
+    ) -> tuple[int, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """How it ended, of the rows that hold the numbers, the sides and the multipliers, and the point."""
+        self._take(reduced)
+        m, point = len(reduced.rows), np.empty(self._unknowns)
+        self._at_zero[:m], self._at_zero[m:] = reduced.free / reduced.lengths, 0.0
         self._lower[:m], self._lower[m:] = lower / reduced.lengths, -np.inf
         self._upper[:m], self._upper[m:] = upper / reduced.lengths, np.inf
         self._slack[:m], self._slack[m:] = reduced.slack / reduced.lengths, 0.0
         self._side[:m], self._side[m:] = side, 0
         self._most[0] = _HOPELESS * reduced.worth
-        self._launch.launch()
-        active = self._active[: np.count_nonzero(self._side)].copy()
-        return int(self._ended[0]), active, self._side[active], self._pulls[: len(active)].copy()
+        self._searching.set_param_at_index_from_ctype(4, point.ctypes.data)
+        self._searching.launch()
+        how, count = self._ended.tolist()
+        active = self._active[:count].copy()
+        return how, active, self._side[active], self._pulls[:count].copy(), point
 
 
 _room = kept_by_thread(16)(_Room)
-_STEP = 32
-"""Rows by which the sizes differ that memory is kept for."""
+
+
+def _room_for(A: np.ndarray) -> _Room:
+    return _room(-(-len(A) // STEP) * STEP, A.shape[1])
+
+
+def _zeros(shape: tuple[int, ...]) -> wp.array:
+    return wp.zeros(shape, dtype=real, device="cpu")
 
 
 def _shared(values: np.ndarray) -> wp.array:
@@ -159,14 +204,13 @@ def optimum_near(
     """
     m, n = reduced.rows.shape
     side = np.where(low & np.isfinite(lower), 1, np.where(high & np.isfinite(upper), -1, 0))
-    how, active, sides, pulls = _room(-(-m // _STEP) * _STEP, n).search(reduced, lower, upper, side)
+    how, active, sides, pulls, x = _room_for(reduced.rows).search(reduced, lower, upper, side)
     multipliers = np.zeros(m)
     if how == kernels.ASTRAY:
         return None
     if how == kernels.INFEASIBLE:
         return Optimum(np.zeros(n), multipliers, False)
     multipliers[active] = -sides * pulls / reduced.lengths[active]
-    x = reduced.point(multipliers)
     at, slack = reduced.rows @ x, 10.0 * reduced.slack
     # Rows that contradict each other are met by none, whatever their multipliers.
     met = bool((at > lower - slack).all() and (at < upper + slack).all())

@@ -66,11 +66,13 @@ class AdmmPrograms:
     """k programs, whose sizes may differ, that are iterated on side by side. Each begins where its last iterations
     have ended, with the rho that they have found."""
 
-    def __init__(self, programs: Sequence[Dense], *, device: Device, scaling: int = 4, adapt: int = 50) -> None:
-        """``scaling`` passes equilibrate, rho may change every ``adapt`` iterations, a multiple of
-        ``kernels.CHECK``."""
+    def __init__(
+        self, programs: Sequence[Dense], *, device: Device, scaling: int = 4, adapt: int = 50, rho: float = _RHO
+    ) -> None:
+        """``scaling`` passes equilibrate, rho begins with ``rho`` and may change every ``adapt`` iterations, a multiple
+        of ``kernels.CHECK``."""
         self._device = wp.get_device(device)
-        self._scaling, self._adapt = scaling, adapt
+        self._scaling, self._adapt, self._first = scaling, adapt, rho
         self._sizes = [one.A.shape for one in programs]
         k, m, n = len(programs), *(max(sizes) for sizes in zip(*self._sizes, strict=True))
         self._programs = scaled.Programs()
@@ -80,7 +82,7 @@ class AdmmPrograms:
         self._programs.rows, self._programs.variables = (
             wp.array([size[side] for size in self._sizes], dtype=int, device=self._device) for side in (0, 1)
         )
-        self._x, self._y, self._rho = np.zeros((k, n)), np.zeros((k, m)), np.full(k, _RHO)
+        self._x, self._y, self._rho = np.zeros((k, n)), np.zeros((k, m)), np.full(k, rho)
 
     def solve(
         self,
@@ -128,7 +130,7 @@ class AdmmPrograms:
                 ending = Ending.FAILED
             if ending in (Ending.INFEASIBLE, Ending.DOUBTFUL, Ending.FAILED):
                 # What was driven apart is no place to begin.
-                self._x[i], self._y[i], self._rho[i] = 0.0, 0.0, _RHO
+                self._x[i], self._y[i], self._rho[i] = 0.0, 0.0, self._first
             ends.append(Iterate(ending, x, y, int(count[i])))
         return ends
 

@@ -6,16 +6,18 @@ See docs/concepts/locomotion.md.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import warp as wp
 
 from egs_warp.contact.coulomb import coulomb_forces
-from egs_warp.launching import Device
+from egs_warp.kernels.locomotion import pieces as kernels
+from egs_warp.launching import Device, kept_by_thread, launch_again, zeros
 from egs_warp.locomotion.solvers import QpSolver, quadratic_program
+from egs_warp.precision import real
 
-_FACES = 8
-"""Of the pyramid that stands in for the friction cone of a contact that sticks."""
 _SINGULAR = 1e-7
 """Of the mean of the operator's diagonal: more points than the cage can resolve leave it singular."""
 _SLOWEST = 1e-9
@@ -27,15 +29,12 @@ _GAIN = 5e-3
 _BROKEN = 0.02
 """By which a start may break a row that its piece does not quite hold."""
 
-_WEDGE = np.radians(30.0)
-"""How far a contact that slides may turn from the way that its friction is taken against. Friction that stays where it
-was while a foot slides elsewhere pushes a body along that no ground would."""
 _NOTHING = 1e-9
 """Body weights: what rounding leaves of the force of a contact that is open."""
 
 _LEAVES, _SLIPS, _TURNS, _LANDS = 0, 1, 2, 3
 
-FREE, STICK, SLIDE = 0, 1, 2
+FREE, STICK, SLIDE = kernels.FREE, kernels.STICK, kernels.SLIDE
 
 
 @dataclass(frozen=True)
@@ -178,17 +177,96 @@ def solve_relaxed(
     m, n = program.activations, program.contacts
     forces = np.hstack([np.zeros((3 * n, m)), np.eye(3 * n)])
     cone = [forces[::3]]
-    for angle in 2.0 * np.pi * np.arange(_FACES) / _FACES:
+    for angle in 2.0 * np.pi * np.arange(kernels.FACES) / kernels.FACES:
         # Around the cone: what bounds must not cut it.
         cone.append(program.friction * forces[::3] - np.cos(angle) * forces[1::3] - np.sin(angle) * forces[2::3])
     A = np.vstack([np.eye(m, m + 3 * n), *cone, program.rows[::3]])
-    lower = np.concatenate([program.lower, np.zeros(n * (1 + _FACES)), -program.offset[::3]])
+    lower = np.concatenate([program.lower, np.zeros(n * (1 + kernels.FACES)), -program.offset[::3]])
     upper = np.concatenate([program.upper, np.full(len(lower) - m, np.inf)])
     P = program.P + _SINGULAR * program.P.diagonal().mean() * np.eye(len(program.P))
     found = quadratic_program(P, program.q, A, solver=solver, device=device).solve(lower, upper)
     if not found.usable:
         return None
     return np.clip(found.x[:m], program.lower, program.upper), found.objective + program.constant
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Where each contact goes on as it does: forces are ``offset`` + ``slope`` a, the cost of activations a is
+    1/2 a^T P a + q^T a and a constant, and ``rows`` a + ``rows_offset`` >= 0 is where it holds."""
+
+    offset: np.ndarray
+    """(3n,) body weights."""
+    slope: np.ndarray
+    """(3n, m)."""
+    P: np.ndarray
+    """(m, m)."""
+    q: np.ndarray
+    """(m,)."""
+    rows: np.ndarray
+    """(m + k, m), the first m those of the activations themselves."""
+    rows_offset: np.ndarray
+    """(m + k,)."""
+    contact: np.ndarray
+    """(k,) whose row each of the others is."""
+    onward: np.ndarray
+    """(k,) what happens to it beyond."""
+
+    @classmethod
+    def of(cls, program: ContactPieces, modes: ContactModes) -> Piece | None:
+        """That of ``modes``; None if no forces hold what is held."""
+        m, n = program.activations, program.contacts
+        stick, slide, free = (np.flatnonzero(modes.kind == kind) for kind in (STICK, SLIDE, FREE))
+        contact = np.concatenate([stick, slide, np.tile(stick, kernels.FACES), slide, slide, free])
+        onward = np.repeat(
+            [_LEAVES, _SLIPS, _TURNS, _LANDS],
+            [len(stick) + len(slide), kernels.FACES * len(stick), 2 * len(slide), len(free)],
+        )
+        given = [np.ascontiguousarray(each) for each in (program.P, program.q, program.rows, program.offset)]
+        given += [modes.kind.astype(np.int32), np.ascontiguousarray(modes.slip)]
+        total, wide = m + len(contact), kernels.padded(m)
+        shapes = (3 * n, wide), 3 * n, (m, wide), m, (total, wide), total
+        slope, offset, P, q, rows, rows_offset = made = [np.empty(shape) for shape in shapes]
+        room = _room(kernels.room_of(m, n), 10 * n)
+        launch_again(
+            kernels.piece_kernel,
+            1,
+            inputs=[m, n, program.friction, *_addresses(given), room.numbers, room.scratch, total],
+            outputs=[*_addresses(made), room.there_array],
+            device=room.device,
+        )
+        if not room.there[0]:
+            return None
+        return cls(offset, slope[:, :m], P[:, :m], q, rows[:, :m], rows_offset, contact, onward)
+
+
+class _Room:
+    """Memory of a thread in which pieces are made."""
+
+    def __init__(self) -> None:
+        self.device = wp.get_device("cpu")
+        self.there = np.zeros(1, np.int32)
+        self.there_array = wp.array(self.there, dtype=int, device="cpu", copy=False)
+        self.scratch, self.numbers = zeros(0, real, "cpu"), zeros(0, int, "cpu")
+
+    def grown(self, scratch: int, numbers: int) -> _Room:
+        """With so many numbers at least."""
+        if self.scratch.size < scratch:
+            self.scratch = zeros(scratch, real, "cpu")
+        if self.numbers.size < numbers:
+            self.numbers = zeros(numbers, int, "cpu")
+        return self
+
+
+_thread_room = kept_by_thread(1)(_Room)
+
+
+def _room(scratch: int, numbers: int) -> _Room:
+    return _thread_room().grown(scratch, numbers)
+
+
+def _addresses(values: Sequence[np.ndarray]) -> list[int]:
+    return [value.ctypes.data for value in values]
 
 
 def solve_piece(
@@ -203,16 +281,12 @@ def solve_piece(
     """Optimum of the activations in the piece of ``modes``; what ``start`` breaks of its bounds, up to ``_BROKEN``, may
     stay broken as much. None without a solution. ``beside`` where another piece of the step is solved already.
     """
-    m = program.activations
-    offset, slope = _forces_of(program, modes)
-    # x = (0, offset) + (1, slope) a; ``PZ`` is P times the second.
-    PZ = program.P[:, :m] + program.P[:, m:] @ slope
-    P = PZ[:m] + slope.T @ PZ[m:]
-    q = program.q[:m] + slope.T @ program.q[m:] + PZ[m:].T @ offset
-    A, b, contact, onward = _bounds(program, modes, offset, slope)
-    lower = np.minimum(-b, np.maximum(A @ start[:m], -b - _BROKEN)) if len(A) else np.zeros(0)
-    qp = quadratic_program(0.5 * (P + P.T), q, np.vstack([np.eye(m), A]), solver=solver, device=device)
-    found = qp.solve(
+    m, piece = program.activations, Piece.of(program, modes)
+    if piece is None:
+        return None
+    b = piece.rows_offset[m:]
+    lower = np.minimum(-b, np.maximum(piece.rows[m:] @ start[:m], -b - _BROKEN))
+    found = quadratic_program(piece.P, piece.q, piece.rows, solver=solver, device=device).solve(
         np.concatenate([program.lower, lower]),
         np.concatenate([program.upper, np.full(len(lower), np.inf)]),
         start[:m],
@@ -221,104 +295,44 @@ def solve_piece(
     if not found.usable:
         return None
     a = np.clip(found.x, program.lower, program.upper)
-    x = np.concatenate([a, offset + slope @ a])
+    x = np.concatenate([a, piece.offset + piece.slope @ a])
     objective = program.objective(x)
     pushes = -found.multipliers[m:]
     active = np.flatnonzero(pushes > _ACTIVE * max(abs(objective), 1e-9))
     further = nearest = None
     if len(active):
-        further = _beyond(program, modes, x, contact[active], onward[active], pushes[active])
-    if len(active) > 1:
-        most = active[[int(np.argmax(pushes[active]))]]
-        nearest = _beyond(program, modes, x, contact[most], onward[most], pushes[most])
+        contact, onward, pushes = piece.contact[active], piece.onward[active], pushes[active]
+        beyond = _Beyond(program, modes, x)
+        further = beyond.where(contact, onward, pushes)
+        if len(active) > 1:
+            most = [int(np.argmax(pushes))]
+            nearest = beyond.where(contact[most], onward[most], pushes[most])
     return PieceSolution(x, objective, further, nearest)
 
 
-def _forces_of(program: ContactPieces, modes: ContactModes) -> tuple[np.ndarray, np.ndarray]:
-    """(3n,) and (3n, m): f = offset + slope a in the piece of ``modes``."""
-    n, m = program.contacts, program.activations
-    stick, slide = modes.kind == STICK, modes.kind == SLIDE
-    held = np.flatnonzero(np.stack([stick | slide, stick, stick], axis=1))
-    sliding = 3 * np.flatnonzero(slide)
-    pull = -program.friction * modes.slip[slide]
-    forces = np.zeros((3 * n, 1 + m))
-    if len(held) > 0:
-        rows = program.rows[held]
-        operator = rows[:, m + held]
-        drawn = rows[:, m + sliding + 1] * pull[:, 0] + rows[:, m + sliding + 2] * pull[:, 1]
-        operator[:, np.searchsorted(held, sliding)] += drawn
-        operator[np.diag_indices_from(operator)] += _SINGULAR * np.abs(operator.diagonal()).mean()
-        forces[held] = np.linalg.solve(operator, -np.column_stack([program.offset[held], rows[:, :m]]))
-        for t in (0, 1):
-            forces[sliding + 1 + t] = pull[:, t, None] * forces[sliding]
-    return forces[:, 0], forces[:, 1:]
+class _Beyond:
+    """Modes past the bounds that hold the optimum ``x`` back."""
 
+    def __init__(self, program: ContactPieces, modes: ContactModes, x: np.ndarray) -> None:
+        self._modes = modes
+        tangents = (program.rows @ x + program.offset).reshape(-1, 3)[:, 1:]
+        self._against, self._along = _unit(-x[program.activations :].reshape(-1, 3)[:, 1:]), _unit(tangents)
+        self._moving = np.linalg.norm(tangents, axis=1) > _SLOWEST
 
-def _bounds(
-    program: ContactPieces, modes: ContactModes, offset: np.ndarray, slope: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Rows A a + b >= 0 within which a piece holds; of each the contact and what happens to it beyond."""
-    m, friction = program.activations, program.friction
-    speed = program.rows[:, :m] + program.rows[:, m:] @ slope
-    speed_offset = program.offset + program.rows[:, m:] @ offset
-    stick, slide = np.flatnonzero(modes.kind == STICK), np.flatnonzero(modes.kind == SLIDE)
-    free = np.flatnonzero(modes.kind == FREE)
-    pressing = np.concatenate([stick, slide])
-    parts = [(slope[3 * pressing], offset[3 * pressing], pressing, _LEAVES)]
-    parts.append((_faces(slope, stick, friction), _faces(offset, stick, friction), np.tile(stick, _FACES), _SLIPS))
-    d = modes.slip[slide]
-    # The way it slides is near the one that its friction is taken against.
-    for side in (1.0, -1.0):
-        edge = np.sin(_WEDGE) * d + side * np.cos(_WEDGE) * d[:, ::-1] * [-1.0, 1.0]
-        parts.append(
-            (
-                edge[:, :1] * speed[3 * slide + 1] + edge[:, 1:] * speed[3 * slide + 2],
-                edge[:, 0] * speed_offset[3 * slide + 1] + edge[:, 1] * speed_offset[3 * slide + 2],
-                slide,
-                _TURNS,
-            )
-        )
-    parts.append((speed[3 * free], speed_offset[3 * free], free, _LANDS))
-    A = np.vstack([part[0] for part in parts])
-    b = np.concatenate([part[1] for part in parts])
-    contact = np.concatenate([part[2] for part in parts])
-    onward = np.repeat([part[3] for part in parts], [len(part[2]) for part in parts])
-    return A, b, contact, onward
-
-
-def _faces(forces: np.ndarray, contacts: np.ndarray, friction: float) -> np.ndarray:
-    """(faces k, ...) what ``forces`` (3n, ...) leave of each face of the pyramids of k ``contacts``, face by face."""
-    normal, first, second = (forces[3 * contacts + part] for part in range(3))
-    angle = (2.0 * np.pi * np.arange(_FACES) / _FACES).reshape(-1, *np.ones(forces.ndim, int))
-    room = friction * np.cos(np.pi / _FACES) * normal - np.cos(angle) * first - np.sin(angle) * second
-    return room.reshape(-1, *forces.shape[1:])
-
-
-def _beyond(
-    program: ContactPieces,
-    modes: ContactModes,
-    x: np.ndarray,
-    contacts: np.ndarray,
-    onward: np.ndarray,
-    pushes: np.ndarray,
-) -> ContactModes:
-    """Modes where ``contacts`` go ``onward``, the most pushed one's word last."""
-    kind, slip = modes.kind.copy(), modes.slip.copy()
-    forces = x[program.activations :].reshape(-1, 3)
-    velocities = (program.rows @ x + program.offset).reshape(-1, 3)
-    against, along = _unit(-forces[:, 1:]), _unit(velocities[:, 1:])
-    moving = np.linalg.norm(velocities[:, 1:], axis=1) > _SLOWEST
-    for index in np.argsort(pushes, kind="stable"):
-        i = contacts[index]
-        if onward[index] == _LEAVES:
-            kind[i] = FREE
-        elif onward[index] == _SLIPS:
-            kind[i], slip[i] = SLIDE, against[i]
-        elif moving[i]:
-            kind[i], slip[i] = SLIDE, along[i]
-        else:
-            kind[i] = STICK
-    return ContactModes(kind, slip)
+    def where(self, contacts: np.ndarray, onward: np.ndarray, pushes: np.ndarray) -> ContactModes:
+        """Modes where ``contacts`` go ``onward``, the most pushed one's word last."""
+        kind, slip = self._modes.kind.copy(), self._modes.slip.copy()
+        for index in np.argsort(pushes, kind="stable"):
+            i = contacts[index]
+            if onward[index] == _LEAVES:
+                kind[i] = FREE
+            elif onward[index] == _SLIPS:
+                kind[i], slip[i] = SLIDE, self._against[i]
+            elif self._moving[i]:
+                kind[i], slip[i] = SLIDE, self._along[i]
+            else:
+                kind[i] = STICK
+        return ContactModes(kind, slip)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -16,13 +16,11 @@ from egs_warp.locomotion.splitting import AdmmSplitting, Iterations, OsqpSplitti
 
 LARGEST_BREACH = 3e-3
 """By which a point of OSQP's iteration limit may leave its bounds and still be used."""
-_ITERATIONS = 50
-"""Of a splitting, before the rows that it holds to be active lead to the optimum."""
 _MOST_ITERATIONS = 4000
 _ROOM = 0.3
 """Of the accuracy, by which bounds are moved apart."""
-_HELD, _NEAR = 1e-12, 1e-4
-"""Between the bounds of a row that is held; from a bound, where the search starts, of a row that may hold it."""
+_HELD = 1e-12
+"""Between the bounds of a row that is held."""
 
 
 class QpStatus(Enum):
@@ -144,22 +142,20 @@ class SplittingProgram:
             return self._exact(rows.minimum, np.zeros(len(lower)))
         if beside:
             return self._from_the_minimum(lower, upper, start)
-        if start is not None:
-            at = self._A @ start
-            chosen |= (at < lower + _NEAR) | (at > upper - _NEAR)
         index = np.flatnonzero(chosen)
-        made = self._splitting.on(self._A[index], _ITERATIONS).run(lower[index], upper[index], start)
-        if made.ending is Ending.INFEASIBLE:
-            return _solution(QpStatus.INFEASIBLE, self._P, self._q, None, None, len(lower))
+        # In coordinates in which costs are squares of distances, where a few iterations go far.
+        below, above = (lower - rows.free) / rows.lengths, (upper - rows.free) / rows.lengths
+        z = None if start is None else rows.place(start)
+        made = self._splitting.near(rows.units[index], below[index], above[index], z)
         if made.ending not in (Ending.SOLVED, Ending.INEXACT, Ending.LIMIT) or not np.isfinite(made.x).all():
-            # There is no point: OSQP leaves 2e9 where it doubts that there is any.
+            # Whether there is no point the search finds out: OSQP leaves 2e9 where it doubts that there is any.
             return self._from_the_minimum(lower, upper, start)
         multipliers = np.zeros(len(lower))
         multipliers[index] = made.multipliers
-        at = self._A @ made.x
-        low = at - lower < -multipliers
-        found = self._finished(lower, upper, low, (upper - at < multipliers) & ~low)
-        return found or self._by_iterations(lower, upper, made.x)
+        at = rows.units @ made.x
+        low, high = at - below < -multipliers, above - at < multipliers
+        found = self._finished(lower, upper, low, high & ~low)
+        return found or self._by_iterations(lower, upper, start)
 
     def _from_the_minimum(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> QpSolution:
         """From the rows that the minimum without bounds breaks."""

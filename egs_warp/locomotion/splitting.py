@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -10,13 +10,21 @@ import numpy as np
 import osqp
 import scipy.sparse as sparse
 
-from egs_warp.launching import Device
+from egs_warp.launching import Device, kept_by_thread
 from egs_warp.locomotion.admm import AdmmPrograms, Dense, Ending, Iterate
 
 SCALING = 4
 """Passes of the equilibration."""
 ADAPT = 50
 """Iterations after which rho may change: by the clock, two runs would differ."""
+NEAR = 15
+"""Iterations that tell which rows hold an optimum."""
+RHO = 1.0
+"""Of these: what multipliers are to distances where costs are squares of distances and rows have length 1."""
+_ENOUGH = 1e-3
+"""Accuracy at which they may end before."""
+_ROWS = 8
+"""Rows by which programs differ that OSQP has memory for."""
 _CODES: Any = osqp.SolverStatus
 
 
@@ -31,6 +39,11 @@ class Iterations(Protocol):
 class Splitting(Protocol):
     """Who iterates on programs with the same P and q."""
 
+    def near(self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> Iterate:
+        """A few iterations on min 1/2 z^T z subject to l <= R z <= u (m,), rows R (m, n) ``units`` long, from
+        ``start`` (n,), else from 0."""
+        ...
+
     def on(self, A: np.ndarray, iterations: int) -> Iterations:
         """With rows A (m, n), at most ``iterations`` each time."""
         ...
@@ -41,6 +54,10 @@ class OsqpSplitting:
 
     def __init__(self, P: np.ndarray, q: np.ndarray, *, accuracy: float) -> None:
         self._P, self._q, self._accuracy = P, q, accuracy
+
+    def near(self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> Iterate:
+        """See ``Splitting``."""
+        return _near(-(-len(units) // _ROWS) * _ROWS, units.shape[1]).run(units, lower, upper, start)
 
     @cached_property
     def _upper_half(self) -> sparse.csc_matrix:
@@ -80,15 +97,58 @@ class OsqpIterations:
             self._solver.update(l=lower, u=upper)
         if start is not None:
             self._solver.warm_start(x=start)
-        result = _answer(self._solver)
-        ending = {
-            _CODES.OSQP_SOLVED: Ending.SOLVED,
-            _CODES.OSQP_SOLVED_INACCURATE: Ending.INEXACT,
-            _CODES.OSQP_MAX_ITER_REACHED: Ending.LIMIT,
-            _CODES.OSQP_PRIMAL_INFEASIBLE: Ending.INFEASIBLE,
-            _CODES.OSQP_PRIMAL_INFEASIBLE_INACCURATE: Ending.DOUBTFUL,
-        }.get(result.info.status_val, Ending.FAILED)
-        return Iterate(ending, result.x, result.y, result.info.iter)
+        return _iterate(_answer(self._solver))
+
+
+def _iterate(result: Any) -> Iterate:
+    ending = {
+        _CODES.OSQP_SOLVED: Ending.SOLVED,
+        _CODES.OSQP_SOLVED_INACCURATE: Ending.INEXACT,
+        _CODES.OSQP_MAX_ITER_REACHED: Ending.LIMIT,
+        _CODES.OSQP_PRIMAL_INFEASIBLE: Ending.INFEASIBLE,
+        _CODES.OSQP_PRIMAL_INFEASIBLE_INACCURATE: Ending.DOUBTFUL,
+    }.get(result.info.status_val, Ending.FAILED)
+    return Iterate(ending, result.x, result.y, result.info.iter)
+
+
+class OsqpNear:
+    """OSQP for programs of so many rows and unknowns: set up once, for only
+    numbers change. It begins where it is told to, so what it was asked before does not matter."""
+
+    def __init__(self, rows: int, unknowns: int) -> None:
+        self._units, self._ones = np.zeros((unknowns, rows)), np.ones(rows)
+        self._solver = osqp.OSQP(algebra="builtin")
+        self._solver.setup(
+            P=sparse.identity(unknowns, format="csc"),
+            q=np.zeros(unknowns),
+            # With ones in place of zeros, which it would leave out.
+            A=sparse.csc_matrix(np.ones((rows, unknowns))),
+            l=-self._ones,
+            u=self._ones,
+            rho=RHO,
+            eps_abs=_ENOUGH,
+            eps_rel=_ENOUGH,
+            scaling=0,
+            max_iter=NEAR,
+            adaptive_rho=False,
+            polishing=False,
+            verbose=False,
+        )
+
+    def run(self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> Iterate:
+        """See ``Splitting.near``."""
+        m, n = units.shape
+        self._units[:, :m], self._units[:, m:] = units.T, 0.0
+        # Rows of zeros after the last have bounds, too: OSQP factors anew where some come or go.
+        low, high = -self._ones, self._ones.copy()
+        low[:m], high[:m] = lower, upper
+        self._solver.update(Ax=self._units.ravel(), l=low, u=high)
+        self._solver.warm_start(x=np.zeros(n) if start is None else start, y=np.zeros(len(low)))
+        made = _iterate(_answer(self._solver))
+        return replace(made, multipliers=made.multipliers[:m])
+
+
+_near = kept_by_thread(16)(OsqpNear)
 
 
 def _answer(solver: osqp.OSQP) -> Any:
@@ -104,6 +164,13 @@ class AdmmSplitting:
 
     def __init__(self, P: np.ndarray, q: np.ndarray, *, accuracy: float, device: Device) -> None:
         self._P, self._q, self._accuracy, self._device = P, q, accuracy, device
+
+    def near(self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> Iterate:
+        """See ``Splitting``."""
+        n = units.shape[1]
+        program = Dense(np.eye(n), np.zeros(n), units)
+        programs = AdmmPrograms([program], device=self._device, scaling=0, adapt=ADAPT, rho=RHO)
+        return AdmmIterations(programs, _ENOUGH, NEAR).run(lower, upper, start)
 
     def on(self, A: np.ndarray, iterations: int) -> AdmmIterations:
         """See ``Splitting``."""

@@ -18,6 +18,7 @@ from egs_warp.locomotion import splitting
 from egs_warp.locomotion.active_set import Optimum, ReducedRows, optimum_near
 from egs_warp.locomotion.admm import Ending, Iterate
 from egs_warp.locomotion.solvers import QpSolver, QpStatus, SplittingProgram, quadratic_program
+from egs_warp.locomotion.splitting import Iterations
 
 SOLVERS = pytest.mark.parametrize(
     ("solver", "accuracy"), [(QpSolver.OSQP, 1e-4), (QpSolver.ADMM, 1e-4), (QpSolver.DAQP, 1e-6)]
@@ -97,11 +98,11 @@ def test_each_splitting_is_that_of_its_name(monkeypatch: pytest.MonkeyPatch) -> 
 class Doubting:
     """A splitting whose iterations end with a loose certificate, as OSQP leaves them."""
 
-    def on(self, A: np.ndarray, iterations: int) -> Doubting:
-        return self
+    def near(self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> Iterate:
+        return Iterate(Ending.DOUBTFUL, np.full(20, 2.143e9), np.zeros(len(lower)), 15)
 
-    def run(self, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> Iterate:
-        return Iterate(Ending.DOUBTFUL, np.full(20, 2.143e9), np.zeros(len(lower)), 50)
+    def on(self, A: np.ndarray, iterations: int) -> Iterations:
+        raise AssertionError("nothing is left to iterate on")
 
 
 def test_what_iterations_leave_in_doubt_is_no_guess(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ A problem has a block of threads to itself, see ``kernels.contact.coulomb``; a t
 import warp as wp
 
 from egs_warp.kernels.block import wait_for_block
-from egs_warp.kernels.vectors import on_cpu
+from egs_warp.kernels.vectors import ROW_ELIMINATION, on_cpu
 from egs_warp.precision import Vec3, Vec4, real
 
 wp.set_module_options({"enable_backward": False})
@@ -223,64 +223,11 @@ def eliminate_panel(panel: int, unknowns: int, pivots: Pivots, newton: Newton):
 
 @wp.func_native(
     on_cpu(
-        """
-    constexpr int PANEL = 16;
+        ROW_ELIMINATION
+        + """
     double* const M = (double*)matrix.data;
-    const int stride = matrix.strides[0] / 8, columns = (unknowns + 4) & ~3;
-    int rank = 0, chosen[PANEL];
-    double largest = 0.0, shares[4 * PANEL];
-    for (int begin = 0; begin < unknowns; begin += PANEL) {
-        const int end = unknowns - begin < PANEL ? unknowns : begin + PANEL, next = (end + 3) & ~3, first = rank;
-        int found = 0;
-        for (int j = begin; j < end; ++j) {
-            int pivot = rank;
-            double size = 0.0;
-            for (int a = rank; a < unknowns; ++a) {
-                const double candidate = __builtin_fabs(M[a * stride + j]);
-                if (candidate > size) { size = candidate; pivot = a; }
-            }
-            if (!(size > singular * largest)) continue;
-            largest = size > largest ? size : largest;
-            double *const top = M + rank * stride, *const other = M + pivot * stride;
-            for (int c = begin; pivot != rank && c < columns; ++c) {
-                const double kept = top[c];
-                top[c] = other[c];
-                other[c] = kept;
-            }
-            for (int a = rank + 1; a < unknowns; ++a) {
-                double* const row = M + a * stride;
-                const double factor = row[j] / top[j];
-                row[j] = factor;
-                for (int c = j + 1; c < next; ++c) row[c] -= factor * top[c];
-            }
-            pivots.data[rank++] = j;
-            chosen[found++] = j;
-        }
-        for (int t = 1; t < found; ++t)
-            for (int s = 0; s < t; ++s) {
-                double *const row = M + (first + t) * stride, *const by = M + (first + s) * stride;
-                const double share = row[chosen[s]];
-                for (int c = next; c < columns; c += 4) *(v4*)(row + c) -= share * *(const v4*)(by + c);
-            }
-        for (int a = rank; a < unknowns; a += 4) {
-            const int rows = unknowns - a < 4 ? unknowns - a : 4;
-            for (int q = 0; q < rows; ++q)
-                for (int s = 0; s < found; ++s) shares[q * PANEL + s] = M[(a + q) * stride + chosen[s]];
-            double* const row = M + a * stride;
-            const double* const by = M + first * stride;
-            int c = next;
-            if (rows == 4)
-                for (; c + 8 <= columns; c += 8)
-                    take_off(row + c, row + stride + c, row + 2 * stride + c, row + 3 * stride + c, shares,
-                             shares + PANEL, shares + 2 * PANEL, shares + 3 * PANEL, by + c, stride, found);
-            for (int q = 0; q < rows; ++q)
-                for (int d = c; d < columns; d += 4) {
-                    v4 left = *(v4*)(row + q * stride + d);
-                    for (int s = 0; s < found; ++s) left -= shares[q * PANEL + s] * *(const v4*)(by + s * stride + d);
-                    *(v4*)(row + q * stride + d) = left;
-                }
-        }
-    }
+    const int stride = matrix.strides[0] / 8;
+    const int rank = eliminate_rows(M, stride, unknowns, (unknowns + 4) & ~3, singular, pivots.data);
     for (int back = rank - 1; back >= 0; back -= 1) {
         const double* const row = M + back * stride;
         const int j = pivots.data[back];

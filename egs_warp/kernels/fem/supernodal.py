@@ -5,20 +5,18 @@ See ``egs_warp/fem/sparse_factors.py``.
 
 import warp as wp
 
-from egs_warp.kernels.vectors import on_cpu
+from egs_warp.kernels.vectors import FRONT_ELIMINATION, on_cpu
 from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
 
-BLOCK = 16
-"""Columns of a front that are eliminated, or solved for, at once; an inverse is kept of each such diagonal block."""
 PANEL = 16
 """Right-hand sides of a panel, in a row of memory for each unknown."""
 PADDING = 16
 """Numbers behind an array that may be read, not used."""
 
 _SIZES = f"""
-    constexpr int BLOCK = {BLOCK}, PANEL = {PANEL};
+    constexpr int PANEL = {PANEL};
 """
 
 
@@ -49,11 +47,10 @@ class Fronts:
 
 @wp.func_native(
     on_cpu(
-        _SIZES
+        FRONT_ELIMINATION
         + """
     double* const F = front.data;
     double* const T = F + front_size;
-    double u[BLOCK], reciprocal[BLOCK], X[BLOCK * BLOCK], P[4 * BLOCK];
     int negative = 0;
     for (int s = 0; s < count; ++s) {
         const int begin = fronts.row_offsets.data[s], f = fronts.row_offsets.data[s + 1] - begin;
@@ -71,71 +68,10 @@ class Fronts:
                 for (int b = 0; b <= a; ++b) row[to[b]] += U[b];
             }
         }
-        double* inverse = inverses.data + fronts.inverse_offsets.data[s];
-        for (int b = 0; b < w; b += BLOCK, inverse += BLOCK * BLOCK) {
-            const int nb = w - b < BLOCK ? w - b : BLOCK, next = b + nb;
-            for (int j = 0; j < nb; ++j) {
-                double* const pivot_row = F + (b + j) * ld + b;
-                const double d = pivot_row[j];
-                if (!(d > least || d < -least)) return -1;
-                negative += d < 0.0;
-                reciprocal[j] = 1.0 / d;
-                reciprocals.data[column + b + j] = reciprocal[j];
-                for (int i = j + 1; i < nb; ++i) u[i] = F[(b + i) * ld + b + j];
-                for (int i = j + 1; i < nb; ++i) {
-                    double* const row = F + (b + i) * ld + b;
-                    const double l = u[i] * reciprocal[j];
-                    for (int k = j + 1; k <= i; ++k) row[k] -= l * u[k];
-                    row[j] = l;
-                }
-            }
-            for (int i = 0; i < BLOCK * BLOCK; ++i) inverse[i] = X[i] = 0.0;
-            for (int i = 0; i < nb; ++i) {
-                double* const row = inverse + i * BLOCK;
-                const double* l = F + (b + i) * ld + b;
-                for (int m = 0; m < i; ++m)
-                    for (int k = 0; k <= m; ++k) row[k] -= l[m] * inverse[m * BLOCK + k];
-                row[i] = 1.0;
-                for (int k = 0; k <= i; ++k) X[k * BLOCK + i] = -row[k];
-            }
-            // The rows below times the inverse are L D: by rows divided by D, by columns as they are.
-            const int aligned = next & ~7;
-            for (int c = 0; c < nb; ++c) {
-                for (int i = aligned; i < next; ++i) T[c * ld + i] = 0.0;
-                for (int i = f; i < ld; ++i) T[c * ld + i] = 0.0;
-            }
-            for (int i = next; i < f; i += 4) {
-                const int rows = f - i < 4 ? f - i : 4;
-                double* const l = F + i * ld + b;
-                for (int k = 0; k < 4 * BLOCK; ++k) P[k] = 0.0;
-                if (rows == 4) {
-                    for (int c = 0; c < nb; c += 8)
-                        take_off(P + c, P + BLOCK + c, P + 2 * BLOCK + c, P + 3 * BLOCK + c, l, l + ld, l + 2 * ld,
-                                 l + 3 * ld, X + c, BLOCK, nb);
-                } else {
-                    for (int q = 0; q < rows; ++q)
-                        for (int c = 0; c < nb; c += 8) take_off_one(P + q * BLOCK + c, l + q * ld, X + c, BLOCK, nb);
-                }
-                for (int q = 0; q < rows; ++q)
-                    for (int c = 0; c < nb; ++c) {
-                        T[c * ld + i + q] = P[q * BLOCK + c];
-                        l[q * ld + c] = P[q * BLOCK + c] * reciprocal[c];
-                    }
-            }
-            for (int i = next; i < f; i += 4) {
-                double* const l = F + i * ld + b;
-                if (f - i >= 4) {
-                    for (int c = aligned; c < i + 4; c += 8) {
-                        double* const y = F + i * ld + c;
-                        take_off(y, y + ld, y + 2 * ld, y + 3 * ld, l, l + ld, l + 2 * ld, l + 3 * ld, T + c, ld, nb);
-                    }
-                } else {
-                    for (int q = 0; q < f - i; ++q)
-                        for (int c = aligned; c <= i + q; c += 8)
-                            take_off_one(F + (i + q) * ld + c, l + q * ld, T + c, ld, nb);
-                }
-            }
-        }
+        const int pivots = eliminate_front(F, f, w, ld, T, least, inverses.data + fronts.inverse_offsets.data[s],
+                                           reciprocals.data + column);
+        if (pivots < 0) return -1;
+        negative += pivots;
         double* const L = factor.data + fronts.factor_offsets.data[s];
         for (int i = 0; i < f; ++i)
             for (int j = 0; j < w; ++j) L[i * w + j] = F[i * ld + j];

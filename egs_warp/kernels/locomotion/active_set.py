@@ -6,6 +6,8 @@ in the direction of its side s, z = R^T (s p), so all that is needed of R are it
 
 import warp as wp
 
+from egs_warp.kernels.locomotion.reduced_rows import Reduced, know_products, write_point
+from egs_warp.kernels.vectors import on_cpu
 from egs_warp.precision import Vec4, real
 
 wp.set_module_options({"enable_backward": False})
@@ -32,10 +34,8 @@ class Program:
     """What is given. Columns of matrices lie by fours, which a processor takes at once, zeros after the last. Rows of
     zeros without bounds may follow."""
 
-    rows: wp.array2d[Vec4]
-    """(m, n) R."""
-    products: wp.array2d[Vec4]
-    """(m, m) R R^T."""
+    reduced: Reduced
+    """The rows R, n unknowns wide, and their products with each other."""
     free: wp.array[Vec4]
     """(m,) by fours, the rows at z = 0."""
     lower: wp.array[real]
@@ -85,35 +85,186 @@ def place_of(search: Search, row: int):
 @wp.func
 def product_of(program: Program, row: int, other: int):
     """Of two rows."""
-    return program.products[row, other / 4][other % 4]
+    return program.reduced.products[row, other / 4][other % 4]
 
 
-@wp.func
-def solve_lower(factor: wp.array2d[real], count: int, x: wp.array[real]):
+@wp.func_native(
+    on_cpu(
+        """
+    const int stride = factor.strides[0] / 8, across = products.strides[0] / 8;
+    double* const L = factor.data;
+    const double* const all = (const double*)products.data;
+    for (int i = 0; i < count; ++i) {
+        double* const row = L + i * stride;
+        const double* const from = all + active.data[i] * across;
+        const int sign = side.data[active.data[i]];
+        for (int k = 0; k <= i; ++k) {
+            const double* const by = L + k * stride;
+            const int other = active.data[k];
+            double value = sign * side.data[other] * from[other];
+            v4 sum = 0.0;
+            int j = 0;
+            for (; j + 4 <= k; j += 4) sum += *(const v4*)(row + j) * *(const v4*)(by + j);
+            value -= (sum[0] + sum[1]) + (sum[2] + sum[3]);
+            for (; j < k; ++j) value -= row[j] * by[j];
+            if (k < i) {
+                row[k] = value / by[k];
+            } else {
+                value += redundant;
+                if (!(value > 0.0)) return 0;
+                row[i] = __builtin_sqrt(value);
+            }
+        }
+    }
+    return 1;
+""",
+        elsewhere="return 0;",
+    )
+)
+def factored(
+    products: wp.array2d[Vec4],
+    active: wp.array[wp.int32],
+    side: wp.array[wp.int32],
+    count: wp.int32,
+    redundant: real,
+    factor: wp.array2d[real],
+) -> wp.int32:
+    """The first ``count`` rows of the factor; whether their products have one."""
+    ...
+
+
+@wp.func_native(
+    on_cpu(
+        """
+    const int stride = factor.strides[0] / 8;
+    double* const to = x.data;
+    for (int i = 0; i < count; ++i) {
+        const double* const row = factor.data + i * stride;
+        v4 sum = 0.0;
+        int k = 0;
+        for (; k + 4 <= i; k += 4) sum += *(const v4*)(row + k) * *(const v4*)(to + k);
+        double value = to[i] - ((sum[0] + sum[1]) + (sum[2] + sum[3]));
+        for (; k < i; ++k) value -= row[k] * to[k];
+        to[i] = value / row[i];
+    }
+"""
+    )
+)
+def solve_lower(factor: wp.array2d[real], count: wp.int32, x: wp.array[real]):
     """x <- L^-1 x."""
-    for i in range(count):
-        value = x[i]
-        for k in range(i):
-            value -= factor[i, k] * x[k]
-        x[i] = value / factor[i, i]
+    ...
+
+
+@wp.func_native(
+    on_cpu(
+        """
+    const int stride = factor.strides[0] / 8;
+    double* const to = x.data;
+    for (int i = count - 1; i >= 0; i -= 1) {
+        const double* const row = factor.data + i * stride;
+        const double value = to[i] / row[i];
+        to[i] = value;
+        int k = 0;
+        for (; k + 4 <= i; k += 4) *(v4*)(to + k) -= *(const v4*)(row + k) * value;
+        for (; k < i; ++k) to[k] -= row[k] * value;
+    }
+"""
+    )
+)
+def solve_upper(factor: wp.array2d[real], count: wp.int32, x: wp.array[real]):
+    """x <- L^-T x, row by row of L as it lies in memory."""
+    ...
 
 
 @wp.func
-def solve_upper(factor: wp.array2d[real], count: int, x: wp.array[real]):
-    """x <- L^-T x, row by row of L as it lies in memory."""
-    for back in range(count):
-        i = count - 1 - back
-        value = x[i] / factor[i, i]
-        x[i] = value
-        for k in range(i):
-            x[k] = x[k] - factor[i, k] * value
+def know(program: Program, search: Search, count: int, row: int):
+    """The products of the active rows and of ``row``."""
+    reduced = program.reduced
+    know_products(
+        reduced.minimum.shape[0], search.active, count, row, reduced.rows, reduced.columns, reduced.products,
+        reduced.known, reduced.scratch,
+    )  # fmt: skip
+
+
+@wp.func_native(
+    on_cpu(
+        """
+    const int tall = products.strides[0] / 8;
+    const double* const from = (const double*)products.data + row * tall;
+    double* const to = (double*)at.data;
+    for (int i = 0; i < tall; i += 4) *(v4*)(to + i) += by * *(const v4*)(from + i);
+"""
+    )
+)
+def move_by(products: wp.array2d[Vec4], row: wp.int32, by: real, at: wp.array[Vec4]):
+    """See ``move_rows``."""
+    ...
 
 
 @wp.func
 def move_rows(program: Program, search: Search, row: int, by: real):
     """All rows where the multiplier of ``row`` is greater ``by``."""
-    for quad in range(search.at.shape[0]):
-        search.at[quad] = search.at[quad] + by * program.products[row, quad]
+    move_by(program.reduced.products, row, by, search.at)
+
+
+@wp.func_native(
+    on_cpu(
+        """
+    const int wide = rows.strides[0] / 8;
+    const double* const Z = (const double*)rows.data;
+    double* const to = (double*)outside.data;
+    for (int c = 0; c < wide; c += 4) *(v4*)(to + c) = towards * *(const v4*)(Z + row * wide + c);
+    for (int i = 0; i < count; ++i) {
+        const int other = active.data[i];
+        const double share = side.data[other] * rates.data[i];
+        for (int c = 0; c < wide; c += 4) *(v4*)(to + c) -= share * *(const v4*)(Z + other * wide + c);
+    }
+    v4 square = 0.0;
+    for (int c = 0; c < wide; c += 4) square += *(v4*)(to + c) * *(v4*)(to + c);
+    return (square[0] + square[1]) + (square[2] + square[3]);
+""",
+        elsewhere="return 0.0;",
+    )
+)
+def square_outside(
+    rows: wp.array2d[Vec4],
+    row: wp.int32,
+    towards: real,
+    active: wp.array[wp.int32],
+    side: wp.array[wp.int32],
+    rates: wp.array[real],
+    count: wp.int32,
+    outside: wp.array[Vec4],
+) -> real:
+    """Of ``row``, in the direction that it is held ``towards``, what lies outside of those that hold, and its
+    square."""
+    ...
+
+
+@wp.func_native(
+    on_cpu(
+        """
+    const double* const place = (const double*)at.data;
+    int found = -1;
+    double most = 0.0;
+    for (int i = 0; i < side.shape[0]; ++i) {
+        const double below = lower.data[i] - place[i], above = place[i] - upper.data[i];
+        const double breach = (below > above ? below : above) - slack.data[i];
+        if (side.data[i] == 0 && breach > most) {
+            most = breach;
+            found = i;
+        }
+    }
+    return found;
+""",
+        elsewhere="return -1;",
+    )
+)
+def most_broken(
+    lower: wp.array[real], upper: wp.array[real], slack: wp.array[real], side: wp.array[wp.int32], at: wp.array[Vec4]
+) -> wp.int32:
+    """Of the rows without a side the one that breaks its bounds most, -1 where none does."""
+    ...
 
 
 @wp.func
@@ -128,22 +279,12 @@ def hold(program: Program, search: Search):
                 return -1
             search.active[count] = row
             count += 1
+    know(program, search, count, -1)
+    if factored(program.reduced.products, search.active, search.side, count, _REDUNDANT, search.factor) == 0:
+        return -1
     for i in range(count):
         row = search.active[i]
         sign = real(search.side[row])
-        for k in range(i + 1):
-            other = search.active[k]
-            value = sign * real(search.side[other]) * product_of(program, row, other)
-            if k == i:
-                value += _REDUNDANT
-            for j in range(k):
-                value -= search.factor[i, j] * search.factor[k, j]
-            if k < i:
-                search.factor[i, k] = value / search.factor[k, k]
-            else:
-                if not value > real(0.0):
-                    return -1
-                search.factor[i, i] = wp.sqrt(value)
         search.pulls[i] = sign * (bound_of(program, search, row) - program.free[row / 4][row % 4])
     solve_lower(search.factor, count, search.pulls)
     solve_upper(search.factor, count, search.pulls)
@@ -241,6 +382,7 @@ def join(program: Program, search: Search, active: int, row: int):
         sign = 1
         bound = program.lower[row]
     towards = real(sign)
+    know(program, search, 0, row)
     square = product_of(program, row, row)
     pull = real(0.0)
     while True:
@@ -252,26 +394,21 @@ def join(program: Program, search: Search, active: int, row: int):
         for i in range(count):
             search.rates[i] = search.across[i]
         solve_upper(search.factor, count, search.rates)
-        for quad in range(search.outside.shape[0]):
-            search.outside[quad] = towards * program.rows[row, quad]
+        apart = square_outside(
+            program.reduced.rows, row, towards, search.active, search.side, search.rates, count, search.outside
+        )
         part = real(wp.inf)
         first = int(-1)
         for i in range(count):
-            other = search.active[i]
             rate = search.rates[i]
-            share = real(search.side[other]) * rate
-            for quad in range(search.outside.shape[0]):
-                search.outside[quad] = search.outside[quad] - share * program.rows[other, quad]
             if rate > real(0.0):
                 ends = wp.max(search.pulls[i], real(0.0)) / rate
                 if ends < part:
                     part = ends
                     first = i
-        apart = real(0.0)
-        for quad in range(search.outside.shape[0]):
-            apart += wp.dot(search.outside[quad], search.outside[quad])
         whole = real(wp.inf)
-        if apart > _DEPENDENT * square:
+        # As many rows as unknowns leave nothing outside, whatever rounding says.
+        if apart > _DEPENDENT * square and count < search.active.shape[0]:
             whole = towards * (bound - place_of(search, row)) / apart
         step = wp.min(whole, part)
         if not apart < real(wp.inf):
@@ -287,8 +424,6 @@ def join(program: Program, search: Search, active: int, row: int):
         for i in range(count):
             search.pulls[i] = search.pulls[i] - step * search.rates[i]
         if whole <= part:
-            if count == search.active.shape[0]:
-                return -2
             for i in range(count):
                 search.factor[count, i] = search.across[i]
             search.factor[count, count] = wp.sqrt(apart + _REDUNDANT)
@@ -321,14 +456,7 @@ def descend(program: Program, search: Search, active: int, pivots: int):
     """From rows that all pull the right way; how the search ends. What is broken most joins first."""
     count = int(active)
     for _ in range(pivots):
-        most = real(0.0)
-        row = int(-1)
-        for j in range(search.side.shape[0]):
-            if search.side[j] == 0:
-                breach = breach_of(program, search, j)
-                if breach > most:
-                    most = breach
-                    row = j
+        row = most_broken(program.lower, program.upper, program.slack, search.side, search.at)
         if row < 0:
             return FOUND
         count = join(program, search, count, row)
@@ -341,6 +469,29 @@ def descend(program: Program, search: Search, active: int, pivots: int):
     return ASTRAY
 
 
+@wp.func
+def find_optimum(program: Program, pivots: int, search: Search):
+    """See ``optimum_kernel``."""
+    for _ in range(_ROUNDS):
+        count = hold(program, search)
+        if count < 0:
+            break
+        if let_go_of_wrong(program, search, count) + hold_broken(program, search) == 0:
+            return FOUND
+    for _ in range(_REVISIONS):
+        count = hold_those_that_pull(program, search)
+        ended = descend(program, search, count, pivots)
+        if ended != FOUND:
+            return ended
+        # Once more without what rounding has carried along.
+        count = hold(program, search)
+        if count < 0:
+            continue
+        if let_go_of_wrong(program, search, count) + hold_broken(program, search) == 0:
+            return FOUND
+    return ASTRAY
+
+
 @wp.kernel
 def optimum_kernel(
     program: Program,
@@ -349,29 +500,23 @@ def optimum_kernel(
     search: Search,
     # Out:
     ended: wp.array[int],
+    point: wp.uint64,
 ):
-    """From ``search.side``, a guess, to the optimum; how it ended. One thread.
+    """From ``search.side``, a guess, to the optimum; how it ended and how many rows hold, and the ``point`` x, n
+    numbers at an address. One thread of a CPU.
 
     The guessed rows are held at their bounds, which is one system of linear equations in their multipliers; rows that
     pull the wrong way are let go, rows that break their bounds are held instead. Where that goes on for long, rows that
     break their bounds join one at a time, at the dual's best step: that ends.
     """
-    ended[0] = FOUND
-    for _ in range(_ROUNDS):
-        count = hold(program, search)
-        if count < 0:
-            break
-        if let_go_of_wrong(program, search, count) + hold_broken(program, search) == 0:
-            return
-    for _ in range(_REVISIONS):
-        count = hold_those_that_pull(program, search)
-        ended[0] = descend(program, search, count, pivots)
-        if ended[0] != FOUND:
-            return
-        # Once more without what rounding has carried along.
-        count = hold(program, search)
-        if count < 0:
-            continue
-        if let_go_of_wrong(program, search, count) + hold_broken(program, search) == 0:
-            return
-    ended[0] = ASTRAY
+    ended[0] = find_optimum(program, pivots, search)
+    count = int(0)
+    for row in range(search.side.shape[0]):
+        if search.side[row] != 0:
+            count += 1
+    ended[1] = count
+    reduced = program.reduced
+    write_point(
+        reduced.lower, reduced.roots, reduced.minimum, reduced.rows, search.active, search.side, search.pulls, count,
+        point,
+    )  # fmt: skip
