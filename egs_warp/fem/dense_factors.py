@@ -72,6 +72,10 @@ class DenseFactors:
         self._fill(self._other, entries)
         return moves.T @ (self._other @ moves)
 
+    def ahead(self, weights: np.ndarray, vectors: torch.Tensor, near: float, far: float) -> torch.Tensor:
+        """See ``Factors``."""
+        return near * vectors + far * self.solve(self.take(weights)[:, None] * vectors)
+
     def take(self, values: np.ndarray) -> torch.Tensor:
         """See ``Factors``."""
         return torch.from_numpy(np.ascontiguousarray(values)).to(self._device)

@@ -41,6 +41,11 @@ class Factors(Protocol):
         comes back."""
         ...
 
+    def ahead(self, weights: np.ndarray, vectors: Any, near: float, far: float) -> Any:
+        """``near`` X + ``far`` S^-1 (diag(w) X) of ``vectors`` X (n, m), one of their own, ``weights`` w (n,); alike
+        comes back."""
+        ...
+
     def take(self, values: np.ndarray) -> Any:
         """As one of their own."""
         ...

@@ -147,6 +147,11 @@ class SparseFactors:
         inside = first.shape[1]
         return np.block([[first[:inside], first[inside:].T], [first[inside:], second]])
 
+    def ahead(self, weights: np.ndarray, vectors: np.ndarray, near: float, far: float) -> np.ndarray:
+        """See ``Factors``."""
+        assert self._added is None, "of a matrix alone"
+        return self._plain(vectors, np.ascontiguousarray(weights, dtype=np.float64), near, far)
+
     def take(self, values: np.ndarray) -> np.ndarray:
         """See ``Factors``."""
         return values
@@ -155,7 +160,9 @@ class SparseFactors:
         """See ``Factors``."""
         return values
 
-    def _plain(self, right: np.ndarray) -> np.ndarray:
+    def _plain(
+        self, right: np.ndarray, weights: np.ndarray | None = None, near: float = 0.0, far: float = 1.0
+    ) -> np.ndarray:
         assert self._ready, "update() comes first"
         right = np.asarray(right, dtype=np.float64)
         count = 1 if right.ndim == 1 else right.shape[1]
@@ -175,6 +182,9 @@ class SparseFactors:
             strides[0],
             strides[1] if right.ndim > 1 else 0,
             count,
+            0 if weights is None else weights.ctypes.data,
+            near,
+            far,
             self._room,
             solution.ctypes.data,
         ]

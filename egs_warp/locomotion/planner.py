@@ -14,13 +14,13 @@ from egs_warp.fem.body import SoftBody
 from egs_warp.fem.factors import Factors
 from egs_warp.launching import beside
 from egs_warp.locomotion.contact_pieces import ContactPieces
+from egs_warp.locomotion.impulses import SynergyImpulses
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.step_cost import Horizon, LinearStep, QuadraticCost, effort_cost, objectives_cost
 from egs_warp.locomotion.strategies import Foreseen, search_program
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.muscles.muscle_set import MuscleSet
-from egs_warp.muscles.tension import muscle_columns
 
 STEPS_A_UNIT = 19.0
 """Least number of steps in sqrt(H / g) within which a body can be steered."""
@@ -119,24 +119,21 @@ class StepPlanner:
     def program(self, prospect: Prospect, last: np.ndarray, objectives: Sequence[AnyObjective]) -> StepProgram:
         """What is asked of the step, linear about the ``prospect``; ``last`` (M,) are the step before's activations."""
         response, foreseen, body = prospect.response, prospect.velocities, self.body
-        problem, contacts, members = response.tangent.problem, response.contacts, self.synergies.members
+        problem, contacts = response.tangent.problem, response.contacts
         weight, m, speed = body.weight, self.synergies.count, body.speed_unit
-        each = muscle_columns(self.muscles, problem.end_positions(foreseen)).toarray() * self.muscles.bounds
         # Without muscles and contact.
         free = problem.residual(foreseen, None).ravel()
-        impulses = np.empty((len(free), m + 1), order="F")
-        impulses[:, :-1] = problem.dt * (members.T @ each.T).T
-        impulses[:, -1] = free
+        impulses = self._impulses.beside(free, problem.end_positions(foreseen), problem.dt)
         # What the kernels of elasticity are needed for goes on in one thread alone.
         solved, horizon = beside(
             lambda: response.tangent.solve(impulses), lambda: Horizon.of(problem, foreseen, self.factors)
         )
+        velocities = np.empty((free.size, m + 3 * contacts.count + 1))
+        velocities[:, :m] = solved[:, :-1]
+        np.multiply(weight, response.columns, out=velocities[:, m:-1])
+        np.subtract(foreseen.ravel(), solved[:, -1], out=velocities[:, -1])
         torques = problem.dt * weight * contacts.speeds(problem.turns).T
-        linear = LinearStep(
-            foreseen.ravel() - solved[:, -1],
-            np.hstack([solved[:, :-1], weight * response.columns]),
-            np.hstack([np.zeros((3, m)), torques]),
-        )
+        linear = LinearStep(velocities, np.hstack([np.zeros((3, m)), torques]))
         previous = self.synergies.mean(last / self.muscles.bounds)
         cost = (
             objectives_cost(problem, linear, contacts, objectives, speed)
@@ -167,6 +164,10 @@ class StepPlanner:
         diagonal[: len(previous)] = 2.0 * (size + change) + _REGULAR
         q[: len(previous)] = -2.0 * change * previous
         return QuadraticCost(np.diag(diagonal), q, float(change @ previous**2))
+
+    @cached_property
+    def _impulses(self) -> SynergyImpulses:
+        return SynergyImpulses(self.muscles, self.synergies)
 
     @cached_property
     def _strengths(self) -> tuple[np.ndarray, np.ndarray]:

@@ -27,12 +27,20 @@ nothing by letting go."""
 class LinearStep:
     """End velocity and change of angular momentum of a step, linear in x = (activations, contact forces)."""
 
-    base: np.ndarray
-    """(3N,) m/s without muscles and contact."""
-    columns: np.ndarray
-    """(3N, k) m/s for each of x."""
+    velocities: np.ndarray
+    """(3N, k + 1) m/s for each of x, and without muscles and contact."""
     torques: np.ndarray
     """(3, k) kg m^2/s for each of x."""
+
+    @property
+    def columns(self) -> np.ndarray:
+        """(3N, k) m/s for each of x."""
+        return self.velocities[:, :-1]
+
+    @property
+    def base(self) -> np.ndarray:
+        """(3N,) m/s without muscles and contact."""
+        return self.velocities[:, -1]
 
 
 @dataclass(frozen=True)
@@ -125,9 +133,8 @@ def effort_cost(
     one implicit step over the horizon: carried on at its speed, what lets go would seem to be strained the other way.
     """
     body, assembly, factors = problem.body, problem.body.assembly, horizon.factors
-    speeds = factors.take(np.column_stack([linear.columns, linear.base]))
-    further = factors.solve(factors.take(np.repeat(body.node_mass, 3)[:, None]) * speeds)
-    moves = problem.dt * speeds + (horizon.time - problem.dt) * further
+    masses, velocities = np.repeat(body.node_mass, 3), factors.take(linear.velocities)
+    moves = factors.ahead(masses, velocities, problem.dt, horizon.time - problem.dt)
     moves[:, -1] -= problem.dt * factors.take(foreseen)
     quadratic = factors.give(factors.quadratic(horizon.entries, moves))
     gradient = assembly.gradient(horizon.end, horizon.damping)

@@ -31,11 +31,8 @@ def example(unknowns: int = 4) -> tuple[StepProblem, LinearStep, np.ndarray]:
     rng = np.random.default_rng(0)
     nodes = BODY.mesh.nodes
     state = BodyState(nodes + 0.005 * rng.standard_normal(nodes.shape), 0.1 * rng.standard_normal(nodes.shape))
-    linear = LinearStep(
-        0.1 * rng.standard_normal(nodes.size),
-        0.1 * rng.standard_normal((nodes.size, unknowns)),
-        rng.standard_normal((3, unknowns)),
-    )
+    base, columns = 0.1 * rng.standard_normal(nodes.size), 0.1 * rng.standard_normal((nodes.size, unknowns))
+    linear = LinearStep(np.column_stack([columns, base]), rng.standard_normal((3, unknowns)))
     return StepProblem(BODY, state, DT), linear, 0.1 * rng.standard_normal(nodes.size)
 
 
@@ -86,7 +83,7 @@ def test_effort_is_the_energy_ahead_and_convex() -> None:
     assert np.linalg.eigvalsh(cost.P).min() >= -1e-12 * np.abs(cost.P).max()
     # About the end that is foreseen the model is the energy, to second order.
     assert np.linalg.norm(cost.P) > 0.0
-    still = LinearStep(0.0 * foreseen, 1e-2 * linear.columns, linear.torques)
+    still = LinearStep(np.column_stack([1e-2 * linear.columns, 0.0 * foreseen]), linear.torques)
     rest = np.zeros_like(foreseen)
     ahead = Horizon.of(problem, rest.reshape(-1, 3), factors, horizon=horizon)
     modelled = effort_cost(problem, still, rest, ahead, weight=0.1)
@@ -110,7 +107,7 @@ def test_what_lets_go_is_foreseen_slack_not_strained_the_other_way() -> None:
     stretch = 0.02 * (nodes - nodes.mean(axis=0)) * [0.0, 0.0, 1.0]
     problem = StepProblem(BODY, BodyState(nodes + stretch, np.zeros_like(nodes)), DT)
     back = (-stretch / DT).ravel()
-    linear = LinearStep(back, np.zeros((back.size, 1)), np.zeros((3, 1)))
+    linear = LinearStep(np.column_stack([np.zeros(back.size), back]), np.zeros((3, 1)))
     factors = SparseFactors(BODY.assembly.upper_pattern)
     horizon = 3.0 * DT / np.sqrt(BODY.height / 9.81)
     ahead = Horizon.of(problem, back.reshape(-1, 3), factors, horizon=horizon)

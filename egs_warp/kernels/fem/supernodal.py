@@ -112,7 +112,8 @@ def factored(
     for (int i = 0; i < unknowns; ++i) {
         double* const row = x + fronts.place.data[i] * PANEL;
         const double* g = given + i * row_stride + from * column_stride;
-        for (int q = 0; q < columns; ++q) row[q] = g[q * column_stride];
+        const double by = weights ? ((const double*)weights)[i] : 1.0;
+        for (int q = 0; q < columns; ++q) row[q] = by * g[q * column_stride];
         for (int q = columns; q < width; ++q) row[q] = 0.0;
     }
     for (int s = 0; s < blocks; ++s) {
@@ -193,7 +194,11 @@ def factored(
     for (int i = 0; i < unknowns; ++i) {
         const double* row = x + fronts.place.data[i] * PANEL;
         double* const to = found + (long long)i * count + from;
-        for (int q = 0; q < columns; ++q) to[q] = row[q];
+        const double* g = given + i * row_stride + from * column_stride;
+        if (weights)
+            for (int q = 0; q < columns; ++q) to[q] = near_share * g[q * column_stride] + far_share * row[q];
+        else
+            for (int q = 0; q < columns; ++q) to[q] = row[q];
     }
 """
     )
@@ -209,12 +214,16 @@ def solved_panel(
     row_stride: wp.int32,
     column_stride: wp.int32,
     count: wp.int32,
+    weights: wp.uint64,
+    near_share: real,
+    far_share: real,
     panel: wp.int32,
     room: wp.array[real],
     solution: wp.uint64,
 ) -> None:
     """A panel of ``count`` right-hand sides; ``right`` and ``solution`` are addresses of numbers, the first with its
-    strides in them, the second row by row."""
+    strides in them, the second row by row. With ``weights`` of rows, another address or 0, ``near_share`` of what is
+    given and ``far_share`` of the solution with what is given by weight."""
     ...
 
 
@@ -327,14 +336,17 @@ def solve_kernel(
     row_stride: wp.int32,
     column_stride: wp.int32,
     count: wp.int32,
+    weights: wp.uint64,
+    near_share: real,
+    far_share: real,
     room: wp.array[real],
     solution: wp.uint64,
 ) -> None:
     """One thread a panel, see ``solved_panel``."""
-    if count == 1:
+    if count == 1 and weights == wp.uint64(0):
         solved_one(fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, room, solution)
         return
     solved_panel(
         fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, column_stride, count,
-        first_panel + wp.tid(), room, solution,
+        weights, near_share, far_share, first_panel + wp.tid(), room, solution,
     )  # fmt: skip
