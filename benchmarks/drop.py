@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from egs_warp.contact.detection import contact_geometry
 from egs_warp.fem.body import GRAVITY, BodyState, SoftBody
-from egs_warp.fem.elasticity import ElasticAssembly, Material
+from egs_warp.fem.elastic_maps import Material
+from egs_warp.fem.elasticity import ElasticAssembly
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh

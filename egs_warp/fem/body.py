@@ -10,7 +10,8 @@ import scipy.sparse as sparse
 import scipy.sparse.linalg as sparse_linalg
 
 from egs_warp.errors import ArgumentError
-from egs_warp.fem.elasticity import ElasticAssembly, Material
+from egs_warp.fem.elastic_maps import Material
+from egs_warp.fem.elasticity import ElasticAssembly
 from egs_warp.geometry.frames import best_turn
 from egs_warp.geometry.plane import Plane
 from egs_warp.geometry.tetmesh import TetMesh

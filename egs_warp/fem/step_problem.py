@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.fem.elasticity import Damping
+from egs_warp.fem.elastic_maps import Damping
 from egs_warp.fem.factors import Factors
 from egs_warp.geometry.frames import turning
 from egs_warp.muscles.tension import MuscleTension

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from egs_warp.contact.detection import ContactSet
-from egs_warp.fem.elasticity import Damping
+from egs_warp.fem.elastic_maps import Damping
 from egs_warp.fem.factors import Factors
 from egs_warp.fem.step_problem import StepProblem, UnsolvableStepError
 from egs_warp.locomotion.objectives import AnyObjective

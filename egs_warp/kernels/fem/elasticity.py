@@ -6,9 +6,10 @@ from egs_warp.precision import Mat33, Vec3, real
 
 wp.set_module_options({"enable_backward": False})
 
-_OFF = wp.constant(real(1e-31))
+OFF, SWEEPS = 1e-31, 12
+_OFF = wp.constant(real(OFF))
 """Of the squared trace: what is left beside the diagonal, squared, of a matrix in its principal axes."""
-_SWEEPS = wp.constant(12)
+_SWEEPS = wp.constant(SWEEPS)
 """In which Jacobi's rotations, whose error squares in each, are long done."""
 
 

@@ -1,0 +1,158 @@
+"""Elasticity by a kernel over the elements and one that gathers, for a GPU: see ``ElasticAssembly``."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sparse
+import warp as wp
+
+from egs_warp.fem.elastic_maps import Damping, ElasticMaps, Material
+from egs_warp.kernels.fem import elasticity as kernels
+from egs_warp.launching import empty, launch_again, put
+from egs_warp.muscles.tension import FULL, SLACK, MuscleTension
+from egs_warp.precision import Mat33, Vec3, real
+
+
+class _MuscleLines:
+    """Kernel, index maps and scratch memory for the segments of one set of muscles."""
+
+    def __init__(self, tension: MuscleTension, device: wp.Device) -> None:
+        self.rows, self._device = tension.rows, device
+        by_node = self.rows.T.tocsr()
+        self.ends = self._index(by_node)
+        self._lines = [*self._index(self.rows), wp.array(tension.rest_lengths, dtype=real, device=device), SLACK, FULL]
+        count = len(tension.rest_lengths)
+        self._tensions = wp.zeros(count, dtype=real, device=device)
+        self._pulls = wp.zeros(count, dtype=Vec3, device=device)
+
+    def _index(self, rows: sparse.csr_matrix) -> list[wp.array]:
+        maps = [wp.array(part.astype(np.int32), dtype=int, device=self._device) for part in (rows.indptr, rows.indices)]
+        return [*maps, wp.array(rows.data, dtype=real, device=self._device)]
+
+    def pulled(self, tension: MuscleTension, positions: wp.array) -> wp.array:
+        """(M,) newtons, by which each segment draws its ends together."""
+        put(self._tensions, tension.tensions)
+        launch_again(
+            kernels.segment_pulls_kernel,
+            len(self._tensions),
+            inputs=[*self._lines, self._tensions, positions],
+            outputs=[self._pulls],
+            device=self._device,
+        )
+        return self._pulls
+
+
+class ElementKernels:
+    """Arrays of one mesh on a device, and scratch memory."""
+
+    def __init__(self, maps: ElasticMaps, material: Material, device: wp.Device) -> None:
+        self._device, self._material = device, material
+        node_count, tet_count = len(maps.corner_offsets) - 1, len(maps.tets)
+        self._tets = wp.array(maps.tets, dtype=wp.vec4i, device=device)
+        self._rest_inverses = wp.array(maps.rest_inverses, dtype=Mat33, device=device)
+        self._volumes = wp.array(maps.volumes, dtype=real, device=device)
+        self._corners, self._blocks_of = (
+            [wp.array(part, dtype=int, device=device) for part in parts]
+            for parts in (
+                (maps.corner_offsets, maps.corner_from_slot),
+                (maps.contribution_offsets, maps.block_from_contribution, maps.entry_from_block),
+            )
+        )
+        self._no_gradients, self._no_pulls = empty(0, Mat33, device), empty(0, Vec3, device)
+        self._no_ends = [empty(0, int, device), empty(0, int, device), empty(0, real, device)]
+        self._muscles: _MuscleLines | None = None
+        self._positions = wp.zeros(node_count, dtype=Vec3, device=device)
+        self._energies = wp.zeros(tet_count, dtype=real, device=device)
+        self._determinants = wp.zeros(tet_count, dtype=real, device=device)
+        self._corner_gradients = wp.zeros((tet_count, 4), dtype=Vec3, device=device)
+        self._node_gradients = wp.zeros(node_count, dtype=Vec3, device=device)
+        self._blocks = wp.zeros((tet_count, 16), dtype=Mat33, device=device)
+        self._entries = wp.zeros(maps.upper_pattern.nnz, dtype=real, device=device)
+
+    @property
+    def _model(self) -> list:
+        material = self._material
+        return [self._tets, self._rest_inverses, self._volumes, material.mu, material.lam, material.damping_time]
+
+    def start(self, positions: np.ndarray) -> wp.array:
+        """What damping needs of a step's start at ``positions`` (N, 3)."""
+        gradients = empty(len(self._tets), Mat33, self._device)
+        put(self._positions, positions)
+        launch_again(
+            kernels.deformation_gradients_kernel,
+            len(self._tets),
+            inputs=[self._tets, self._rest_inverses, self._positions],
+            outputs=[gradients],
+            device=self._device,
+        )
+        return gradients
+
+    def _damping_inputs(self, damping: Damping | None) -> list:
+        # A kernel that is told no step does not read the gradients.
+        return (
+            [self._no_gradients, self._positions, 0.0]
+            if damping is None
+            else [damping.start, self._positions, damping.dt]
+        )
+
+    def energy(self, positions: np.ndarray, damping: Damping | None) -> tuple[float, np.ndarray]:
+        """Joules, and det F (T,)."""
+        put(self._positions, positions)
+        launch_again(
+            kernels.element_energies_kernel,
+            len(self._tets),
+            inputs=[*self._model, *self._damping_inputs(damping)],
+            outputs=[self._energies, self._determinants],
+            device=self._device,
+        )
+        return float(self._energies.numpy().sum()), self._determinants.numpy().copy()
+
+    def gradient(self, positions: np.ndarray, damping: Damping | None, tension: MuscleTension | None) -> np.ndarray:
+        """(N, 3) newtons."""
+        put(self._positions, positions)
+        ends, pulls = self._no_ends, self._no_pulls
+        if tension is not None:
+            muscles = self._muscles_of(tension)
+            ends, pulls = muscles.ends, muscles.pulled(tension, self._positions)
+        launch_again(
+            kernels.element_gradients_kernel,
+            len(self._tets),
+            inputs=[*self._model, *self._damping_inputs(damping)],
+            outputs=[self._corner_gradients],
+            device=self._device,
+        )
+        launch_again(
+            kernels.gather_forces_kernel,
+            len(self._positions),
+            inputs=[*self._corners, *ends, self._corner_gradients, pulls],
+            outputs=[self._node_gradients],
+            device=self._device,
+        )
+        return self._node_gradients.numpy().copy()
+
+    def _muscles_of(self, tension: MuscleTension) -> _MuscleLines:
+        if self._muscles is None or self._muscles.rows is not tension.rows:
+            self._muscles = _MuscleLines(tension, self._device)
+        return self._muscles
+
+    def hessian_entries(
+        self, positions: np.ndarray, damping: Damping | None, *, factor: float, projected: bool
+    ) -> np.ndarray:
+        """(nnz,) upper entries."""
+        put(self._positions, positions)
+        hessian = kernels.element_projected_hessians_kernel if projected else kernels.element_hessians_kernel
+        launch_again(
+            hessian,
+            len(self._tets),
+            inputs=[*self._model, *self._damping_inputs(damping)],
+            outputs=[self._blocks],
+            device=self._device,
+        )
+        launch_again(
+            kernels.gather_matrix_kernel,
+            self._blocks_of[2].shape[0],
+            inputs=[*self._blocks_of, self._blocks, factor],
+            outputs=[self._entries],
+            device=self._device,
+        )
+        return self._entries.numpy().copy()
