@@ -53,7 +53,8 @@ class ContactResponse:
     def of(cls, tangent: Tangent, contacts: ContactSet, columns: np.ndarray | None = None) -> ContactResponse:
         """Of ``contacts``; ``columns`` if they are known."""
         if columns is None:
-            columns = tangent.problem.dt * tangent.solve(contacts.frame.T)
+            columns = tangent.solve(contacts.frame.T)
+            columns *= tangent.problem.dt
         delassus = contacts.speeds(columns)
         return cls(tangent, contacts, columns, delassus)
 

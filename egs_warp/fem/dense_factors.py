@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import scipy.sparse as sparse
 import torch
+
+from egs_warp.fem.kept import Kept
 
 
 class DenseFactors:
@@ -45,8 +45,8 @@ class DenseFactors:
         """See ``Factors``; S keeps its own factor where the sum has none."""
         if not self._finite or not (np.isfinite(across).all() and np.isfinite(rates).all()):
             return False
-        directions = self.take(across)
-        factor, info = torch.linalg.cholesky_ex(torch.addmm(self._matrix, directions * self.take(rates), directions.T))
+        directions = self._take(across)
+        factor, info = torch.linalg.cholesky_ex(torch.addmm(self._matrix, directions * self._take(rates), directions.T))
         if int(info) != 0:
             return False
         self._factor, self._inverse = factor, None
@@ -57,34 +57,44 @@ class DenseFactors:
         """See ``Factors``."""
         return self._factor is not None
 
-    def solve(self, right: Any) -> Any:
+    def solve(self, right: np.ndarray, kept: Kept | None = None) -> np.ndarray:
         """See ``Factors``."""
-        if isinstance(right, np.ndarray):
-            return self.give(self.solve(self.take(right)))
+        plain = self._give(self._solve(self._take(right)))
+        return plain if kept is None else kept.corrected(right, plain)
+
+    def _solve(self, right: torch.Tensor) -> torch.Tensor:
         inverse = self._inverse
         if inverse is None:
             assert self._factor is not None, "update() comes first"
             inverse = self._inverse = torch.linalg.solve_triangular(self._factor, self._identity, upper=False)
         return inverse.T @ (inverse @ right)
 
-    def quadratic(self, entries: np.ndarray, moves: torch.Tensor) -> torch.Tensor:
+    def strain_ahead(
+        self,
+        entries: np.ndarray,
+        slope: np.ndarray,
+        weights: np.ndarray,
+        vectors: np.ndarray,
+        *,
+        near: float,
+        far: float,
+        away: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """See ``Factors``."""
+        given = self._take(vectors)
+        moves = near * given + far * self._solve(self._take(weights)[:, None] * given)
+        moves[:, -1] -= self._take(away)
         self._fill(self._other, entries)
-        return moves.T @ (self._other @ moves)
+        return self._give(moves.T @ (self._other @ moves)), self._give(self._take(slope) @ moves)
 
-    def ahead(self, weights: np.ndarray, vectors: torch.Tensor, near: float, far: float) -> torch.Tensor:
-        """See ``Factors``."""
-        return near * vectors + far * self.solve(self.take(weights)[:, None] * vectors)
-
-    def take(self, values: np.ndarray) -> torch.Tensor:
-        """See ``Factors``."""
+    def _take(self, values: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(values)).to(self._device)
 
-    def give(self, values: torch.Tensor) -> np.ndarray:
-        """See ``Factors``."""
+    @staticmethod
+    def _give(values: torch.Tensor) -> np.ndarray:
         return values.cpu().numpy()
 
     def _fill(self, matrix: torch.Tensor, entries: np.ndarray) -> None:
-        values, flat = self.take(entries), matrix.view(-1)
+        values, flat = self._take(entries), matrix.view(-1)
         flat[self._upper] = values
         flat[self._lower] = values

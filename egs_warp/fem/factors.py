@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import scipy.sparse as sparse
 import warp as wp
 
+from egs_warp.fem.kept import Kept
 from egs_warp.fem.sparse_factors import SparseFactors
 
 
 class Factors(Protocol):
-    """Of symmetric matrices S of one pattern, and of sums with them.
-
-    Arrays are NumPy's, or their own: those are made by ``take``, stay where the factors are, can be calculated with
-    like NumPy's, and come back by ``give``.
-    """
+    """Of symmetric matrices S of one pattern, and of sums with them."""
 
     def update(self, entries: np.ndarray) -> bool:
         """Factor S with these upper ``entries`` (nnz,); False if it is not positive definite."""
@@ -32,26 +29,24 @@ class Factors(Protocol):
         """Whether there is something to solve with."""
         ...
 
-    def solve(self, right: Any) -> Any:
-        """(n,) or each column of (n, m), NumPy's or their own; alike comes back."""
+    def solve(self, right: np.ndarray, kept: Kept | None = None) -> np.ndarray:
+        """(n,) or each column of (n, m); with what is ``kept``."""
         ...
 
-    def quadratic(self, entries: np.ndarray, moves: Any) -> Any:
-        """(m, m) X^T H X of the matrix H with upper ``entries`` (nnz,) and ``moves`` X (n, m), one of their own; alike
-        comes back."""
-        ...
-
-    def ahead(self, weights: np.ndarray, vectors: Any, near: float, far: float) -> Any:
-        """``near`` X + ``far`` S^-1 (diag(w) X) of ``vectors`` X (n, m), one of their own, ``weights`` w (n,); alike
-        comes back."""
-        ...
-
-    def take(self, values: np.ndarray) -> Any:
-        """As one of their own."""
-        ...
-
-    def give(self, values: Any) -> np.ndarray:
-        """One of their own, as NumPy's."""
+    def strain_ahead(
+        self,
+        entries: np.ndarray,
+        slope: np.ndarray,
+        weights: np.ndarray,
+        vectors: np.ndarray,
+        *,
+        near: float,
+        far: float,
+        away: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(m, m) X^T H X and (m,) X^T g of the moves X = ``near`` V + ``far`` S^-1 diag(w) V of ``vectors`` V (n, m),
+        ``weights`` w (n,), from the last of which ``away`` (n,) is taken; H has upper ``entries``, g (n,) is the
+        ``slope``. Of an S without a sum."""
         ...
 
 

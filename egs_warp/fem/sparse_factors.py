@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import scipy.linalg as dense
 import scipy.sparse as sparse
 import warp as wp
 
 from egs_warp.fem.front_layout import Layout, indices_of
+from egs_warp.fem.kept import Kept
 from egs_warp.fem.supernodes import Supernodes, first_of_alike
 from egs_warp.kernels.fem import products as products_kernels
 from egs_warp.kernels.fem import supernodal as kernels
-from egs_warp.launching import beside, launch_again
+from egs_warp.launching import beside, launch_again, zeros
 from egs_warp.precision import real
 
 _SINGULAR = 1e-14
 """Of the largest diagonal entry: pivots that are as small have no reciprocal worth the name."""
-_FIRST_PART = 0.42
-"""Of the columns of a symmetric product."""
 
 
 class SparseFactors:
@@ -32,7 +34,7 @@ class SparseFactors:
         """``upper_pattern``: upper triangle with the diagonal, entries in the order of ``update``."""
         self._device = wp.get_device("cpu")
         # Two threads at once cannot load them.
-        for kernel in (kernels.solve_kernel, products_kernels.product_kernel):
+        for kernel in (kernels.solve_kernel, products_kernels.form_kernel):
             kernel.module.load(self._device, block_dim=1)
         upper = sparse.csc_matrix(
             (np.arange(1.0, upper_pattern.nnz + 1.0), upper_pattern.indices, upper_pattern.indptr), upper_pattern.shape
@@ -40,8 +42,10 @@ class SparseFactors:
         full = (upper + sparse.triu(upper, 1).T).tocsc()
         full.sort_indices()
         self._full_from_upper = full.data.astype(np.int64) - 1
-        self._full_values, self._full_array = _shared_zeros(full.nnz)
-        self._full = [indices_of(full.indptr), indices_of(full.indices), indices_of(first_of_alike(full))]
+        self._full = products_kernels.Rows()
+        self._full_values, self._full.values = _shared_zeros(full.nnz)
+        self._full.offsets, self._full.indices = indices_of(full.indptr), indices_of(full.indices)
+        self._full.heads = indices_of(first_of_alike(full))
         self._diagonal = upper.indptr[1:] - 1
         self._unknowns = len(upper.indptr) - 1
         blocks = Supernodes.of(upper)
@@ -57,6 +61,9 @@ class SparseFactors:
         self._negative = np.zeros(1, np.int32)
         self._negative_array = wp.array(self._negative, dtype=int, device="cpu", copy=False)
         self._room = _shared_zeros(0)[1]
+        self._nothing = _keeping(None)
+        self._kept: tuple[Kept | None, Any] = None, self._nothing
+        self._moves: _Moves | None = None
         self._ready = False
         self._added: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         """U, S^-1 U and the inverse of the capacitance matrix."""
@@ -115,91 +122,131 @@ class SparseFactors:
         """See ``Factors``."""
         return self._ready
 
-    def solve(self, right: np.ndarray) -> np.ndarray:
+    def solve(self, right: np.ndarray, kept: Kept | None = None) -> np.ndarray:
         """See ``Factors``."""
-        plain = self._plain(right)
         if self._added is None:
-            return plain
+            return self._plain(right, kept)
+        plain = self._plain(right)
         across, through, small = self._added
-        return plain - through @ (small @ (across.T @ plain))
+        plain -= through @ (small @ (across.T @ plain))
+        return plain if kept is None else kept.corrected(right, plain)
 
-    def quadratic(self, entries: np.ndarray, moves: np.ndarray) -> np.ndarray:
-        """See ``Factors``."""
+    def strain_ahead(
+        self,
+        entries: np.ndarray,
+        slope: np.ndarray,
+        weights: np.ndarray,
+        vectors: np.ndarray,
+        *,
+        near: float,
+        far: float,
+        away: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See ``Factors``: panel after panel, half of them in a second thread."""
+        assert self._ready and self._added is None, "update() comes first"
+        count = vectors.shape[1]
+        panels = -(-count // kernels.PANEL)
+        if self._moves is None or len(self._moves.pairs) != panels * (panels + 1) // 2:
+            self._moves = _Moves(panels, self._unknowns)
+        room, vectors = self._moves, np.asarray(vectors, dtype=np.float64)
+        weights = np.ascontiguousarray(weights, dtype=np.float64)
         self._full_values[:] = entries[self._full_from_upper]
-        moves = np.ascontiguousarray(moves)
-        products, count = np.empty_like(moves), moves.shape[1]
-        strips = -(-count // products_kernels.STRIP)
-        inputs = [self._unknowns, *self._full, self._full_array, moves.ctypes.data, count, products.ctypes.data]
+        room.away[:], room.slope[:] = away, slope
+        given = [weights.ctypes.data, near, far, room.away_array, room.slope_array, self._full]
+        inputs = [*self._solving, *self._place_of(vectors), *given, self._room_for(panels)]
+        both = [room.moves, room.products]
 
-        def part(first: int, last: int) -> np.ndarray:
-            """The columns of some strips, from their own rows on: the rest is their mirror image."""
+        def part(first: int, last: int) -> None:
             launch_again(
-                products_kernels.product_kernel, last - first, inputs=[first, *inputs], outputs=[], device=self._device
+                kernels.moves_kernel,
+                last - first,
+                inputs=[first, *inputs],
+                outputs=[*both, room.along_array],
+                device=self._device,
             )
-            begin, end = first * products_kernels.STRIP, min(last * products_kernels.STRIP, count)
-            return moves[:, begin:].T @ products[:, begin:end]
 
-        # The first has more rows: less than half of them are as much work.
-        half = max(1, int(_FIRST_PART * strips))
-        first, second = beside(lambda: part(0, half), lambda: part(half, strips)) if strips > 1 else (part(0, 1), None)
-        if second is None:
-            return first
-        inside = first.shape[1]
-        return np.block([[first[:inside], first[inside:].T], [first[inside:], second]])
+        in_halves(part, panels)
 
-    def ahead(self, weights: np.ndarray, vectors: np.ndarray, near: float, far: float) -> np.ndarray:
-        """See ``Factors``."""
-        assert self._added is None, "of a matrix alone"
-        return self._plain(vectors, np.ascontiguousarray(weights, dtype=np.float64), near, far)
+        def multiply(first: int, last: int) -> None:
+            launch_again(
+                products_kernels.form_kernel,
+                last - first,
+                inputs=[first, room.pairs, *both],
+                outputs=[room.form_array],
+                device=self._device,
+            )
 
-    def take(self, values: np.ndarray) -> np.ndarray:
-        """See ``Factors``."""
-        return values
+        in_halves(multiply, len(room.pairs))
+        return room.form[:count, :count].copy(), room.along.ravel()[:count].copy()
 
-    def give(self, values: np.ndarray) -> np.ndarray:
-        """See ``Factors``."""
-        return values
-
-    def _plain(
-        self, right: np.ndarray, weights: np.ndarray | None = None, near: float = 0.0, far: float = 1.0
-    ) -> np.ndarray:
+    def _plain(self, right: np.ndarray, kept: Kept | None = None) -> np.ndarray:
         assert self._ready, "update() comes first"
         right = np.asarray(right, dtype=np.float64)
-        count = 1 if right.ndim == 1 else right.shape[1]
         solution = np.empty(right.shape)
-        strides = [stride // 8 for stride in right.strides]
-        panels = -(-count // kernels.PANEL)
-        if self._room.size < panels * (self._unknowns + 4) * kernels.PANEL:
-            self._room = _shared_zeros(panels * (self._unknowns + 4) * kernels.PANEL)[1]
-        inputs = [
-            self._layout.fronts,
-            len(self._layout.fronts.first),
-            self._unknowns,
-            self._factor,
-            self._inverses,
-            self._reciprocals,
-            right.ctypes.data,
-            strides[0],
-            strides[1] if right.ndim > 1 else 0,
-            count,
-            0 if weights is None else weights.ctypes.data,
-            near,
-            far,
-            self._room,
-            solution.ctypes.data,
-        ]
+        panels = -(-(1 if right.ndim == 1 else right.shape[1]) // kernels.PANEL)
+        inputs = [*self._solving, *self._place_of(right), self._keeping(kept), self._room_for(panels), solution.ctypes.data]
 
         def solve(first: int, last: int) -> None:
             launch_again(kernels.solve_kernel, last - first, inputs=[first, *inputs], outputs=[], device=self._device)
 
-        if panels < 2:
-            solve(0, panels)
-        else:
-            beside(lambda: solve(0, (panels + 1) // 2), lambda: solve((panels + 1) // 2, panels))
+        in_halves(solve, panels)
         return solution
 
+    def _keeping(self, kept: Kept | None) -> Any:
+        if kept is None:
+            return self._nothing
+        if self._kept[0] is not kept:
+            self._kept = kept, _keeping(kept)
+        return self._kept[1]
 
-def _shared_zeros(size: int) -> tuple[np.ndarray, wp.array]:
+    @property
+    def _solving(self) -> list[Any]:
+        fronts = self._layout.fronts
+        return [fronts, len(fronts.first), self._unknowns, self._factor, self._inverses, self._reciprocals]
+
+    @staticmethod
+    def _place_of(right: np.ndarray) -> list[int]:
+        """Address, strides by rows and columns, and how many columns there are."""
+        strides = [stride // 8 for stride in right.strides]
+        return [right.ctypes.data, *(strides if right.ndim > 1 else [*strides, 0]), right[0].size]
+
+    def _room_for(self, panels: int) -> wp.array:
+        size = panels * (self._unknowns + 4) * kernels.PANEL
+        if self._room.size < size:
+            self._room = _shared_zeros(size)[1]
+        return self._room
+
+
+def _keeping(kept: Kept | None) -> Any:
+    keeping = kernels.Kept()
+    keeping.there, keeping.ratio = int(kept is not None), kept.ratio if kept else 0.0
+    for name in ("turns", "momenta", "turned", "inverse"):
+        values = np.ascontiguousarray(getattr(kept, name)).ravel() if kept else np.zeros(0)
+        setattr(keeping, name, wp.array(values, dtype=real, device="cpu", copy=False))
+    return keeping
+
+
+class _Moves:
+    """Memory for so many panels of moves."""
+
+    def __init__(self, panels: int, unknowns: int) -> None:
+        self.moves, self.products = (zeros((panels, unknowns, kernels.PANEL), real, "cpu") for _ in range(2))
+        self.away, self.away_array = _shared_zeros(unknowns)
+        self.slope, self.slope_array = _shared_zeros(unknowns)
+        self.along, self.along_array = _shared_zeros((panels, kernels.PANEL))
+        self.form, self.form_array = _shared_zeros((panels * kernels.PANEL, panels * kernels.PANEL))
+        self.pairs = wp.array(np.transpose(np.triu_indices(panels)).astype(np.int32), dtype=wp.vec2i, device="cpu")
+
+
+def in_halves(part: Callable[[int, int], None], count: int) -> None:
+    """``part`` of 0 to ``count``, half of it in a second thread."""
+    if count < 2:
+        part(0, count)
+    else:
+        beside(lambda: part(0, (count + 1) // 2), lambda: part((count + 1) // 2, count))
+
+
+def _shared_zeros(size: int | tuple[int, ...]) -> tuple[np.ndarray, wp.array]:
     values = np.zeros(size)
     return values, wp.array(values, dtype=real, device="cpu", copy=False)
 

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.elastic_maps import Damping
 from egs_warp.fem.factors import Factors
+from egs_warp.fem.kept import Kept
 from egs_warp.geometry.frames import turning
 from egs_warp.muscles.tension import MuscleTension
 
@@ -147,14 +148,12 @@ class Tangent:
     factors: Factors
 
     @cached_property
-    def _turning(self) -> tuple[np.ndarray, np.ndarray]:
-        turned = self.factors.solve(self.problem.momenta.T)
-        return turned, np.linalg.inv((1.0 + self.problem.dt * self.problem.drag) * self.problem.momenta @ turned)
+    def _kept(self) -> Kept:
+        problem = self.problem
+        ratio, momenta = 1.0 + problem.dt * problem.drag, np.ascontiguousarray(problem.momenta.T)
+        turned = self.factors.solve(momenta)
+        return Kept(problem.turns, momenta, ratio, turned, np.linalg.inv(ratio * momenta.T @ turned))
 
     def solve(self, impulses: np.ndarray) -> np.ndarray:
         """(3N,) or (3N, m) m/s that ``impulses`` of that shape, N s, bring about."""
-        problem, plain = self.problem, self.factors.solve(impulses)
-        turned, inverse = self._turning
-        mass_ratio = 1.0 + problem.dt * problem.drag
-        missing = problem.turns.T @ impulses - mass_ratio * (problem.momenta @ plain)
-        return plain + turned @ (inverse @ missing)
+        return self.factors.solve(impulses, self._kept)

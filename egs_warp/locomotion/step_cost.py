@@ -133,12 +133,15 @@ def effort_cost(
     one implicit step over the horizon: carried on at its speed, what lets go would seem to be strained the other way.
     """
     body, assembly, factors = problem.body, problem.body.assembly, horizon.factors
-    masses, velocities = np.repeat(body.node_mass, 3), factors.take(linear.velocities)
-    moves = factors.ahead(masses, velocities, problem.dt, horizon.time - problem.dt)
-    moves[:, -1] -= problem.dt * factors.take(foreseen)
-    quadratic = factors.give(factors.quadratic(horizon.entries, moves))
-    gradient = assembly.gradient(horizon.end, horizon.damping)
-    force = factors.give(factors.take(gradient.ravel()) @ moves)
+    quadratic, force = factors.strain_ahead(
+        horizon.entries,
+        assembly.gradient(horizon.end, horizon.damping).ravel(),
+        np.repeat(body.node_mass, 3),
+        linear.velocities,
+        near=problem.dt,
+        far=horizon.time - problem.dt,
+        away=problem.dt * foreseen,
+    )
     unit = weight / (body.weight * body.height)
     return QuadraticCost(
         unit * quadratic[:-1, :-1],

@@ -35,7 +35,7 @@ def pattern(count: int) -> sparse.csc_matrix:
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("diagonal", [30.0, 1.0])
 def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
-    """Solutions and quadratic forms to rounding, with a sum and without; an indefinite matrix has no dense factors, but
+    """Solutions and strains of moves to rounding, with a sum and without; an indefinite matrix has no dense factors, but
     a sum with it may have.
     """
     upper = pattern(60)
@@ -47,12 +47,18 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
         entries = entries_of(upper, seed, diagonal)
         definite = thin.update(entries)
         assert dense.update(entries) == dense.ready == definite == (diagonal == 30.0)
-        matrix = thin.quadratic(entries, np.eye(60))
-        assert np.array_equal(matrix, matrix.T) and np.array_equal(
-            sparse.csc_matrix((entries, upper.indices, upper.indptr), upper.shape).toarray(), np.triu(matrix)
-        )
-        got = dense.give(dense.quadratic(entries, dense.take(right)))
-        assert np.abs(got - right.T @ matrix @ right).max() < 1e-10
+        half = sparse.csc_matrix((entries, upper.indices, upper.indptr), upper.shape).toarray()
+        matrix = half + np.triu(half, 1).T
+        if definite:
+            slope, weights, away = random.normal(size=(3, 60))
+            for found, expected in zip(
+                *(
+                    one.strain_ahead(entries, slope, weights, right, near=0.2, far=0.5, away=away)
+                    for one in (dense, thin)
+                ),
+                strict=True,
+            ):
+                assert np.abs(found - expected).max() < 1e-11 * np.abs(expected).max()
         if definite:
             assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-12
             assert np.abs(dense.solve(right[:, 0]) - thin.solve(right[:, 0])).max() < 1e-12

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import scipy.sparse as sparse
 
+from egs_warp.fem.factors import Factors
+from egs_warp.fem.kept import Kept
 from egs_warp.fem.sparse_factors import SparseFactors, inverse_and_positives
 from egs_warp.launching import THREADS
 from tests.support.sparse_patterns import PATTERNS, upper_of
@@ -66,17 +68,61 @@ def test_every_pattern_and_number_of_right_sides(name: str) -> None:
     np.testing.assert_array_equal(factors.solve(right[:, [3]])[:, 0], factors.solve(right[:, 3].copy()))
 
 
+def strained(factors: Factors, upper: sparse.csc_matrix, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """By the matrix itself, numbers drawn."""
+    random = np.random.default_rng(6)
+    slope, weights, away = random.standard_normal((3, len(vectors)))
+    return factors.strain_ahead(upper.data, slope, weights, vectors, near=0.3, far=-0.7, away=away)
+
+
 @pytest.mark.parametrize("name", PATTERNS)
-def test_a_quadratic_form_of_many_moves(name: str) -> None:
-    """X^T H X of a matrix of the same pattern, which none is factored for."""
+def test_the_strain_of_many_moves(name: str) -> None:
+    """X^T H X and X^T g of X = 0.3 V - 0.7 S^-1 diag(w) V less what is taken away from its last column, H another
+    matrix of the same pattern."""
     matrix = PATTERNS[name]
-    factors, random = SparseFactors(upper_of(matrix)), np.random.default_rng(6)
+    factors = SparseFactors(upper_of(matrix))
+    factors.update(upper_of(matrix).data)
+    other = sparse.csc_matrix(matrix - 0.3 * sparse.diags(matrix.diagonal()))
     for width in (1, 4, 8, 13, 16, 41):
-        moves = random.standard_normal((len(matrix.indptr) - 1, width))
-        expected = moves.T @ (matrix @ moves)
-        for given in (moves, np.asfortranarray(moves)):
-            found = factors.quadratic(upper_of(matrix).data, given)
-            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
+        vectors = np.random.default_rng(5).standard_normal((len(matrix.indptr) - 1, width))
+        slope, weights, away = np.random.default_rng(6).standard_normal((3, len(vectors)))
+        moves = 0.3 * vectors - 0.7 * np.linalg.solve(matrix.toarray(), weights[:, None] * vectors)
+        moves[:, -1] -= away
+        expected = moves.T @ (other @ moves), moves.T @ slope
+        for given in (vectors, np.asfortranarray(vectors), np.repeat(vectors, 2, axis=1)[:, ::2]):
+            found = strained(factors, upper_of(other), given)
+            for one, wanted in zip(found, expected, strict=True):
+                np.testing.assert_allclose(one, wanted, rtol=1e-11, atol=1e-12 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize("added", [False, True])
+def test_what_solutions_keep(added: bool) -> None:
+    """M T of a solution, by its ratio, is T of what is given: of many as of one, of a sum with muscles, too."""
+    matrix = PATTERNS["grid of nodes"]
+    count, random = len(matrix.indptr) - 1, np.random.default_rng(8)
+    factors = SparseFactors(upper_of(matrix))
+    factors.update(upper_of(matrix).data)
+    if added:
+        assert factors.add(random.standard_normal((count, 4)), np.ones(4))
+    turns, mass, ratio = random.standard_normal((count, 3)), random.uniform(1.0, 2.0, (count, 1)), 1.1
+    turned = factors.solve(mass * turns)
+    kept = Kept(turns, mass * turns, ratio, turned, np.linalg.inv(ratio * (mass * turns).T @ turned))
+    right = random.standard_normal((count, 21))
+    for given in (right, right[:, 3], right[:, ::-2]):
+        found, plain = factors.solve(given, kept), factors.solve(given)
+        np.testing.assert_allclose(ratio * (mass * turns).T @ found, turns.T @ given, atol=1e-12 * count)
+        np.testing.assert_allclose(found, kept.corrected(given, plain), atol=1e-13 * np.abs(plain).max())
+        assert np.abs(found - plain).max() > 1e-6
+
+
+def test_where_nothing_is_given_nothing_comes_of_it() -> None:
+    """Columns with a few numbers each, by which some blocks are passed over."""
+    matrix = PATTERNS["grid of nodes"]
+    count = len(matrix.indptr) - 1
+    factors = SparseFactors(upper_of(matrix))
+    factors.update(upper_of(matrix).data)
+    right = np.eye(count)[:, [0, 1, 7, count // 2, count - 1]]
+    np.testing.assert_allclose(factors.solve(right), np.linalg.solve(matrix.toarray(), right), atol=1e-13)
 
 
 def test_the_same_bits_on_any_number_of_cores(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,7 +132,7 @@ def test_the_same_bits_on_any_number_of_cores(monkeypatch: pytest.MonkeyPatch) -
         monkeypatch.setenv(THREADS, threads)
         factors = SparseFactors(upper_of(matrix))
         factors.update(upper_of(matrix).data)
-        found.append((factors.solve(right), factors.quadratic(upper_of(matrix).data, right)))
+        found.append((factors.solve(right), *strained(factors, upper_of(matrix), right)))
     for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one, other)
 

@@ -1,4 +1,4 @@
-"""Products of a sparse symmetric matrix with many vectors, on a CPU."""
+"""Products of a sparse symmetric matrix with panels of vectors, and of panels with each other, on a CPU."""
 
 import warp as wp
 
@@ -7,15 +7,32 @@ from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
 
-STRIP = 8
-"""Columns at a time."""
+PANEL, STRIP = 16, 8
+"""Vectors that lie together, in a row of memory for each unknown, and of them those that are taken at a time."""
+
+
+@wp.struct
+class Rows:
+    """A matrix row by row."""
+
+    offsets: wp.array[wp.int32]
+    indices: wp.array[wp.int32]
+    heads: wp.array[wp.int32]
+    """Zero for rows with the same columns as the row before."""
+    values: wp.array[real]
+
+
+@wp.func_native("return (wp::uint64)values.data;")
+def address_of(values: wp.array2d[real]) -> wp.uint64:
+    """Of its first number."""
+    ...
 
 
 @wp.func_native(
     on_cpu("""
     const double* const x = (const double*)vectors;
     double* const y = (double*)products;
-    const int from = strip * 8, width = columns - from < 8 ? columns - from : 8;
+    const int from = strip * 8;
     for (int i = 0; i < rows; ) {
         const int begin = offsets.data[i], count = offsets.data[i + 1] - begin;
         // The rows of a node have the same columns.
@@ -25,7 +42,7 @@ STRIP = 8
         const double* const l0 = values.data + begin;
         const double *const l1 = alike > 1 ? l0 + count : l0, *const l2 = alike > 2 ? l1 + count : l0;
         double sums[24];
-        if (width == 8) {
+        {
             v4 a0 = 0.0, a1 = 0.0, b0 = 0.0, b1 = 0.0, c0 = 0.0, c1 = 0.0;
             for (int j = 0; j < count; ++j) {
                 const double* const z = x + (long long)to[j] * columns + from;
@@ -35,17 +52,9 @@ STRIP = 8
             }
             *(v4*)sums = a0; *(v4*)(sums + 4) = a1; *(v4*)(sums + 8) = b0; *(v4*)(sums + 12) = b1;
             *(v4*)(sums + 16) = c0; *(v4*)(sums + 20) = c1;
-        } else {
-            for (int q = 0; q < 24; ++q) sums[q] = 0.0;
-            for (int j = 0; j < count; ++j) {
-                const double* const z = x + (long long)to[j] * columns + from;
-                for (int q = 0; q < width; ++q) {
-                    sums[q] += l0[j] * z[q]; sums[8 + q] += l1[j] * z[q]; sums[16 + q] += l2[j] * z[q];
-                }
-            }
         }
         for (int t = 0; t < alike; ++t)
-            for (int q = 0; q < width; ++q) y[(long long)(i + t) * columns + from + q] = sums[8 * t + q];
+            for (int q = 0; q < 8; ++q) y[(long long)(i + t) * columns + from + q] = sums[8 * t + q];
         i += alike;
     }
 """)
@@ -61,23 +70,83 @@ def strip_of_products(
     strip: wp.int32,
     products: wp.uint64,
 ) -> None:
-    """Eight columns of a product; see ``product_kernel``."""
+    """``STRIP`` of the ``columns`` of a product, row by row at addresses as the vectors are."""
+    ...
+
+
+@wp.func_native(
+    on_cpu("""
+    const int n = moves.shape[0], width = moves.shape[1];
+    double* const X = (double*)moves.data;
+    for (int q = 0; q < width; ++q) along.data[q] = 0.0;
+    for (int i = 0; i < n; ++i) {
+        double* const row = X + i * width;
+        if (columns <= width) row[columns - 1] -= away.data[i];
+        for (int q = columns; q < width; ++q) row[q] = 0.0;
+        for (int q = 0; q < width; ++q) along.data[q] += slope.data[i] * row[q];
+    }
+""")
+)
+def finish_moves(
+    columns: wp.int32,
+    away: wp.array[real],
+    slope: wp.array[real],
+    moves: wp.array2d[real],
+    along: wp.array[real],
+) -> None:
+    """Of a panel of ``moves`` from which on there are so many ``columns``: see ``moves_kernel``."""
+    ...
+
+
+@wp.func_native(
+    on_cpu("""
+    constexpr int PANEL = 16, CHUNK = 128;
+    const int n = moves.shape[0], stride = form.strides[0] / 8;
+    double sums[PANEL][PANEL] = {{0.0}};
+    for (int begin = 0; begin < n; begin += CHUNK) {
+        const int rows = n - begin < CHUNK ? n - begin : CHUNK;
+        for (int i = 0; i < PANEL; i += 4)
+            for (int c = 0; c < PANEL; c += 8) {
+                const double* x = (const double*)moves.data + begin * PANEL + i;
+                const double* y = (const double*)products.data + begin * PANEL + c;
+                v4 a0 = 0.0, a1 = 0.0, b0 = 0.0, b1 = 0.0, c0 = 0.0, c1 = 0.0, d0 = 0.0, d1 = 0.0;
+                for (int k = 0; k < rows; ++k, x += PANEL, y += PANEL) {
+                    const v4 y0 = *(const v4*)y, y1 = *(const v4*)(y + 4);
+                    a0 += x[0] * y0; a1 += x[0] * y1; b0 += x[1] * y0; b1 += x[1] * y1;
+                    c0 += x[2] * y0; c1 += x[2] * y1; d0 += x[3] * y0; d1 += x[3] * y1;
+                }
+                const v4 found[8] = {a0, a1, b0, b1, c0, c1, d0, d1};
+                for (int q = 0; q < 8; ++q) *(v4*)(sums[i + q / 2] + c + 4 * (q % 2)) += found[q];
+            }
+    }
+    double* const to = (double*)form.data;
+    for (int i = 0; i < PANEL; ++i)
+        for (int c = 0; c < PANEL; ++c) {
+            to[(first * PANEL + i) * stride + second * PANEL + c] = sums[i][c];
+            if (first != second) to[(second * PANEL + c) * stride + first * PANEL + i] = sums[i][c];
+        }
+""")
+)
+def write_form(
+    first: wp.int32,
+    second: wp.int32,
+    moves: wp.array2d[real],
+    products: wp.array2d[real],
+    form: wp.array2d[real],
+) -> None:
+    """Two blocks of ``form_kernel``."""
     ...
 
 
 @wp.kernel
-def product_kernel(
-    first_strip: wp.int32,
-    rows: wp.int32,
-    offsets: wp.array[wp.int32],
-    indices: wp.array[wp.int32],
-    heads: wp.array[wp.int32],
-    values: wp.array[real],
-    vectors: wp.uint64,
-    columns: wp.int32,
-    products: wp.uint64,
+def form_kernel(
+    first_pair: wp.int32,
+    pairs: wp.array[wp.vec2i],
+    moves: wp.array3d[real],
+    products: wp.array3d[real],
+    # Out:
+    form: wp.array2d[real],
 ) -> None:
-    """Of a matrix by rows (``offsets``, ``indices``, ``values``) with ``vectors`` (rows, columns), an address, row by
-    row, as ``products`` are; ``heads`` are zero for rows with the same columns as the row before. One thread for each
-    ``STRIP`` columns."""
-    strip_of_products(rows, offsets, indices, heads, values, vectors, columns, first_strip + wp.tid(), products)
+    """X^T Y of ``moves`` X and ``products`` Y (panels, n, ``PANEL``), which is symmetric: a thread for two panels."""
+    pair = pairs[first_pair + wp.tid()]
+    write_form(pair[0], pair[1], moves[pair[0]], products[pair[1]], form)

@@ -5,13 +5,12 @@ See ``egs_warp/fem/sparse_factors.py``.
 
 import warp as wp
 
+from egs_warp.kernels.fem.products import PANEL, STRIP, Rows, address_of, finish_moves, strip_of_products
 from egs_warp.kernels.vectors import FRONT_ELIMINATION, on_cpu
 from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
 
-PANEL = 16
-"""Right-hand sides of a panel, in a row of memory for each unknown."""
 PADDING = 16
 """Numbers behind an array that may be read, not used."""
 
@@ -43,6 +42,20 @@ class Fronts:
     """On the stack of what is still to be added to a parent."""
     place: wp.array[wp.int32]
     """The permuted place of each row."""
+
+
+@wp.struct
+class Kept:
+    """Angular momentum that a solution keeps, see ``fem.factors.Kept``; nothing where it is not ``there``."""
+
+    there: wp.int32
+    ratio: real
+    turns: wp.array[real]
+    momenta: wp.array[real]
+    turned: wp.array[real]
+    """(3n,), three numbers for each unknown."""
+    inverse: wp.array[real]
+    """(9,)."""
 
 
 @wp.func_native(
@@ -126,6 +139,11 @@ def factored(
             const int nb = w - b < BLOCK ? w - b : BLOCK;
             for (int h = 0; h < width; h += 8) {
                 double* const own = x + (column + b) * PANEL + h;
+                bool any = false;
+                for (int q = 0; q < nb && !any; ++q)
+                    for (int c = 0; c < 8; ++c) any |= own[q * PANEL + c] != 0.0;
+                // Where nothing is given, nothing comes of it.
+                if (!any) continue;
                 for (int g = (nb - 1) & ~3; g >= 0; g -= 4) {
                     double sums[32] = {0.0};
                     const double* l = inverse + g * BLOCK;
@@ -191,14 +209,32 @@ def factored(
             }
         }
     }
+    double missing[3][PANEL] = {{0.0}}, by[3][PANEL] = {{0.0}};
+    if (kept.there) {
+        for (int i = 0; i < unknowns; ++i) {
+            const double *const row = x + fronts.place.data[i] * PANEL, *const g = given + i * row_stride + from * column_stride;
+            for (int t = 0; t < 3; ++t) {
+                const double turn = kept.turns.data[3 * i + t], momentum = kept.ratio * kept.momenta.data[3 * i + t];
+                for (int q = 0; q < columns; ++q) missing[t][q] += turn * g[q * column_stride] - momentum * row[q];
+            }
+        }
+        for (int t = 0; t < 3; ++t)
+            for (int s = 0; s < 3; ++s)
+                for (int q = 0; q < columns; ++q) by[t][q] += kept.inverse.data[3 * t + s] * missing[s][q];
+    }
     for (int i = 0; i < unknowns; ++i) {
         const double* row = x + fronts.place.data[i] * PANEL;
-        double* const to = found + (long long)i * count + from;
+        double* const to = found + (long long)i * solution_stride;
         const double* g = given + i * row_stride + from * column_stride;
-        if (weights)
+        if (weights) {
             for (int q = 0; q < columns; ++q) to[q] = near_share * g[q * column_stride] + far_share * row[q];
-        else
+        } else if (kept.there) {
+            const double* const turned = kept.turned.data + 3 * i;
+            for (int q = 0; q < columns; ++q)
+                to[q] = row[q] + (turned[0] * by[0][q] + turned[1] * by[1][q] + turned[2] * by[2][q]);
+        } else {
             for (int q = 0; q < columns; ++q) to[q] = row[q];
+        }
     }
 """
     )
@@ -217,13 +253,16 @@ def solved_panel(
     weights: wp.uint64,
     near_share: real,
     far_share: real,
+    kept: Kept,
     panel: wp.int32,
     room: wp.array[real],
     solution: wp.uint64,
+    solution_stride: wp.int32,
 ) -> None:
-    """A panel of ``count`` right-hand sides; ``right`` and ``solution`` are addresses of numbers, the first with its
-    strides in them, the second row by row. With ``weights`` of rows, another address or 0, ``near_share`` of what is
-    given and ``far_share`` of the solution with what is given by weight."""
+    """A panel of ``count`` right-hand sides; ``right`` and ``solution``, which is the panel's own, are addresses of
+    numbers, the first with its strides in them, the second row by row. With ``weights`` of rows, another address or 0, ``near_share`` of what is
+    given and ``far_share`` of the solution with what is given by weight; else
+    what is ``kept``."""
     ...
 
 
@@ -285,7 +324,16 @@ def solved_panel(
             for (int i = 0; i < nb; ++i) own[i] = c[i >> 2][i & 3];
         }
     }
-    for (int i = 0; i < unknowns; ++i) found[i] = x[fronts.place.data[i]];
+    double missing[3] = {0.0, 0.0, 0.0}, by[3] = {0.0, 0.0, 0.0};
+    for (int i = 0; i < unknowns; ++i) {
+        found[i] = x[fronts.place.data[i]];
+        for (int t = 0; t < 3 && kept.there; ++t)
+            missing[t] += kept.turns.data[3 * i + t] * given[i * row_stride]
+                - kept.ratio * kept.momenta.data[3 * i + t] * found[i];
+    }
+    for (int t = 0; t < 9 && kept.there; ++t) by[t / 3] += kept.inverse.data[t] * missing[t % 3];
+    for (int i = 0; i < unknowns && kept.there; ++i)
+        for (int t = 0; t < 3; ++t) found[i] += kept.turned.data[3 * i + t] * by[t];
 """
     )
 )
@@ -298,6 +346,7 @@ def solved_one(
     reciprocals: wp.array[real],
     right: wp.uint64,
     row_stride: wp.int32,
+    kept: Kept,
     room: wp.array[real],
     solution: wp.uint64,
 ) -> None:
@@ -336,17 +385,57 @@ def solve_kernel(
     row_stride: wp.int32,
     column_stride: wp.int32,
     count: wp.int32,
-    weights: wp.uint64,
-    near_share: real,
-    far_share: real,
+    kept: Kept,
     room: wp.array[real],
     solution: wp.uint64,
 ) -> None:
     """One thread a panel, see ``solved_panel``."""
-    if count == 1 and weights == wp.uint64(0):
-        solved_one(fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, room, solution)
+    if count == 1:
+        solved_one(fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, kept, room, solution)
         return
+    panel = first_panel + wp.tid()
     solved_panel(
-        fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, column_stride, count,
-        weights, near_share, far_share, first_panel + wp.tid(), room, solution,
+        fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, column_stride, count, wp.uint64(0),
+        real(0.0), real(1.0), kept, panel, room, solution + wp.uint64(8 * PANEL * panel), count,
     )  # fmt: skip
+
+
+@wp.kernel
+def moves_kernel(
+    first_panel: wp.int32,
+    fronts: Fronts,
+    blocks: wp.int32,
+    unknowns: wp.int32,
+    factor: wp.array[real],
+    inverses: wp.array[real],
+    reciprocals: wp.array[real],
+    right: wp.uint64,
+    row_stride: wp.int32,
+    column_stride: wp.int32,
+    count: wp.int32,
+    weights: wp.uint64,
+    near_share: real,
+    far_share: real,
+    away: wp.array[real],
+    slope: wp.array[real],
+    matrix: Rows,
+    room: wp.array[real],
+    # Out:
+    moves: wp.array3d[real],
+    products: wp.array3d[real],
+    along: wp.array2d[real],
+) -> None:
+    """One thread a panel: its ``moves`` (panels, n, ``PANEL``), see ``solved_panel``, from the last of which ``away``
+    is taken; their ``products`` with a ``matrix``, and what they are ``along`` the ``slope`` (panels, ``PANEL``)."""
+    panel = first_panel + wp.tid()
+    mine = address_of(moves[panel])
+    solved_panel(
+        fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, column_stride, count, weights,
+        near_share, far_share, Kept(), panel, room, mine, PANEL,
+    )  # fmt: skip
+    finish_moves(count - PANEL * panel, away, slope, moves[panel], along[panel])
+    for strip in range(PANEL // STRIP):
+        strip_of_products(
+            unknowns, matrix.offsets, matrix.indices, matrix.heads, matrix.values, mine, PANEL, strip,
+            address_of(products[panel]),
+        )  # fmt: skip
