@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,8 +12,8 @@ import warp as wp
 from egs_warp.fem.front_layout import Layout, indices_of
 from egs_warp.fem.kept import Kept
 from egs_warp.fem.supernodes import Supernodes, first_of_alike
-from egs_warp.kernels.fem import products as products_kernels
 from egs_warp.kernels.fem import supernodal as kernels
+from egs_warp.kernels.fem.products import Rows
 from egs_warp.launching import beside, launch_again, zeros
 from egs_warp.precision import real
 
@@ -34,15 +33,14 @@ class SparseFactors:
         """``upper_pattern``: upper triangle with the diagonal, entries in the order of ``update``."""
         self._device = wp.get_device("cpu")
         # Two threads at once cannot load them.
-        for kernel in (kernels.solve_kernel, products_kernels.form_kernel):
-            kernel.module.load(self._device, block_dim=1)
+        kernels.solve_kernel.module.load(self._device, block_dim=1)
         upper = sparse.csc_matrix(
             (np.arange(1.0, upper_pattern.nnz + 1.0), upper_pattern.indices, upper_pattern.indptr), upper_pattern.shape
         )
         full = (upper + sparse.triu(upper, 1).T).tocsc()
         full.sort_indices()
         self._full_from_upper = full.data.astype(np.int64) - 1
-        self._full = products_kernels.Rows()
+        self._full = Rows()
         self._full_values, self._full.values = _shared_zeros(full.nnz)
         self._full.offsets, self._full.indices = indices_of(full.indptr), indices_of(full.indices)
         self._full.heads = indices_of(first_of_alike(full))
@@ -61,8 +59,10 @@ class SparseFactors:
         self._negative = np.zeros(1, np.int32)
         self._negative_array = wp.array(self._negative, dtype=int, device="cpu", copy=False)
         self._room = _shared_zeros(0)[1]
-        self._nothing = _keeping(None)
-        self._kept: tuple[Kept | None, Any] = None, self._nothing
+        self._counters = np.zeros(3, np.int32)
+        self._counters_array = wp.array(self._counters, dtype=int, device="cpu", copy=False)
+        self._nothing, self._keeping = _Keeping(0).struct, _Keeping(self._unknowns)
+        self._keeping.struct.there = 1
         self._moves: _Moves | None = None
         self._ready = False
         self._added: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
@@ -146,37 +146,19 @@ class SparseFactors:
         assert self._ready and self._added is None, "update() comes first"
         count = vectors.shape[1]
         panels = -(-count // kernels.PANEL)
-        if self._moves is None or len(self._moves.pairs) != panels * (panels + 1) // 2:
+        if self._moves is None or len(self._moves.along) != panels:
             self._moves = _Moves(panels, self._unknowns)
         room, vectors = self._moves, np.asarray(vectors, dtype=np.float64)
         weights = np.ascontiguousarray(weights, dtype=np.float64)
         self._full_values[:] = entries[self._full_from_upper]
         room.away[:], room.slope[:] = away, slope
-        given = [weights.ctypes.data, near, far, room.away_array, room.slope_array, self._full]
-        inputs = [*self._solving, *self._place_of(vectors), *given, self._room_for(panels)]
-        both = [room.moves, room.products]
-
-        def part(first: int, last: int) -> None:
-            launch_again(
-                kernels.moves_kernel,
-                last - first,
-                inputs=[first, *inputs],
-                outputs=[*both, room.along_array],
-                device=self._device,
-            )
-
-        in_halves(part, panels)
-
-        def multiply(first: int, last: int) -> None:
-            launch_again(
-                products_kernels.form_kernel,
-                last - first,
-                inputs=[first, room.pairs, *both],
-                outputs=[room.form_array],
-                device=self._device,
-            )
-
-        in_halves(multiply, len(room.pairs))
+        self._by_two(
+            kernels.strain_kernel,
+            panels,
+            [*self._solving, *self._place_of(vectors), weights.ctypes.data, near, far, room.away_array]
+            + [room.slope_array, self._full, self._room_for(panels)],
+            [room.moves, room.products, room.along_array, room.form_array],
+        )
         return room.form[:count, :count].copy(), room.along.ravel()[:count].copy()
 
     def _plain(self, right: np.ndarray, kept: Kept | None = None) -> np.ndarray:
@@ -184,20 +166,23 @@ class SparseFactors:
         right = np.asarray(right, dtype=np.float64)
         solution = np.empty(right.shape)
         panels = -(-(1 if right.ndim == 1 else right.shape[1]) // kernels.PANEL)
-        inputs = [*self._solving, *self._place_of(right), self._keeping(kept), self._room_for(panels), solution.ctypes.data]
+        keeping = self._nothing if kept is None else self._keeping.of(kept)
+        inputs = [*self._solving, *self._place_of(right), keeping, self._room_for(panels), solution.ctypes.data]
 
-        def solve(first: int, last: int) -> None:
-            launch_again(kernels.solve_kernel, last - first, inputs=[first, *inputs], outputs=[], device=self._device)
-
-        in_halves(solve, panels)
+        self._by_two(kernels.solve_kernel, panels, inputs, [])
         return solution
 
-    def _keeping(self, kept: Kept | None) -> Any:
-        if kept is None:
-            return self._nothing
-        if self._kept[0] is not kept:
-            self._kept = kept, _keeping(kept)
-        return self._kept[1]
+    def _by_two(self, kernel: Any, panels: int, inputs: list[Any], outputs: list[Any]) -> None:
+        """``kernel``, of which two threads share what there is to do if there are several ``panels``."""
+        self._counters[:] = 0
+
+        def launch() -> None:
+            launch_again(kernel, 1, inputs=[self._counters_array, *inputs], outputs=outputs, device=self._device)
+
+        if panels > 1:
+            beside(launch, launch)
+        else:
+            launch()
 
     @property
     def _solving(self) -> list[Any]:
@@ -217,13 +202,25 @@ class SparseFactors:
         return self._room
 
 
-def _keeping(kept: Kept | None) -> Any:
-    keeping = kernels.Kept()
-    keeping.there, keeping.ratio = int(kept is not None), kept.ratio if kept else 0.0
-    for name in ("turns", "momenta", "turned", "inverse"):
-        values = np.ascontiguousarray(getattr(kept, name)).ravel() if kept else np.zeros(0)
-        setattr(keeping, name, wp.array(values, dtype=real, device="cpu", copy=False))
-    return keeping
+class _Keeping:
+    """Memory for what is kept."""
+
+    def __init__(self, unknowns: int) -> None:
+        self.struct = kernels.Kept()
+        self._arrays: dict[str, np.ndarray] = {}
+        for name, size in (("turns", 3 * unknowns), ("momenta", 3 * unknowns), ("turned", 3 * unknowns), ("inverse", 9)):
+            self._arrays[name], array = _shared_zeros(size)
+            setattr(self.struct, name, array)
+        self._ratio, self.struct.ratio = _shared_zeros(1)
+        self._now: Kept | None = None
+
+    def of(self, kept: Kept) -> Any:
+        """As the kernels read it."""
+        if self._now is not kept:
+            self._now, self._ratio[0] = kept, kept.ratio
+            for name, array in self._arrays.items():
+                array[:] = getattr(kept, name).ravel()
+        return self.struct
 
 
 class _Moves:
@@ -235,15 +232,6 @@ class _Moves:
         self.slope, self.slope_array = _shared_zeros(unknowns)
         self.along, self.along_array = _shared_zeros((panels, kernels.PANEL))
         self.form, self.form_array = _shared_zeros((panels * kernels.PANEL, panels * kernels.PANEL))
-        self.pairs = wp.array(np.transpose(np.triu_indices(panels)).astype(np.int32), dtype=wp.vec2i, device="cpu")
-
-
-def in_halves(part: Callable[[int, int], None], count: int) -> None:
-    """``part`` of 0 to ``count``, half of it in a second thread."""
-    if count < 2:
-        part(0, count)
-    else:
-        beside(lambda: part(0, (count + 1) // 2), lambda: part((count + 1) // 2, count))
 
 
 def _shared_zeros(size: int | tuple[int, ...]) -> tuple[np.ndarray, wp.array]:

@@ -70,6 +70,10 @@ class StepProblem:
         """(3, 3) kg m^2 at the start of the step."""
         return self.momenta @ self.turns
 
+    @cached_property
+    def _inverse_inertia(self) -> np.ndarray:
+        return np.linalg.inv(self.inertia)
+
     @property
     def unit(self) -> float:
         """dt times the weight, N s: what residuals are told in."""
@@ -89,7 +93,7 @@ class StepProblem:
         what is stiff, whose speed at the start says nothing about the end, is at rest."""
         positions, mass = self.state.positions, self.body.node_mass
         centre = self.body.centre_of_mass(positions)
-        spin = np.linalg.solve(self.inertia, self.body.angular_momentum(positions, self.state.velocities))
+        spin = self._inverse_inertia @ self.body.angular_momentum(positions, self.state.velocities)
         turned = Rotation.from_rotvec(self.dt * spin).apply(positions - centre)
         return mass @ self.state.velocities / mass.sum() + (turned - (positions - centre)) / self.dt
 
@@ -100,7 +104,7 @@ class StepProblem:
 
     def spin(self, internal_gradient: np.ndarray) -> np.ndarray:
         """(3,) rad/s that the step gives back: the rigid turn whose momentum implicit Euler would have eaten."""
-        return self.dt * np.linalg.solve(self.inertia, self.turns.T @ internal_gradient.ravel())
+        return self.dt * (self._inverse_inertia @ (self.turns.T @ internal_gradient.ravel()))
 
     def residual(self, velocities: np.ndarray, tension: MuscleTension | None) -> np.ndarray:
         """(N, 3) N s, left side less right side of the equation without contact forces; not finite where an element is

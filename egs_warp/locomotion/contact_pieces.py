@@ -28,6 +28,8 @@ _GAIN = 5e-3
 """Share of the objective by which a further piece has to lower it."""
 _BROKEN = 0.02
 """By which a start may break a row that its piece does not quite hold."""
+_ROUNDING = 1e-6
+"""Of a start that is the only point of its piece, as where contacts repeat each other."""
 
 _NOTHING = 1e-9
 """Body weights: what rounding leaves of the force of a contact that is open."""
@@ -285,7 +287,7 @@ def solve_piece(
     if piece is None:
         return None
     b = piece.rows_offset[m:]
-    lower = np.minimum(-b, np.maximum(piece.rows[m:] @ start[:m], -b - _BROKEN))
+    lower = np.minimum(-b, np.maximum(piece.rows[m:] @ start[:m], -b - _BROKEN)) - _ROUNDING
     found = quadratic_program(piece.P, piece.q, piece.rows, solver=solver, device=device).solve(
         np.concatenate([program.lower, lower]),
         np.concatenate([program.upper, np.full(len(lower), np.inf)]),

@@ -1,4 +1,7 @@
-"""Products of a sparse symmetric matrix with panels of vectors, and of panels with each other, on a CPU."""
+"""Products of a sparse symmetric matrix with panels of vectors, and of panels with each other, on a CPU.
+
+Threads share panels as they come to them, so that one that is late or slow does less.
+"""
 
 import warp as wp
 
@@ -20,6 +23,18 @@ class Rows:
     heads: wp.array[wp.int32]
     """Zero for rows with the same columns as the row before."""
     values: wp.array[real]
+
+
+@wp.func_native("return __atomic_fetch_add(&counters.data[which], 1, __ATOMIC_ACQ_REL);")
+def claimed(counters: wp.array[wp.int32], which: wp.int32) -> wp.int32:
+    """The next number of a counter that threads share: each number goes to one of them."""
+    ...
+
+
+@wp.func_native("while (__atomic_load_n(&counters.data[which], __ATOMIC_ACQUIRE) < least) {}")
+def wait_for(counters: wp.array[wp.int32], which: wp.int32, least: wp.int32) -> None:
+    """Until a counter is as large: what was written before it was counted can be read."""
+    ...
 
 
 @wp.func_native("return (wp::uint64)values.data;")
@@ -134,19 +149,5 @@ def write_form(
     products: wp.array2d[real],
     form: wp.array2d[real],
 ) -> None:
-    """Two blocks of ``form_kernel``."""
+    """Of X^T Y of panels X of moves and Y of products, which is symmetric, the blocks of two."""
     ...
-
-
-@wp.kernel
-def form_kernel(
-    first_pair: wp.int32,
-    pairs: wp.array[wp.vec2i],
-    moves: wp.array3d[real],
-    products: wp.array3d[real],
-    # Out:
-    form: wp.array2d[real],
-) -> None:
-    """X^T Y of ``moves`` X and ``products`` Y (panels, n, ``PANEL``), which is symmetric: a thread for two panels."""
-    pair = pairs[first_pair + wp.tid()]
-    write_form(pair[0], pair[1], moves[pair[0]], products[pair[1]], form)

@@ -5,7 +5,17 @@ See ``egs_warp/fem/sparse_factors.py``.
 
 import warp as wp
 
-from egs_warp.kernels.fem.products import PANEL, STRIP, Rows, address_of, finish_moves, strip_of_products
+from egs_warp.kernels.fem.products import (
+    PANEL,
+    STRIP,
+    Rows,
+    address_of,
+    claimed,
+    finish_moves,
+    strip_of_products,
+    wait_for,
+    write_form,
+)
 from egs_warp.kernels.vectors import FRONT_ELIMINATION, on_cpu
 from egs_warp.precision import real
 
@@ -49,7 +59,8 @@ class Kept:
     """Angular momentum that a solution keeps, see ``fem.factors.Kept``; nothing where it is not ``there``."""
 
     there: wp.int32
-    ratio: real
+    ratio: wp.array[real]
+    """(1,)."""
     turns: wp.array[real]
     momenta: wp.array[real]
     turned: wp.array[real]
@@ -214,7 +225,7 @@ def factored(
         for (int i = 0; i < unknowns; ++i) {
             const double *const row = x + fronts.place.data[i] * PANEL, *const g = given + i * row_stride + from * column_stride;
             for (int t = 0; t < 3; ++t) {
-                const double turn = kept.turns.data[3 * i + t], momentum = kept.ratio * kept.momenta.data[3 * i + t];
+                const double turn = kept.turns.data[3 * i + t], momentum = kept.ratio.data[0] * kept.momenta.data[3 * i + t];
                 for (int q = 0; q < columns; ++q) missing[t][q] += turn * g[q * column_stride] - momentum * row[q];
             }
         }
@@ -329,7 +340,7 @@ def solved_panel(
         found[i] = x[fronts.place.data[i]];
         for (int t = 0; t < 3 && kept.there; ++t)
             missing[t] += kept.turns.data[3 * i + t] * given[i * row_stride]
-                - kept.ratio * kept.momenta.data[3 * i + t] * found[i];
+                - kept.ratio.data[0] * kept.momenta.data[3 * i + t] * found[i];
     }
     for (int t = 0; t < 9 && kept.there; ++t) by[t / 3] += kept.inverse.data[t] * missing[t % 3];
     for (int i = 0; i < unknowns && kept.there; ++i)
@@ -374,7 +385,7 @@ def factor_kernel(
 
 @wp.kernel
 def solve_kernel(
-    first_panel: wp.int32,
+    counters: wp.array[wp.int32],
     fronts: Fronts,
     blocks: wp.int32,
     unknowns: wp.int32,
@@ -389,20 +400,22 @@ def solve_kernel(
     room: wp.array[real],
     solution: wp.uint64,
 ) -> None:
-    """One thread a panel, see ``solved_panel``."""
+    """Panel after panel as ``counters`` (1,) give them out, see ``solved_panel``."""
     if count == 1:
         solved_one(fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, kept, room, solution)
         return
-    panel = first_panel + wp.tid()
-    solved_panel(
-        fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, column_stride, count, wp.uint64(0),
-        real(0.0), real(1.0), kept, panel, room, solution + wp.uint64(8 * PANEL * panel), count,
-    )  # fmt: skip
+    panel = claimed(counters, 0)
+    while PANEL * panel < count:
+        solved_panel(
+            fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, column_stride, count,
+            wp.uint64(0), real(0.0), real(1.0), kept, panel, room, solution + wp.uint64(8 * PANEL * panel), count,
+        )  # fmt: skip
+        panel = claimed(counters, 0)
 
 
 @wp.kernel
-def moves_kernel(
-    first_panel: wp.int32,
+def strain_kernel(
+    counters: wp.array[wp.int32],
     fronts: Fronts,
     blocks: wp.int32,
     unknowns: wp.int32,
@@ -424,18 +437,33 @@ def moves_kernel(
     moves: wp.array3d[real],
     products: wp.array3d[real],
     along: wp.array2d[real],
+    form: wp.array2d[real],
 ) -> None:
-    """One thread a panel: its ``moves`` (panels, n, ``PANEL``), see ``solved_panel``, from the last of which ``away``
-    is taken; their ``products`` with a ``matrix``, and what they are ``along`` the ``slope`` (panels, ``PANEL``)."""
-    panel = first_panel + wp.tid()
-    mine = address_of(moves[panel])
-    solved_panel(
-        fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, column_stride, count, weights,
-        near_share, far_share, Kept(), panel, room, mine, PANEL,
-    )  # fmt: skip
-    finish_moves(count - PANEL * panel, away, slope, moves[panel], along[panel])
-    for strip in range(PANEL // STRIP):
-        strip_of_products(
-            unknowns, matrix.offsets, matrix.indices, matrix.heads, matrix.values, mine, PANEL, strip,
-            address_of(products[panel]),
+    """The ``moves`` (panels, n, ``PANEL``) of each panel, see ``solved_panel``, from the last of which ``away`` is
+    taken; their ``products`` with a ``matrix``, what they are ``along`` the ``slope`` (panels, ``PANEL``), and when all
+    panels are there their ``form`` X^T Y. ``counters`` (3,): panels and pairs of them that are given out, and panels
+    that are done."""
+    panels = moves.shape[0]
+    panel = claimed(counters, 0)
+    while panel < panels:
+        mine = address_of(moves[panel])
+        solved_panel(
+            fronts, blocks, unknowns, factor, inverses, reciprocals, right, row_stride, column_stride, count, weights,
+            near_share, far_share, Kept(), panel, room, mine, PANEL,
         )  # fmt: skip
+        finish_moves(count - PANEL * panel, away, slope, moves[panel], along[panel])
+        for strip in range(PANEL // STRIP):
+            strip_of_products(
+                unknowns, matrix.offsets, matrix.indices, matrix.heads, matrix.values, mine, PANEL, strip,
+                address_of(products[panel]),
+            )  # fmt: skip
+        claimed(counters, 2)
+        panel = claimed(counters, 0)
+    wait_for(counters, 2, panels)
+    pair = claimed(counters, 1)
+    while pair < panels * panels:
+        first = pair / panels
+        second = pair % panels
+        if first <= second:
+            write_form(first, second, moves[first], products[second], form)
+        pair = claimed(counters, 1)
