@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.sparse as sparse
 import warp as wp
 
 from egs_warp.fem.elastic_maps import Damping, ElasticMaps, Material

@@ -208,7 +208,12 @@ class _Keeping:
     def __init__(self, unknowns: int) -> None:
         self.struct = kernels.Kept()
         self._arrays: dict[str, np.ndarray] = {}
-        for name, size in (("turns", 3 * unknowns), ("momenta", 3 * unknowns), ("turned", 3 * unknowns), ("inverse", 9)):
+        for name, size in (
+            ("turns", 3 * unknowns),
+            ("momenta", 3 * unknowns),
+            ("turned", 3 * unknowns),
+            ("inverse", 9),
+        ):
             self._arrays[name], array = _shared_zeros(size)
             setattr(self.struct, name, array)
         self._ratio, self.struct.ratio = _shared_zeros(1)

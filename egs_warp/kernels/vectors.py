@@ -103,7 +103,8 @@ ROW_ELIMINATION = """
                 for (int q = 0; q < rows; ++q)
                     for (int d = c; d < columns; d += 4) {
                         v4 left = *(v4*)(row + q * stride + d);
-                        for (int s = 0; s < found; ++s) left -= shares[q * BLOCK + s] * *(const v4*)(by + s * stride + d);
+                        for (int s = 0; s < found; ++s)
+                            left -= shares[q * BLOCK + s] * *(const v4*)(by + s * stride + d);
                         *(v4*)(row + q * stride + d) = left;
                     }
             }

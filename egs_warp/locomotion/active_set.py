@@ -46,8 +46,8 @@ class ReducedRows:
 
     @classmethod
     def of(cls, P: np.ndarray, q: np.ndarray, A: np.ndarray) -> ReducedRows:
-        """Of P (n, n), q (n,) and A (m, n). Raises ``numpy.linalg.LinAlgError`` where P is not positive definite; of one
-        that holds no number there is no minimum."""
+        """Of P (n, n), q (n,) and A (m, n). Raises ``numpy.linalg.LinAlgError`` where P is not positive definite; one
+        that holds no number has no minimum."""
         P, q, A = (np.asarray(each, dtype=np.float64) for each in (P, q, A))
         minimum, free, lengths = _room_for(A).reduce(P, q, A)
         return cls(P, q, A, minimum, free, lengths, max(1.0, -0.5 * float(q @ minimum)))

@@ -35,8 +35,8 @@ def pattern(count: int) -> sparse.csc_matrix:
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("diagonal", [30.0, 1.0])
 def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
-    """Solutions and strains of moves to rounding, with a sum and without; an indefinite matrix has no dense factors, but
-    a sum with it may have.
+    """Solutions and strains of moves to rounding, with a sum and without; an indefinite matrix has no dense factors,
+    but a sum with it may have.
     """
     upper = pattern(60)
     dense, thin = DenseFactors(upper, device=device), SparseFactors(upper)

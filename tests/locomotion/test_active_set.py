@@ -135,3 +135,47 @@ def test_what_was_sought_before_changes_nothing() -> None:
         found(P, 3.0 * q, A[: len(q) + 2], lower[: len(q) + 2], upper[: len(q) + 2])
         for got, value in zip(found(P, q, A, lower, upper), expected, strict=True):
             assert np.array_equal(got, value)
+
+
+def test_rows_in_coordinates_in_which_distances_are_costs() -> None:
+    """z = 0 is the minimum, half its square the cost beside it, and each row's unit and length are those by z."""
+    for seed in range(20):
+        P, q, A, _, _ = random_program(seed)
+        rows = ReducedRows.of(P, q, A)
+        minimum = np.linalg.solve(P, -q)
+        assert np.allclose(rows.minimum, minimum) and np.allclose(rows.free, A @ minimum)
+        x = np.random.default_rng(seed).standard_normal(len(q))
+        z = rows.place(x)
+        cost = 0.5 * x @ P @ x + q @ x - (0.5 * minimum @ P @ minimum + q @ minimum)
+        assert 0.5 * z @ z == pytest.approx(cost)
+        assert np.allclose(rows.free + rows.lengths * (rows.units @ z), A @ x)
+        assert np.allclose(np.linalg.norm(rows.units, axis=1), 1.0)
+
+
+def test_rows_of_two_programs_are_not_mixed_up() -> None:
+    """Which share their memory; an indefinite Hessian is refused."""
+    (P, q, A, *_), (Q, r, _, *_) = random_program(7), random_program(7)
+    first, second = ReducedRows.of(P, q, A), ReducedRows.of(2.0 * Q, r + 1.0, A)
+    units = second.units.copy()
+    assert np.abs(first.units - units).max() < 1e-12 and np.allclose(second.lengths * np.sqrt(2.0), first.lengths)
+    x = np.ones(len(q))
+    assert np.linalg.norm(second.place(second.minimum)) < 1e-9 < np.linalg.norm(second.place(x) - first.place(x))
+    with pytest.raises(np.linalg.LinAlgError, match="not positive definite"):
+        ReducedRows.of(P - 2.0 * np.linalg.eigvalsh(P)[0] * np.eye(len(q)), q, A)
+
+
+def test_as_many_rows_as_unknowns_and_one_that_contradicts_them() -> None:
+    """Rows that nearly repeat each other hold a corner, from which a further one is a ten-thousandth away: no point,
+    and no search that rounding leads astray."""
+    rng = np.random.default_rng(0)
+    count = 40
+    A = np.eye(count) + 1e-3 * rng.standard_normal((count, count))
+    A = np.vstack([A + 0.4 * np.ones((count, count)), -np.ones((1, count))])
+    corner = rng.standard_normal(count)
+    lower = A @ corner
+    lower[-1] += 1e-4
+    reduced = ReducedRows.of(np.eye(count), -10.0 * corner - 3.0, A)
+    upper = np.full(len(A), np.inf)
+    for guess in (np.zeros(len(A), bool), reduced.free < lower, np.ones(len(A), bool)):
+        found = optimum_near(reduced, lower, upper, guess, np.zeros(len(A), bool))
+        assert found is not None and not found.feasible

@@ -12,6 +12,7 @@ from egs_warp.locomotion.contact_pieces import (
     STICK,
     ContactModes,
     ContactPieces,
+    Piece,
     search_pieces,
     solve_piece,
     solve_relaxed,
@@ -55,6 +56,64 @@ def under(program: ContactPieces, activations: np.ndarray) -> np.ndarray:
 def started(program: ContactPieces) -> tuple[np.ndarray, ContactModes]:
     start = under(program, np.zeros(2))
     return start, ContactModes.of(start[2:].reshape(-1, 3), FRICTION)
+
+
+def larger_program(seed: int, activations: int, contacts: int) -> ContactPieces:
+    """Of any size: what its matrices stand for is of no account, but that one is symmetric and contact can answer."""
+    rng = np.random.default_rng(seed)
+    size = activations + 3 * contacts
+    half, frame = rng.standard_normal((size, size)), rng.standard_normal((3 * contacts, 3 * contacts + 4))
+    rows = np.hstack([rng.standard_normal((3 * contacts, activations)), frame @ frame.T])
+    return ContactPieces(
+        *(half @ half.T, rng.standard_normal(size), 0.7, rows, rng.standard_normal(3 * contacts), FRICTION),
+        *(-np.ones(activations), np.ones(activations)),
+    )
+
+
+@pytest.mark.parametrize(("activations", "contacts"), [(1, 0), (2, 1), (5, 3), (8, 4), (13, 9), (92, 21)])
+def test_a_piece_is_what_its_modes_say(activations: int, contacts: int) -> None:
+    """Forces from one linear system, the cost of activations alone, and the rows where it ends, all written out."""
+    program = larger_program(contacts, activations, contacts)
+    rng = np.random.default_rng(activations)
+    angle = rng.uniform(0.0, 2.0 * np.pi, contacts)
+    for kind in (rng.integers(0, 3, contacts), np.full(contacts, STICK), np.full(contacts, SLIDE), np.zeros(contacts)):
+        modes = ContactModes(kind.astype(int), np.stack([np.cos(angle), np.sin(angle)], axis=1))
+        piece = Piece.of(program, modes)
+        assert piece is not None
+        for a in (np.zeros(activations), rng.standard_normal(activations)):
+            forces = (piece.offset + piece.slope @ a).reshape(-1, 3)
+            x = np.concatenate([a, forces.ravel()])
+            speeds = (program.rows @ x + program.offset).reshape(-1, 3)
+            scale = 1e-5 * max(np.abs(forces).max(initial=1.0), 1.0)
+            ends: list[list[float]] = [[], [], [], [], []]
+            for i in range(contacts):
+                normal, tangents, d = forces[i, 0], forces[i, 1:], modes.slip[i]
+                if kind[i] == FREE:
+                    assert not forces[i].any()
+                    ends[4].append(speeds[i, 0])
+                    continue
+                # Next to nothing for each force: what makes the operator regular.
+                assert abs(speeds[i, 0]) < scale
+                if kind[i] == STICK:
+                    assert np.abs(speeds[i]).max() < scale
+                    angles = 2.0 * np.pi * np.arange(8) / 8
+                    sides = np.cos(angles) * tangents[0] + np.sin(angles) * tangents[1]
+                    ends[1].append(FRICTION * np.cos(np.pi / 8) * normal - sides)
+                else:
+                    assert np.allclose(tangents, -FRICTION * normal * d, atol=scale)
+                    across = np.array([-d[1], d[0]])
+                    for side, sign in ((2, 1.0), (3, -1.0)):
+                        ends[side].append((0.5 * d + sign * np.sqrt(0.75) * across) @ speeds[i, 1:])
+            leaves = [forces[i, 0] for kept in (STICK, SLIDE) for i in range(contacts) if kind[i] == kept]
+            faces = np.array(ends[1]).T.ravel() if ends[1] else np.zeros(0)
+            expected = np.concatenate([a, leaves, faces, ends[2], ends[3], ends[4]])
+            found = piece.rows @ a + piece.rows_offset
+            np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max(initial=1.0))
+            cost = 0.5 * a @ piece.P @ a + piece.q @ a
+            none = np.concatenate([np.zeros(activations), piece.offset])
+            assert cost == pytest.approx(program.objective(x) - program.objective(none), rel=1e-7, abs=1e-7)
+        assert np.array_equal(piece.P, piece.P.T)
+        assert len(piece.contact) == len(piece.onward) == len(piece.rows) - activations
 
 
 @pytest.mark.parametrize("solver", list(QpSolver))

@@ -226,8 +226,8 @@ _HESSIANS = """
         const double beta = elements.damping_time, by = beta / dt;
         for (int i = 0; i < 3; ++i)
             for (int k = 0; k < 3; ++k)
-                block[3 * i + k] += by * (elements.mu * (along * FF.at[i][k] + fb[i] * fa[k]) + elements.lam * fa[i] * fb[k])
-                    + (i == k ? beta * turning : v4(0.0));
+                block[3 * i + k] += by * elements.mu * (along * FF.at[i][k] + fb[i] * fa[k])
+                    + by * elements.lam * fa[i] * fb[k] + (i == k ? beta * turning : v4(0.0));
     };
     auto scatter = [&](int group, const v4 (*block)[9]) {
         v4 all[78];

@@ -223,9 +223,11 @@ def factored(
     double missing[3][PANEL] = {{0.0}}, by[3][PANEL] = {{0.0}};
     if (kept.there) {
         for (int i = 0; i < unknowns; ++i) {
-            const double *const row = x + fronts.place.data[i] * PANEL, *const g = given + i * row_stride + from * column_stride;
+            const double* const row = x + fronts.place.data[i] * PANEL;
+            const double* const g = given + i * row_stride + from * column_stride;
             for (int t = 0; t < 3; ++t) {
-                const double turn = kept.turns.data[3 * i + t], momentum = kept.ratio.data[0] * kept.momenta.data[3 * i + t];
+                const double turn = kept.turns.data[3 * i + t];
+                const double momentum = kept.ratio.data[0] * kept.momenta.data[3 * i + t];
                 for (int q = 0; q < columns; ++q) missing[t][q] += turn * g[q * column_stride] - momentum * row[q];
             }
         }
@@ -271,9 +273,9 @@ def solved_panel(
     solution_stride: wp.int32,
 ) -> None:
     """A panel of ``count`` right-hand sides; ``right`` and ``solution``, which is the panel's own, are addresses of
-    numbers, the first with its strides in them, the second row by row. With ``weights`` of rows, another address or 0, ``near_share`` of what is
-    given and ``far_share`` of the solution with what is given by weight; else
-    what is ``kept``."""
+    numbers, the first with its strides in them, the second row by row. With ``weights`` of rows, another address or 0,
+    ``near_share`` of what is given and ``far_share`` of the solution with what is given by weight; else what is
+    ``kept``."""
     ...
 
 

@@ -55,8 +55,8 @@ def room_of(unknowns: int, wide: int) -> int:
     const int wide = lower.strides[0] / 8, tall = columns.strides[0] / 8, blocks = (n + BLOCK - 1) / BLOCK;
     const double *const P = (const double*)hessian, *const q = (const double*)slope, *const A = (const double*)given;
     double *const L = lower.data, *const U = upper.data, *const x = minimum.data, *const Z = (double*)rows.data;
-    double *const T = scratch.data, *const inverses = T + BLOCK * wide, *const turned = inverses + BLOCK * BLOCK * blocks;
-    double* const reciprocals = turned + BLOCK * BLOCK * blocks;
+    double *const T = scratch.data, *const inverses = T + BLOCK * wide;
+    double *const turned = inverses + BLOCK * BLOCK * blocks, *const reciprocals = turned + BLOCK * BLOCK * blocks;
     for (int i = 0; i < n; ++i) {
         for (int k = 0; k <= i; ++k) L[i * wide + k] = P[i * hessian_stride + k];
         for (int k = i + 1; k < wide; ++k) L[i * wide + k] = 0.0;
