@@ -502,14 +502,18 @@ def optimum_kernel(
     ended: wp.array[int],
     point: wp.uint64,
 ):
-    """From ``search.side``, a guess, to the optimum; how it ended and how many rows hold, and the ``point`` x, n
-    numbers at an address. One thread of a CPU.
+    """From ``search.side``, a guess, to the optimum; how it ended, and where there is one how many rows hold it and
+    the ``point`` x, n numbers at an address. One thread of a CPU.
 
     The guessed rows are held at their bounds, which is one system of linear equations in their multipliers; rows that
     pull the wrong way are let go, rows that break their bounds are held instead. Where that goes on for long, rows that
     break their bounds join one at a time, at the dual's best step: that ends.
     """
     ended[0] = find_optimum(program, pivots, search)
+    ended[1] = 0
+    if ended[0] != FOUND:
+        # What holds then says nothing: more rows than there are unknowns may have a side.
+        return
     count = int(0)
     for row in range(search.side.shape[0]):
         if search.side[row] != 0:
