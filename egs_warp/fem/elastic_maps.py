@@ -112,5 +112,5 @@ class ElasticMaps:
             offsets.astype(np.int32),
             upper[order].astype(np.int32),
             entry_from_block,
-            pattern,
+            sparse.csc_matrix(pattern),
         )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -80,7 +82,7 @@ class ElementVectors:
         )
         return self._gradient.copy()
 
-    def _lines_of(self, tension: MuscleTension) -> kernels.Lines:
+    def _lines_of(self, tension: MuscleTension) -> Any:
         if self._muscles is None or self._muscles.rows is not tension.rows:
             self._muscles = _Muscles(tension, self._device)
         self._muscles.tensions[:] = tension.tensions
@@ -116,7 +118,7 @@ class _Muscles:
         self.lines.tensions = array
 
 
-def _no_lines(device: wp.Device) -> kernels.Lines:
+def _no_lines(device: wp.Device) -> Any:
     lines = kernels.Lines()
     lines.offsets, lines.nodes = empty(0, int, device), empty(0, int, device)
     lines.shares, lines.rest_lengths, lines.tensions = (empty(0, real, device) for _ in range(3))

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from egs_warp.kernels.locomotion.impulses import impulses_kernel
-from egs_warp.launching import launch_again, put, zeros
+from egs_warp.launching import device_of, launch_again, put, zeros
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import FULL, SLACK
@@ -43,7 +43,7 @@ class SynergyImpulses:
             self._count,
             inputs=[*self._maps, self._positions, dt],
             outputs=[self._rows],
-            device=self._positions.device,
+            device=device_of(self._positions),
         )
         self._impulses[-1] = other
         return self._impulses.T
