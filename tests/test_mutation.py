@@ -75,7 +75,7 @@ def test_the_nearest_test_comes_first() -> None:
     """By the imports that lead from a test to the module, over host code to its kernels; its own before others."""
     nearest = ["tests/contact/test_points.py", "tests/contact/test_batch_contacts.py"]
     assert mutants.tests_of("contact", "egs_warp/contact/points.py")[:2] == nearest
-    assert mutants.tests_of("fem", "egs_warp/kernels/fem/elasticity.py")[0] == "tests/fem/test_elasticity.py"
+    assert mutants.tests_of("fem", "egs_warp/kernels/fem/elasticity.py")[0] == "tests/fem/test_element_vectors.py"
     for chosen in mutants.ROOMS:
         assert len(mutants.tests_of(chosen, "")) == len(list((mutants.ROOT / "tests" / chosen).glob("test_*.py"))) > 3
 

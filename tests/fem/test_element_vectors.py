@@ -1,4 +1,4 @@
-"""Elements by fours against one at a time: the same numbers, whatever way they are added up."""
+"""Eq. (5), elements by fours against one at a time: the same numbers, whatever way they are added up."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def strings(mesh: TetMesh) -> MuscleTension:
 @pytest.mark.parametrize("count", [1, 4, 7, 40, None])
 @pytest.mark.parametrize("dt", [None, 1 / 60])
 def test_they_are_those_of_one_at_a_time(count: int | None, dt: float | None) -> None:
-    """Energy, determinants, gradients with muscles and without, both Hessians."""
+    """Eq. (5): energy, determinants, gradients with muscles and without, both Hessians."""
     mesh = block_mesh() if count is None else part(count)
     one, four = both(mesh)
     rng = np.random.default_rng(3)

@@ -79,8 +79,8 @@ LOCOMOTION = [
     ),
     Survivor(
         "locomotion/solvers.py",
-        "found = self._finished(lower, upper, low, (upper - at < multipliers) & ~low)",
-        "found = self._finished(lower, upper, low, (upper - at != multipliers) & ~low)",
+        "low, high = at - below < -multipliers, above - at < multipliers",
+        "low, high = at - below < -multipliers, above - at != multipliers",
         "a guess: the search from any other ends at the same optimum",
     ),
     Survivor(
