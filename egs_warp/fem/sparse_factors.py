@@ -142,7 +142,7 @@ class SparseFactors:
         far: float,
         away: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """See ``Factors``: panel after panel, half of them in a second thread."""
+        """See ``Factors``: two threads share the panels."""
         assert self._ready and self._added is None, "update() comes first"
         count = vectors.shape[1]
         panels = -(-count // kernels.PANEL)
@@ -168,7 +168,6 @@ class SparseFactors:
         panels = -(-(1 if right.ndim == 1 else right.shape[1]) // kernels.PANEL)
         keeping = self._nothing if kept is None else self._keeping.of(kept)
         inputs = [*self._solving, *self._place_of(right), keeping, self._room_for(panels), solution.ctypes.data]
-
         self._by_two(kernels.solve_kernel, panels, inputs, [])
         return solution
 

@@ -14,13 +14,13 @@ from egs_warp.fem.body import SoftBody
 from egs_warp.fem.factors import Factors
 from egs_warp.launching import beside
 from egs_warp.locomotion.contact_pieces import ContactPieces
-from egs_warp.locomotion.impulses import SynergyImpulses
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.step_cost import Horizon, LinearStep, QuadraticCost, effort_cost, objectives_cost
 from egs_warp.locomotion.strategies import Foreseen, search_program
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.muscles.muscle_set import MuscleSet
+from egs_warp.muscles.tension import GroupImpulses
 
 STEPS_A_UNIT = 19.0
 """Least number of steps in sqrt(H / g) within which a body can be steered."""
@@ -166,8 +166,8 @@ class StepPlanner:
         return QuadraticCost(np.diag(diagonal), q, float(change @ previous**2))
 
     @cached_property
-    def _impulses(self) -> SynergyImpulses:
-        return SynergyImpulses(self.muscles, self.synergies)
+    def _impulses(self) -> GroupImpulses:
+        return GroupImpulses(self.muscles, self.synergies.group_from_muscle)
 
     @cached_property
     def _strengths(self) -> tuple[np.ndarray, np.ndarray]:

@@ -7,8 +7,12 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
+import warp as wp
 
+from egs_warp.kernels.muscles.impulses import impulses_kernel
+from egs_warp.launching import device_of, launch_again, put, zeros
 from egs_warp.muscles.muscle_set import MuscleSet
+from egs_warp.precision import Vec3, real
 
 FULL, SLACK = 0.7, 0.3
 """Of its rest length: a segment that is at least so long pulls with all its tension, one at most so long not at all."""
@@ -50,6 +54,42 @@ def muscle_columns(muscles: MuscleSet, positions: np.ndarray) -> sparse.csc_matr
     return sparse.csc_matrix(
         (entries.ravel(), nodes, 3 * rows.indptr), shape=(3 * muscles.node_count, len(rows.indptr) - 1)
     )
+
+
+class GroupImpulses:
+    """Columns of groups of segments that act together, over a step: kernel, index maps and memory, on the host."""
+
+    def __init__(self, muscles: MuscleSet, group_from_muscle: np.ndarray) -> None:
+        """``group_from_muscle`` (M,) from 0 to m - 1."""
+        rows, self._count = muscles.difference_rows, int(group_from_muscle.max(initial=-1)) + 1
+        order = np.argsort(group_from_muscle, kind="stable")
+        offsets = np.searchsorted(group_from_muscle[order], np.arange(self._count + 1))
+        self._maps = [
+            *(wp.array(part.astype(np.int32), dtype=int, device="cpu") for part in (offsets, order)),
+            *(wp.array(part.astype(np.int32), dtype=int, device="cpu") for part in (rows.indptr, rows.indices)),
+            *(
+                wp.array(part, dtype=real, device="cpu")
+                for part in (rows.data, muscles.stiffness * muscles.bounds, muscles.rest_lengths)
+            ),
+            *(SLACK, FULL),
+        ]
+        self._positions = zeros(muscles.node_count, Vec3, "cpu")
+        self._impulses = np.zeros((self._count + 1, 3 * muscles.node_count))
+        self._rows = wp.array(self._impulses.reshape(len(self._impulses), -1, 3), dtype=Vec3, device="cpu", copy=False)
+
+    def beside(self, other: np.ndarray, positions: np.ndarray, dt: float) -> np.ndarray:
+        """(3N, m + 1) N s over ``dt`` seconds at node ``positions`` (N, 3), of each group at its bounds, and as the last
+        column ``other`` (3N,); it is overwritten the next time."""
+        put(self._positions, positions)
+        launch_again(
+            impulses_kernel,
+            self._count,
+            inputs=[*self._maps, self._positions, dt],
+            outputs=[self._rows],
+            device=device_of(self._positions),
+        )
+        self._impulses[-1] = other
+        return self._impulses.T
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,11 @@ from egs_warp.fem.body import BodyState, SoftBody, make_body
 from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.plane import Plane
+from egs_warp.locomotion.synergies import Synergies
 from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.muscle_set import MuscleSet, attach_fibres
-from egs_warp.muscles.tension import MuscleTension, muscle_columns
+from egs_warp.muscles.tension import GroupImpulses, MuscleTension, muscle_columns
+from tests.support.creatures import coarse_pawn
 from tests.support.meshes import box_mesh
 from tests.support.passive import passive_body
 
@@ -234,3 +236,22 @@ def test_the_tangent_is_inverted_even_where_the_elastic_part_is_indefinite(
     missing = missing - turned @ np.linalg.lstsq(turned, missing, rcond=None)[0]
     np.testing.assert_allclose(missing, 0.0, rtol=0, atol=1e-6 * np.abs(right).max())
     np.testing.assert_allclose(problem.momenta @ found, problem.turns.T @ right, rtol=0, atol=1e-9)
+
+
+def test_impulses_of_groups_are_the_columns_of_their_muscles() -> None:
+    """Eq. (7), each at its bound, over the time, of a body that is bent so far that some pull less; one muscle a group,
+    and several."""
+    creature = coarse_pawn()
+    muscles, rest = creature.muscles, creature.body.mesh.nodes
+    bent = rest * [1.0, 1.0, 0.6] + 0.01 * np.random.default_rng(0).standard_normal(rest.shape)
+    other = np.arange(3.0 * len(rest))
+    for most in (muscles.segment_count, 7):
+        synergies = Synergies((np.arange(muscles.segment_count) % most).astype(np.int32))
+        impulses = GroupImpulses(muscles, synergies.group_from_muscle)
+        for positions in (rest, bent):
+            found = impulses.beside(other, positions, 0.02)
+            each = muscle_columns(muscles, positions).toarray() * muscles.bounds
+            expected = 0.02 * (each @ synergies.members.toarray())
+            assert found.shape == (3 * len(rest), most + 1)
+            np.testing.assert_allclose(found[:, :-1], expected, atol=1e-12 * np.abs(expected).max())
+            np.testing.assert_array_equal(found[:, -1], other)

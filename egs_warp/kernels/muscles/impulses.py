@@ -1,4 +1,4 @@
-"""What activations of synergies push nodes with over a step (Eq. 7), a row for each."""
+"""What activations of groups of segments push nodes with over a step (Eq. 7), a row for each."""
 
 import warp as wp
 
@@ -25,13 +25,13 @@ def impulses_kernel(
     # Out:
     impulses_out: wp.array2d[Vec3],
 ):
-    """N s on each node for an activation of a synergy at its bound, over ``dt`` seconds: of its ``members``, which pull
+    """N s on each node for an activation of a group at its bound, over ``dt`` seconds: of its ``members``, which pull
     with ``strengths`` newtons at their bounds where they are not ``slack``, with the shares of tension of
-    ``muscles.tension``. One thread a synergy."""
-    synergy = wp.tid()
+    ``muscles.tension``. One thread a group."""
+    group = wp.tid()
     for node in range(positions.shape[0]):
-        impulses_out[synergy, node] = Vec3(real(0.0))
-    for place in range(member_offsets[synergy], member_offsets[synergy + 1]):
+        impulses_out[group, node] = Vec3(real(0.0))
+    for place in range(member_offsets[group], member_offsets[group + 1]):
         segment = members[place]
         line = Vec3(real(0.0))
         for slot in range(node_offsets[segment], node_offsets[segment + 1]):
@@ -42,4 +42,4 @@ def impulses_kernel(
         pull = (-dt * strengths[segment] * share / length) * line
         for slot in range(node_offsets[segment], node_offsets[segment + 1]):
             node = nodes[slot]
-            impulses_out[synergy, node] = impulses_out[synergy, node] + shares[slot] * pull
+            impulses_out[group, node] = impulses_out[group, node] + shares[slot] * pull
