@@ -78,8 +78,8 @@ class GroupImpulses:
         self._rows = wp.array(self._impulses.reshape(len(self._impulses), -1, 3), dtype=Vec3, device="cpu", copy=False)
 
     def beside(self, other: np.ndarray, positions: np.ndarray, dt: float) -> np.ndarray:
-        """(3N, m + 1) N s over ``dt`` seconds at node ``positions`` (N, 3), of each group at its bounds, and as the last
-        column ``other`` (3N,); it is overwritten the next time."""
+        """(3N, m + 1) N s over ``dt`` seconds at node ``positions`` (N, 3), of each group at its bounds, and last
+        ``other`` (3N,); overwritten the next time."""
         put(self._positions, positions)
         launch_again(
             impulses_kernel,
