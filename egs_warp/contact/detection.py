@@ -272,8 +272,6 @@ class ContactDetector:
             coefficients = wp.array(geometry.field.coefficients, dtype=real, device=device)
             axes, origin = Mat33(*geometry.field.axes.ravel().tolist()), Vec3(*geometry.field.origin.tolist())
             self._field = [axes, origin, real(geometry.field.spacing), coefficients]
-        self._corners = wp.array(geometry.mesh.tets[geometry.tet_from_point], dtype=wp.vec4i, device=device)
-        self._heights = wp.zeros(len(rows) * len(geometry.mesh.nodes), dtype=real, device=device)
         self._positions = wp.zeros(len(geometry.mesh.nodes), dtype=Vec3, device=device)
         count = len(geometry.tet_from_point)
         self._gaps = wp.zeros(count, dtype=real, device=device)
@@ -296,17 +294,20 @@ class ContactDetector:
 
     def _find(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         put(self._positions, positions)
-        solids, outputs = [self._planes, self._solids, self._positions], [self._gaps, self._nearest]
-        if self._device.is_cpu:
-            inputs = [self._corners, self._weights, *solids]
-            launch_again(
-                kernels.all_gaps_kernel, 1, inputs=inputs, outputs=[self._heights, *outputs], device=self._device
-            )
-        else:
-            inputs = [self._tets, self._tet_from_point, self._weights, *solids]
-            launch_again(
-                kernels.point_gaps_kernel, len(self._gaps), inputs=inputs, outputs=outputs, device=self._device
-            )
+        launch_again(
+            kernels.point_gaps_kernel,
+            len(self.geometry.tet_from_point),
+            inputs=[
+                self._tets,
+                self._tet_from_point,
+                self._weights,
+                self._planes,
+                self._solids,
+                self._positions,
+            ],
+            outputs=[self._gaps, self._nearest],
+            device=self._device,
+        )
         if self._field:
             wp.launch(
                 ground_gaps_kernel,

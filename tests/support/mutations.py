@@ -71,7 +71,7 @@ EQUATIONS: dict[int, Mutation] = {
         ),
         (
             *(8, "the plane's offset", "kernels/contact/gaps.py"),
-            *("plane[2] * x[3 * i + 2] + plane[3]", "plane[2] * x[3 * i + 2] - plane[3]"),
+            *("plane[2] * x[2] + plane[3]", "plane[2] * x[2] - plane[3]"),
             "contact/test_detection.py::test_gaps_kernel_equals_its_twin",
         ),
         (
