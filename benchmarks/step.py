@@ -22,7 +22,7 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
 from egs_warp.assets import pawn
-from egs_warp.contact.coupled_step import ContactResponse
+from egs_warp.contact.response import ContactResponse
 from egs_warp.fem.elasticity import ElasticAssembly
 from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
@@ -76,7 +76,7 @@ def contact_errors(creature: Creature, before: StepReport, step: StepReport) -> 
         response = ContactResponse.of(tangent, contacts)
         free = velocities.ravel() - tangent.solve(problem.residual(velocities, now).ravel())
         shift = stepper.solver.shift(contacts, step.dt)
-        forces, _ = response.forces(free, shift, creature.geometry.friction, step.forces)
+        forces, _ = response.forces(contacts.speeds(free), shift, creature.geometry.friction, step.forces)
         expected = free + response.columns @ forces.ravel()
         errors[place] = (contacts.frame @ (expected - step.state.velocities.ravel()))[loaded]
     return errors

@@ -101,7 +101,7 @@ class BatchDetector:
         """Raises ``ArgumentError`` for ground that is not flat."""
         if geometry.field is not None:
             raise ArgumentError("geometry", "many worlds stand on flat ground only; run these over processes")
-        self.device, self.near, self.lower = device, points.near, points.lower
+        self.device, self.near, self.lower, self.alike = device, points.near, points.lower, points.alike
         self.point_count = len(geometry.tet_from_point)
         tet_count, node_count = len(geometry.mesh.tets), len(geometry.mesh.nodes)
         planes = np.array([[*plane.normal, plane.offset] for plane in geometry.planes])
@@ -114,6 +114,7 @@ class BatchDetector:
         ]
         self._cells = torch.as_tensor(points.cell_from_point.astype(np.int64), device=device)
         self._cell_count = int(points.cell_from_point.max()) + 1
+        self._ranks = torch.as_tensor(np.argsort(points.order), device=device)
         corners = geometry.mesh.tets[geometry.tet_from_point]
         self._nodes = torch.as_tensor(corners.astype(np.int32), device=device)
         self._weights = self._reals(geometry.weights)
@@ -158,20 +159,21 @@ class BatchDetector:
         return self._lowest(deep & (taken == 0), gaps)
 
     def _lowest(self, among: torch.Tensor, gaps: torch.Tensor) -> torch.Tensor:
-        """(c, P) bool: of the points ``among`` the lowest of each cell, of several the first."""
-        cells = self._cells.expand_as(gaps)
+        """(c, P) bool: of the points ``among`` the lowest of each cell, of several that lie alike the one next to its
+        middle."""
+        cells, heights = self._cells.expand_as(gaps), (gaps / self.alike).round()
         low = gaps.new_full((len(gaps), self._cell_count), torch.inf)
-        low.scatter_reduce_(1, cells, torch.where(among, gaps, torch.inf), "amin")
-        numbers = torch.arange(self.point_count, device=self.device).expand_as(gaps)
-        candidates = torch.where(among & (gaps == low.gather(1, cells)), numbers, self.point_count)
+        low.scatter_reduce_(1, cells, torch.where(among, heights, torch.inf), "amin")
+        ranks = self._ranks.expand_as(gaps)
+        candidates = torch.where(among & (heights == low.gather(1, cells)), ranks, self.point_count)
         first = torch.full_like(low, self.point_count, dtype=torch.int64)
         first.scatter_reduce_(1, cells, candidates, "amin")
-        return numbers == first.gather(1, cells)
+        return ranks == first.gather(1, cells)
 
     def contacts(
         self, chosen: torch.Tensor, gaps: torch.Tensor, faces: torch.Tensor, order: torch.Tensor | None = None
     ) -> BatchContacts:
-        """At the points ``chosen`` (c, P), in ascending order, or in that of ``order`` (c, P); ``gaps`` and ``faces``
+        """At the points ``chosen`` (c, P), in ascending order, or in that of ``order``, metres; ``gaps`` and ``faces``
         (c, P) at the start of the step. Waits for the device."""
         counts = chosen.sum(dim=1)
         most = int(counts.max()) if len(counts) else 0
@@ -183,7 +185,7 @@ class BatchDetector:
         points = points[:, :most]
         there = torch.arange(most, device=self.device) < counts[:, None]
         if order is not None:
-            key = torch.where(there, order.gather(1, points), torch.inf)
+            key = torch.where(there, (order.gather(1, points) / self.alike).round(), torch.inf)
             points = points.gather(1, key.argsort(dim=1, stable=True))
         at = faces.gather(1, points)
         return BatchContacts(

@@ -21,11 +21,11 @@ from egs_warp.contact.coupled_step import (
     PUSH_OUT,
     ROUNDS,
     SHORTEST,
-    SINGULAR,
     SINKS,
     SLOW,
     UNANSWERED,
 )
+from egs_warp.contact.response import SINGULAR
 from egs_warp.fem.batch_problem import BatchProblem, BatchTurning, inverse_of
 from egs_warp.fem.worlds import Worlds, indices
 

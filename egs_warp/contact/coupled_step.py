@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.contact.detection import ContactDetector, ContactSet, push_out_speeds
 from egs_warp.contact.points import ContactPoints
+from egs_warp.contact.response import ContactResponse, HostResponder, Iterate, Responder
 from egs_warp.fem.factors import Factors
-from egs_warp.fem.step_problem import Tangent
 from egs_warp.muscles.tension import MuscleTension
 
 ITERATIONS = 60
@@ -34,44 +32,6 @@ ANSWERED = 1e-6
 """Of dt g, which a step gives what falls: by how much less the forces of its end miss Coulomb's law."""
 UNANSWERED = 3
 """Times that forces may miss it by more before the step is given up, to be done in halves."""
-SINGULAR = 1e-7
-"""Of the mean of the Delassus operator's diagonal: more points than the cage can resolve leave it singular."""
-
-
-@dataclass(frozen=True)
-class ContactResponse:
-    """What forces at contact points bring about, by the tangent of one step."""
-
-    tangent: Tangent
-    contacts: ContactSet
-    columns: np.ndarray
-    """(3N, 3n) m/s for each newton."""
-    delassus: np.ndarray
-    """(3n, 3n) m/(N s), contact velocities for each newton."""
-
-    @classmethod
-    def of(cls, tangent: Tangent, contacts: ContactSet, columns: np.ndarray | None = None) -> ContactResponse:
-        """Of ``contacts``; ``columns`` if they are known."""
-        if columns is None:
-            columns = tangent.solve(contacts.frame.T)
-            columns *= tangent.problem.dt
-        delassus = contacts.speeds(columns)
-        return cls(tangent, contacts, columns, delassus)
-
-    @cached_property
-    def _regular(self) -> np.ndarray:
-        regular = self.delassus.copy()
-        regular[np.diag_indices_from(regular)] += SINGULAR * regular.diagonal().mean()
-        return regular
-
-    def forces(
-        self, free: np.ndarray, shift: np.ndarray, friction: float, start: np.ndarray
-    ) -> tuple[np.ndarray, float]:
-        """(n, 3) newtons that obey contact and friction if the body moves at ``free`` (3N,) without them, and the m/s
-        by which they miss that."""
-        if self.contacts.count == 0:
-            return start, 0.0
-        return coulomb_forces(self._regular, self.contacts.speeds(free), shift, friction, start)
 
 
 @dataclass(frozen=True)
@@ -104,6 +64,7 @@ class CoupledSolver:
     """Metres: points that would end deeper join the set."""
     tolerance: float = 1e-8
     """Residual over dt x weight."""
+    respond: Responder = field(default_factory=HostResponder)
 
     def shift(self, contacts: ContactSet, dt: float) -> np.ndarray:
         """(n,) m/s, the constant of the normal measure of a step of ``dt`` seconds: nothing goes deeper, and
@@ -137,9 +98,7 @@ class CoupledSolver:
             if not result.converged or len(added) == 0 or number == ROUNDS - 1:
                 break
             contacts = self.detector.contact_set(np.concatenate([contacts.points, added]), problem.state.positions)
-            new = contacts.frame[3 * len(forces) :].T
-            columns = np.hstack([response.columns, problem.dt * response.tangent.solve(new)])
-            response = ContactResponse.of(response.tangent, contacts, columns)
+            response = response.wider(contacts)
             forces = np.vstack([forces, np.zeros((len(added), 3))])
         return CoupledResult(
             velocities, response.contacts, forces, result.converged, result.residual, iterations, tangents
@@ -149,42 +108,32 @@ class CoupledSolver:
         self, response: ContactResponse, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray
     ) -> tuple[CoupledResult, ContactResponse]:
         problem, contacts = response.tangent.problem, response.contacts
-        dt = problem.dt
-        shift = self.shift(contacts, dt)
+        shift = self.shift(contacts, problem.dt)
         friction = self.detector.geometry.friction
         answered = ANSWERED * problem.unit / problem.body.mass
         tangents, unanswered, fresh = 0, 0, False
-
-        def missing(v: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, float]:
-            free = problem.residual(v, tension)
-            rest = free.ravel() - dt * contacts.pushes(f)
-            return free, float(np.linalg.norm(rest)) / problem.unit
-
-        free, size = missing(velocities, forces)
+        now = trial = response.at(tension, velocities, forces)
         recent: list[float] = []
         for iteration in range(1, ITERATIONS + 1):
-            loose = velocities.ravel() - response.tangent.solve(free.ravel())
-            wanted, missed = response.forces(loose, shift, friction, forces)
+            wanted, missed = response.forces(now.speeds, shift, friction, now.forces)
             unanswered += missed > answered
-            change = (loose + response.columns @ wanted.ravel()).reshape(velocities.shape) - velocities
             length, better = 1.0, False
             while length > SHORTEST:
-                trial, trial_forces = velocities + length * change, forces + length * (wanted - forces)
-                trial_free, trial_size = missing(trial, trial_forces)
+                trial = now.toward(wanted, length)
                 # Contacts that open, close or begin to slide change the forces at once: the residual need not fall in
                 # every step. It is no number where an element is inverted.
                 least = max((1.0 - 1e-4 * length) * max(recent, default=np.inf), self.tolerance)
-                better = np.isfinite(trial_size) and (iteration == 1 or trial_size < least)
+                better = np.isfinite(trial.size) and (iteration == 1 or trial.size < least)
                 if better:
                     break
                 length *= 0.5
             if better:
-                before, velocities, forces, free, size = size, trial, trial_forces, trial_free, trial_size
-                recent = [*recent[1 - MEMORY :], size]
+                before, now = now, trial
+                recent = [*recent[1 - MEMORY :], now.size]
                 # After a whole step the contact velocities are those that were solved for, by linearity.
-                if length == 1.0 and size <= self.tolerance and missed <= answered:
-                    return CoupledResult(velocities, contacts, forces, True, size, iteration, tangents), response
-                slow = (iteration > 1 and size > SLOW * before) or length < 1.0 or missed > answered
+                if length == 1.0 and now.size <= self.tolerance and missed <= answered:
+                    return _result(now, True, iteration, tangents), response
+                slow = (iteration > 1 and now.size > SLOW * before.size) or length < 1.0 or missed > answered
             else:
                 slow = True
                 if fresh:
@@ -193,7 +142,12 @@ class CoupledSolver:
                 break
             fresh = False
             if slow:
-                tangent = problem.tangent(self.factors, velocities, tension)
-                response = ContactResponse.of(tangent, contacts)
+                response = self.respond(problem.tangent(self.factors, now.velocities, tension), contacts)
+                now = now.by(response)
                 tangents, fresh = tangents + 1, True
-        return CoupledResult(velocities, contacts, forces, False, size, iteration, tangents), response
+        return _result(now, False, iteration, tangents), response
+
+
+def _result(end: Iterate, converged: bool, iterations: int, tangents: int) -> CoupledResult:
+    contacts = end.response.contacts
+    return CoupledResult(end.velocities, contacts, end.forces, converged, end.size, iterations, tangents)

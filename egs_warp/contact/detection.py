@@ -276,10 +276,15 @@ class ContactDetector:
         count = len(geometry.tet_from_point)
         self._gaps = wp.zeros(count, dtype=real, device=device)
         self._nearest = wp.zeros(count, dtype=int, device=device)
+        self._only_face: np.ndarray | None = None
+        if len(geometry.planes) == 1:
+            self._only_face = np.zeros(count, np.int32)
+            self._only_face.flags.writeable = False
         self._found: OrderedDict[bytes, tuple[np.ndarray, np.ndarray]] = OrderedDict()
 
     def gaps(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(P,) signed distance of every point at ``positions`` (N, 3) to the nearest solid, and (P,) its face's index.
+        """(P,) signed distance of every point at ``positions`` (N, 3) to the nearest solid, and (P,) its face's index;
+        both are kept, and not to be written to.
 
         Of a solid's faces the one counts that the point is furthest in front of, or least far behind; to ground that is
         not flat the distance is ``HeightField.gaps``.
@@ -289,8 +294,7 @@ class ContactDetector:
             self._found[place] = self._find(positions)
             while len(self._found) > _PLACES:
                 self._found.popitem(last=False)
-        gaps, nearest = self._found[place]
-        return gaps.copy(), nearest.copy()
+        return self._found[place]
 
     def _find(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         put(self._positions, positions)
@@ -316,7 +320,12 @@ class ContactDetector:
                 outputs=[self._gaps, self._nearest],
                 device=self._device,
             )
-        return self._gaps.numpy().copy(), self._nearest.numpy().copy()
+        gaps, nearest = self._gaps.numpy().copy(), self._only_face
+        if nearest is None:
+            nearest = self._nearest.numpy().copy()
+            nearest.flags.writeable = False
+        gaps.flags.writeable = False
+        return gaps, nearest
 
     def points_within(self, positions: np.ndarray, distance: float) -> np.ndarray:
         """(k, 3) contact points that are nearer than ``distance`` metres to a plane at ``positions`` (N, 3)."""

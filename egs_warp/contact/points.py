@@ -14,6 +14,10 @@ more apart.
 """
 _FINEST = 0.4
 """Edges of the cage across the smallest cells: small feet stand on several."""
+ALIKE = 1e-7
+"""Of the distance at which points take part: those whose gaps are the same but for so much lie alike, and the one next
+to the middle of its cell is taken. What is flat lies flat on the ground to rounding, which would choose otherwise on
+each machine."""
 _WIDER = 1.1
 """Growth of the cells until they are few enough."""
 
@@ -30,13 +34,17 @@ class ContactPoints:
         """``near`` metres: a cell takes part if the step may bring it so near to a solid. ``lower`` metres: by how much
         another point of a cell must lie lower to take its place.
         """
-        self.geometry, self.near, self.lower = geometry, near, lower
+        self.geometry, self.near, self.lower, self.alike = geometry, near, lower, ALIKE * near
         corners = geometry.mesh.tets[geometry.tet_from_point]
         places = np.einsum("pw,pwi->pi", geometry.weights, geometry.mesh.nodes[corners])
+        # What is as far from one seed as from another goes to the same on every machine.
+        places = self.alike * np.rint(places / self.alike)
         heights = geometry.ground_heights(places)
         sole = np.flatnonzero(heights < heights.min() + 2.0 * near)
         spacing = _FINEST * mean_edge_length(geometry.mesh)
-        self.cell_from_point = _few_cells(places, heights, sole, spacing, MOST_AT_REST)
+        self.cell_from_point, away = _few_cells(places, heights, sole, spacing, MOST_AT_REST)
+        self.order = np.lexsort((np.rint(away / self.alike), self.cell_from_point))
+        """(P,) points cell by cell, those next to its middle first."""
 
     def choose(self, previous: np.ndarray, loaded: np.ndarray, gaps: np.ndarray) -> np.ndarray:
         """(n,) points of the next step in ascending order; ``previous`` (m,) were the last's, ``loaded`` (m,) bool
@@ -44,7 +52,7 @@ class ContactPoints:
         """
         cells = self.cell_from_point
         near = gaps[previous] < 2.0 * self.near
-        lowest = self._lowest(np.flatnonzero(gaps < self.near), gaps)
+        lowest = self._lowest(gaps < self.near, gaps)
         low = np.full(cells.max() + 1, np.inf)
         low[cells[lowest]] = gaps[lowest]
         kept = previous[near & (loaded | (gaps[previous] <= low[cells[previous]] + self.lower))]
@@ -55,13 +63,22 @@ class ContactPoints:
         """(k,) the deepest point of each cell of which one ends more than ``depth`` metres deep that is not among
         ``points`` (n,).
         """
-        return self._lowest(np.setdiff1d(np.flatnonzero(gaps < -depth), points), gaps)
+        deep = gaps < -depth
+        deep[points] = False
+        return self._lowest(deep, gaps)
 
-    def _lowest(self, points: np.ndarray, gaps: np.ndarray) -> np.ndarray:
-        """(k,) of ``points`` (n,) the lowest of each cell."""
-        points = points[np.argsort(gaps[points], kind="stable")]
-        _, first = np.unique(self.cell_from_point[points], return_index=True)
-        return points[np.sort(first)]
+    def _lowest(self, among: np.ndarray, gaps: np.ndarray) -> np.ndarray:
+        """(k,) of the points ``among`` (P,) bool the lowest of each cell, the lowest of all first; of those that lie
+        alike the one next to the cell's middle."""
+        points = self.order[among[self.order]]
+        if len(points) == 0:
+            return points
+        cells, heights = self.cell_from_point[points], np.rint(gaps[points] / self.alike)
+        begins = np.flatnonzero(np.diff(cells, prepend=-1))
+        least = np.repeat(np.minimum.reduceat(heights, begins), np.diff(begins, append=len(points)))
+        found = np.flatnonzero(heights == least)
+        found = found[np.diff(cells[found], prepend=-1) > 0]
+        return points[found[np.lexsort((points[found], heights[found]))]]
 
     @staticmethod
     def matched(points: np.ndarray, before: np.ndarray, forces: np.ndarray) -> np.ndarray:
@@ -74,16 +91,18 @@ class ContactPoints:
         return matched
 
 
-def _few_cells(places: np.ndarray, heights: np.ndarray, sole: np.ndarray, spacing: float, most: int) -> np.ndarray:
-    """(P,) nearest seed of each of ``places`` (P, 3); as many seeds as are ``spacing`` metres apart, or fewer, until at
-    most ``most`` of them are nearest to points of the ``sole``.
+def _few_cells(
+    places: np.ndarray, heights: np.ndarray, sole: np.ndarray, spacing: float, most: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """(P,) nearest seed of each of ``places`` (P, 3), and how far it is (P,); as many seeds as are ``spacing`` metres
+    apart, or fewer, until at most ``most`` of them are nearest to points of the ``sole``.
     """
     seeds, apart = _spread(places, int(np.argmin(heights)), spacing)
     while True:
         first = seeds[: np.count_nonzero(apart >= spacing)]
-        nearest = np.asarray(KDTree(places[first]).query(places)[1], dtype=int)
+        away, nearest = (np.asarray(each) for each in KDTree(places[first]).query(places))
         if len(np.unique(nearest[sole])) <= most:
-            return nearest
+            return nearest.astype(int), away
         spacing *= _WIDER
 
 

@@ -2,72 +2,102 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import scipy.sparse as sparse
 import torch
 
+from egs_warp.fem.graphs import GraphStream, Recordings, Upload
 from egs_warp.fem.kept import Kept
+
+_LARGEST = 64
+"""Rows of the blocks of a triangle that are inverted at once."""
 
 
 class DenseFactors:
     """Cholesky factors L of symmetric matrices of one pattern; see ``Factors``.
 
-    L^-1 is made once a matrix: a triangular solve takes as long for one right-hand side as for a thousand, a product
-    with L^-1 a fiftieth of that.
+    L^-1 is made once a matrix, by halves: a triangular solve takes as long for one right-hand side as for a thousand, a
+    product with L^-1 a fiftieth of that.
     """
+
+    host = False
 
     def __init__(self, upper_pattern: sparse.csc_matrix | sparse.csc_array, *, device: str) -> None:
         """``upper_pattern``: upper triangle with the diagonal, entries in the order of ``update``."""
         count = len(upper_pattern.indptr) - 1
         rows = np.asarray(upper_pattern.indices, dtype=np.int64)
         columns = np.repeat(np.arange(count), np.diff(upper_pattern.indptr))
-        self._device = torch.device(device)
-        self._upper = torch.from_numpy(rows * count + columns).to(self._device)
-        self._lower = torch.from_numpy(columns * count + rows).to(self._device)
-        self._matrix, self._other = torch.zeros((2, count, count), dtype=torch.float64, device=self._device)
-        self._identity = torch.eye(count, dtype=torch.float64, device=self._device)
-        self._finite = False
-        self._factor: torch.Tensor | None = None
-        self._inverse: torch.Tensor | None = None
+        self.device = torch.device(device)
+        self.stream = GraphStream(self.device)
+        self._upper = torch.from_numpy(rows * count + columns).to(self.device)
+        self._lower = torch.from_numpy(columns * count + rows).to(self.device)
+        self._matrix, self._other = torch.zeros((2, count, count), dtype=torch.float64, device=self.device)
+        self._entries, self._diagonal = self._matrix.new_zeros(len(rows)), self._matrix.new_zeros(count)
+        self._triangle = _Triangle(count, self.device)
+        self._told = self.stream.pinned(2)
+        self._factored = self.stream.recorded(self._factor)
+        self._strain_told, self._strain_entries = Upload(self.stream, 3 * count), torch.zeros_like(self._entries)
+        self._strain_here, self._strains = self.stream.pinned(0), Recordings(self.stream)
+        self._finite = self._ready = False
 
-    def update(self, entries: np.ndarray) -> bool:
+    def update(self, entries: np.ndarray | torch.Tensor, diagonal: np.ndarray | None = None) -> bool:
         """See ``Factors``; what is not positive definite has no factors."""
-        self._factor = self._inverse = None
-        self._finite = bool(np.isfinite(entries).all())
-        if not self._finite:
-            return False
-        self._fill(self._matrix, entries)
+        with self.stream:
+            self._entries.copy_(self._take(entries))
+            if diagonal is None:
+                self._diagonal.zero_()
+            else:
+                self._diagonal.copy_(self._take(diagonal))
+            self._factored()
+            self.stream.wait()
+        finite, definite = self._told.tolist()
+        self._finite, self._ready = finite > 0.0, finite > 0.0 and definite > 0.0
+        return self._ready
+
+    def _factor(self) -> None:
+        """L^-1 of what lies in the entries and the diagonal, and whether these are finite and make it definite."""
+        self._matrix.view(-1)[self._lower] = self._entries
+        self._matrix.diagonal().add_(self._diagonal)
         factor, info = torch.linalg.cholesky_ex(self._matrix)
-        self._factor = factor if int(info) == 0 else None
-        return self.ready
+        self._triangle.invert(factor)
+        told = torch.stack([self._entries.isfinite().all(), info == 0]).to(torch.float64)
+        self._told.copy_(told, non_blocking=True)
 
     def add(self, across: np.ndarray, rates: np.ndarray) -> bool:
         """See ``Factors``; S keeps its own factor where the sum has none."""
         if not self._finite or not (np.isfinite(across).all() and np.isfinite(rates).all()):
             return False
-        directions = self._take(across)
-        factor, info = torch.linalg.cholesky_ex(torch.addmm(self._matrix, directions * self._take(rates), directions.T))
-        if int(info) != 0:
-            return False
-        self._factor, self._inverse = factor, None
+        with self.stream:
+            directions = self._take(across)
+            both = torch.addmm(self._matrix, directions * self._take(rates), directions.T)
+            factor, info = torch.linalg.cholesky_ex(both)
+            if int(info) != 0:
+                return False
+            self._triangle.invert(factor)
+        self._ready = True
         return True
 
     @property
     def ready(self) -> bool:
         """See ``Factors``."""
-        return self._factor is not None
+        return self._ready
 
     def solve(self, right: np.ndarray, kept: Kept | None = None) -> np.ndarray:
         """See ``Factors``."""
-        plain = self._give(self._solve(self._take(right)))
+        with self.stream:
+            plain = self._give(self._solve(self._take(right)))
         return plain if kept is None else kept.corrected(right, plain)
 
+    @property
+    def inverse(self) -> torch.Tensor:
+        """(n, n) L^-1, a lower triangle, on the device, always in the same place."""
+        return self._triangle.inverse
+
     def _solve(self, right: torch.Tensor) -> torch.Tensor:
-        inverse = self._inverse
-        if inverse is None:
-            assert self._factor is not None, "update() comes first"
-            inverse = self._inverse = torch.linalg.solve_triangular(self._factor, self._identity, upper=False)
-        return inverse.T @ (inverse @ right)
+        assert self._ready, "update() comes first"
+        return self.inverse.T @ (self.inverse @ right)
 
     def strain_ahead(
         self,
@@ -81,20 +111,79 @@ class DenseFactors:
         away: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """See ``Factors``."""
-        given = self._take(vectors)
-        moves = near * given + far * self._solve(self._take(weights)[:, None] * given)
-        moves[:, -1] -= self._take(away)
-        self._fill(self._other, entries)
-        return self._give(moves.T @ (self._other @ moves)), self._give(self._take(slope) @ moves)
+        count = vectors.shape[1]
+        with self.stream:
+            self._strain_told.take(slope, weights, away)
+            self._strain_entries.copy_(self._take(entries))
+            given = self._take(vectors)
+            if self._strain_here.numel() < count * count + count:
+                self._strain_here = self.stream.pinned(count * count + count)
+                self._strains.forget()
 
-    def _take(self, values: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values)).to(self._device)
+            def work() -> None:
+                found = self._strain(given, near, far)
+                self._strain_here[: len(found)].copy_(found, non_blocking=True)
+
+            if isinstance(vectors, torch.Tensor):
+                self._strains.run((given.data_ptr(), count, near, far), work)
+            else:
+                # What comes from the host lies elsewhere the next time.
+                work()
+            self.stream.wait()
+        form, along = np.split(self._strain_here.numpy()[: count * count + count], [count * count])
+        return form.reshape(count, count).copy(), along.copy()
+
+    def _strain(self, given: torch.Tensor, near: float, far: float) -> torch.Tensor:
+        """Form and slope, one behind the other, with what was told."""
+        slope, weights, away = self._strain_told.there.split([len(given)] * 3)
+        moves = near * given + far * self._solve(weights[:, None] * given)
+        moves[:, -1] -= away
+        flat = self._other.view(-1)
+        flat[self._upper] = self._strain_entries
+        flat[self._lower] = self._strain_entries
+        return torch.cat([(moves.T @ (self._other @ moves)).flatten(), slope @ moves])
+
+    def _take(self, values: np.ndarray | torch.Tensor) -> torch.Tensor:
+        if isinstance(values, torch.Tensor):
+            return values
+        return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
 
     @staticmethod
     def _give(values: torch.Tensor) -> np.ndarray:
         return values.cpu().numpy()
 
-    def _fill(self, matrix: torch.Tensor, entries: np.ndarray) -> None:
-        values, flat = self._take(entries), matrix.view(-1)
-        flat[self._upper] = values
-        flat[self._lower] = values
+
+class _Triangle:
+    """Inverses of lower triangles of one size: of small blocks on the diagonal at once, then of pairs of them."""
+
+    def __init__(self, count: int, device: torch.device) -> None:
+        pairs = max(0, math.ceil(math.log2(count / _LARGEST)))
+        # Even, for what loads two numbers at once.
+        side = 2 * math.ceil(count / 2 ** (pairs + 1))
+        size = side * 2**pairs
+        self._count, self._side, self._size = count, side, size
+        self._given = torch.eye(size, dtype=torch.float64, device=device)
+        self._made = torch.zeros_like(self._given)
+        self._identity = torch.eye(side, dtype=torch.float64, device=device)
+
+        self.inverse = self._made[:count, :count]
+
+    def invert(self, lower: torch.Tensor) -> None:
+        """``lower`` (n, n) into ``inverse``."""
+        self._given[: self._count, : self._count] = lower
+        side = self._side
+        small = _blocks(self._given, side, side, 0)
+        inverted = torch.linalg.solve_triangular(small, self._identity.expand_as(small), upper=False)
+        _blocks(self._made, side, side, 0).copy_(inverted)
+        while side < self._size:
+            first, second = (_blocks(self._made, side, 2 * side, place) for place in (0, side * (self._size + 1)))
+            below = side * self._size
+            between = torch.bmm(_blocks(self._given, side, 2 * side, below), first)
+            _blocks(self._made, side, 2 * side, below).copy_(torch.bmm(second, between).neg_())
+            side *= 2
+
+
+def _blocks(matrix: torch.Tensor, side: int, apart: int, first: int) -> torch.Tensor:
+    """(b, side, side) blocks of a square ``matrix``, each so far ``apart`` along the diagonal, from entry ``first``."""
+    size = len(matrix)
+    return matrix.as_strided((size // apart, side, side), (apart * (size + 1), size, 1), first)

@@ -12,6 +12,7 @@ import warp as wp
 from egs_warp.fem.elastic_maps import Damping, ElasticMaps, Material
 from egs_warp.fem.element_kernels import ElementKernels
 from egs_warp.fem.element_vectors import ElementVectors
+from egs_warp.fem.factors import Factors
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.muscles.tension import MuscleTension
 
@@ -25,7 +26,7 @@ class ElasticAssembly:
         self.upper_pattern = self.maps.upper_pattern
         self.diagonal_entries = self.upper_pattern.indptr[1:] - 1
         on_device = ElementVectors if self.device.is_cpu else ElementKernels
-        self._elements = on_device(self.maps, material, self.device)
+        self.elements = on_device(self.maps, material, self.device)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """It is made anew wherever a copy of it is read: its arrays lie on a device."""
@@ -33,11 +34,11 @@ class ElasticAssembly:
 
     def damping(self, positions: np.ndarray, dt: float) -> Damping:
         """Of a step of ``dt`` seconds that starts at ``positions`` (N, 3)."""
-        return Damping(dt, self._elements.start(positions))
+        return Damping(dt, self.elements.start(positions))
 
     def determinants(self, positions: np.ndarray) -> np.ndarray:
         """(T,) J = det F; not positive where an element is inverted."""
-        return self._elements.energy(positions, None)[1]
+        return self.elements.energy(positions, None)[1]
 
     def energy(self, positions: np.ndarray, damping: Damping | None = None) -> float:
         """Psi(positions), joules; infinite if an element is inverted.
@@ -45,14 +46,14 @@ class ElasticAssembly:
         With ``damping``, plus dt beta/2 sum V E':C:E', where E' = (F^T F - F0^T F0) / (2 dt) is the mean strain rate of
         the step.
         """
-        return self._elements.energy(positions, damping)[0]
+        return self.elements.energy(positions, damping)[0]
 
     def gradient(
         self, positions: np.ndarray, damping: Damping | None = None, tension: MuscleTension | None = None
     ) -> np.ndarray:
         """(N, 3) newtons: the derivative of ``energy`` by the positions, minus the internal force; with that of
         ``tension``."""
-        return self._elements.gradient(positions, damping, tension)
+        return self.elements.gradient(positions, damping, tension)
 
     def hessian_entries(
         self, positions: np.ndarray, damping: Damping | None = None, *, factor: float = 1.0, projected: bool = False
@@ -61,7 +62,22 @@ class ElasticAssembly:
 
         ``projected``: each element's part is made positive semi-definite.
         """
-        return self._elements.hessian_entries(positions, damping, factor=factor, projected=projected)
+        return self.elements.hessian_entries(positions, damping, factor=factor, projected=projected)
+
+    def entries_for(
+        self,
+        factors: Factors,
+        positions: np.ndarray,
+        damping: Damping | None,
+        *,
+        factor: float = 1.0,
+        projected: bool = False,
+    ) -> Any:
+        """``hessian_entries`` where ``factors`` want them: a tensor of torch, or an array of the host."""
+        if factors.host:
+            return self.hessian_entries(positions, damping, factor=factor, projected=projected)
+        assert isinstance(self.elements, ElementKernels)
+        return self.elements.entries_there(positions, damping, factor=factor, projected=projected)
 
     def matrix(self, entries: np.ndarray) -> sparse.csc_matrix:
         """Upper triangle (3N, 3N) with the given entries."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import scipy.sparse as sparse
 import warp as wp
@@ -13,8 +15,8 @@ from egs_warp.muscles.tension import FULL, SLACK, MuscleTension
 from egs_warp.precision import Mat33, Vec3, real
 
 
-class _MuscleLines:
-    """Kernel, index maps and scratch memory for the segments of one set of muscles."""
+class MuscleLines:
+    """Index maps and scratch memory for the segments of one set of muscles."""
 
     def __init__(self, tension: MuscleTension, device: wp.Device) -> None:
         self.rows, self._device = tension.rows, device
@@ -29,17 +31,21 @@ class _MuscleLines:
         maps = [wp.array(part.astype(np.int32), dtype=int, device=self._device) for part in (rows.indptr, rows.indices)]
         return [*maps, wp.array(rows.data, dtype=real, device=self._device)]
 
-    def pulled(self, tension: MuscleTension, positions: wp.array) -> wp.array:
-        """(M,) newtons, by which each segment draws its ends together."""
-        put(self._tensions, tension.tensions)
+    def enqueue_pulls(self, tensions: wp.array, positions: wp.array) -> wp.array:
+        """(M,) newtons, by which each segment with ``tensions`` (M,) draws its ends together."""
         launch_again(
             kernels.segment_pulls_kernel,
-            len(self._tensions),
-            inputs=[*self._lines, self._tensions, positions],
+            len(self._pulls),
+            inputs=[*self._lines, tensions, positions],
             outputs=[self._pulls],
             device=self._device,
         )
         return self._pulls
+
+    def told(self, tension: MuscleTension) -> wp.array:
+        """(M,) its tensions, where the kernels are."""
+        put(self._tensions, tension.tensions)
+        return self._tensions
 
 
 class ElementKernels:
@@ -59,11 +65,13 @@ class ElementKernels:
             )
         )
         self._no_gradients, self._no_pulls = empty(0, Mat33, device), empty(0, Vec3, device)
-        self._no_ends = [empty(0, int, device), empty(0, int, device), empty(0, real, device)]
-        self._muscles: _MuscleLines | None = None
+        self._no_shares = empty(0, real, device)
+        self._no_ends = [empty(0, int, device), empty(0, int, device), self._no_shares]
+        self._muscles: MuscleLines | None = None
         self._positions = wp.zeros(node_count, dtype=Vec3, device=device)
-        self._energies = wp.zeros(tet_count, dtype=real, device=device)
-        self._determinants = wp.zeros(tet_count, dtype=real, device=device)
+        # Both come to the host at once.
+        self._energies_and_determinants = wp.zeros((2, tet_count), dtype=real, device=device)
+        self._energies, self._determinants = self._energies_and_determinants[0], self._energies_and_determinants[1]
         self._corner_gradients = wp.zeros((tet_count, 4), dtype=Vec3, device=device)
         self._node_gradients = wp.zeros(node_count, dtype=Vec3, device=device)
         self._blocks = wp.zeros((tet_count, 16), dtype=Mat33, device=device)
@@ -105,19 +113,35 @@ class ElementKernels:
             outputs=[self._energies, self._determinants],
             device=self._device,
         )
-        return float(self._energies.numpy().sum()), self._determinants.numpy().copy()
+        energies, determinants = self._energies_and_determinants.numpy().copy()
+        return float(energies.sum()), determinants
 
     def gradient(self, positions: np.ndarray, damping: Damping | None, tension: MuscleTension | None) -> np.ndarray:
         """(N, 3) newtons."""
         put(self._positions, positions)
+        lines = None if tension is None else self.muscle_lines(tension)
+        tensions = self._no_shares if lines is None or tension is None else lines.told(tension)
+        start, dt = (self._no_gradients, 0.0) if damping is None else (damping.start, damping.dt)
+        self.enqueue_gradient(self._positions, start, dt, lines, tensions, self._node_gradients)
+        return self._node_gradients.numpy().copy()
+
+    def enqueue_gradient(
+        self,
+        positions: wp.array,
+        start: wp.array,
+        dt: float,
+        lines: MuscleLines | None,
+        tensions: wp.array,
+        gradient: wp.array,
+    ) -> None:
+        """The same into ``gradient`` (N,), of what lies on the device, with nothing that waits."""
         ends, pulls = self._no_ends, self._no_pulls
-        if tension is not None:
-            muscles = self._muscles_of(tension)
-            ends, pulls = muscles.ends, muscles.pulled(tension, self._positions)
+        if lines is not None:
+            ends, pulls = lines.ends, lines.enqueue_pulls(tensions, positions)
         launch_again(
             kernels.element_gradients_kernel,
             len(self._tets),
-            inputs=[*self._model, *self._damping_inputs(damping)],
+            inputs=[*self._model, start, positions, dt],
             outputs=[self._corner_gradients],
             device=self._device,
         )
@@ -125,20 +149,28 @@ class ElementKernels:
             kernels.gather_forces_kernel,
             len(self._positions),
             inputs=[*self._corners, *ends, self._corner_gradients, pulls],
-            outputs=[self._node_gradients],
+            outputs=[gradient],
             device=self._device,
         )
-        return self._node_gradients.numpy().copy()
 
-    def _muscles_of(self, tension: MuscleTension) -> _MuscleLines:
+    def muscle_lines(self, tension: MuscleTension) -> MuscleLines:
+        """As the kernels read the segments of ``tension``."""
         if self._muscles is None or self._muscles.rows is not tension.rows:
-            self._muscles = _MuscleLines(tension, self._device)
+            self._muscles = MuscleLines(tension, self._device)
         return self._muscles
 
     def hessian_entries(
         self, positions: np.ndarray, damping: Damping | None, *, factor: float, projected: bool
     ) -> np.ndarray:
         """(nnz,) upper entries."""
+        return self._made(positions, damping, factor, projected).numpy().copy()
+
+    def entries_there(self, positions: np.ndarray, damping: Damping | None, *, factor: float, projected: bool) -> Any:
+        """The same as a tensor of torch, where they are; torch is to work on Warp's stream."""
+        return wp.to_torch(self._made(positions, damping, factor, projected)).clone()
+
+    def _made(self, positions: np.ndarray, damping: Damping | None, factor: float, projected: bool) -> wp.array:
+        """(nnz,) upper entries, overwritten the next time."""
         put(self._positions, positions)
         hessian = kernels.element_projected_hessians_kernel if projected else kernels.element_hessians_kernel
         launch_again(
@@ -155,4 +187,4 @@ class ElementKernels:
             outputs=[self._entries],
             device=self._device,
         )
-        return self._entries.numpy().copy()
+        return self._entries

@@ -29,6 +29,8 @@ class SparseFactors:
     with muscles are wanted, and one that is next to singular has no factors.
     """
 
+    host = True
+
     def __init__(self, upper_pattern: sparse.csc_matrix | sparse.csc_array) -> None:
         """``upper_pattern``: upper triangle with the diagonal, entries in the order of ``update``."""
         self._device = wp.get_device("cpu")
@@ -70,7 +72,7 @@ class SparseFactors:
         self.negative_pivots = 0
         """Negative eigenvalues of the last matrix."""
 
-    def update(self, entries: np.ndarray) -> bool:
+    def update(self, entries: np.ndarray, diagonal: np.ndarray | None = None) -> bool:
         """See ``Factors``. The factors of an indefinite matrix can be solved with all the same; without any, ``solve``
         must not be called.
         """
@@ -78,6 +80,8 @@ class SparseFactors:
         if not np.isfinite(entries).all():
             return False
         self._entries[:] = entries
+        if diagonal is not None:
+            self._entries[self._diagonal] += diagonal
         launch_again(
             kernels.factor_kernel,
             1,
@@ -85,7 +89,7 @@ class SparseFactors:
                 self._layout.fronts,
                 len(self._layout.fronts.first),
                 self._matrix,
-                _SINGULAR * float(np.abs(entries[self._diagonal]).max()),
+                _SINGULAR * float(np.abs(self._entries[self._diagonal]).max()),
                 self._front,
                 self._layout.front,
                 self._stack,

@@ -71,7 +71,8 @@ class StepProblem:
         return self.momenta @ self.turns
 
     @cached_property
-    def _inverse_inertia(self) -> np.ndarray:
+    def turning_rates(self) -> np.ndarray:
+        """(3, 3) 1/(kg m^2), the inverse of the inertia."""
         return np.linalg.inv(self.inertia)
 
     @property
@@ -93,7 +94,7 @@ class StepProblem:
         what is stiff, whose speed at the start says nothing about the end, is at rest."""
         positions, mass = self.state.positions, self.body.node_mass
         centre = self.body.centre_of_mass(positions)
-        spin = self._inverse_inertia @ self.body.angular_momentum(positions, self.state.velocities)
+        spin = self.turning_rates @ self.body.angular_momentum(positions, self.state.velocities)
         turned = Rotation.from_rotvec(self.dt * spin).apply(positions - centre)
         return mass @ self.state.velocities / mass.sum() + (turned - (positions - centre)) / self.dt
 
@@ -104,7 +105,7 @@ class StepProblem:
 
     def spin(self, internal_gradient: np.ndarray) -> np.ndarray:
         """(3,) rad/s that the step gives back: the rigid turn whose momentum implicit Euler would have eaten."""
-        return self.dt * (self._inverse_inertia @ (self.turns.T @ internal_gradient.ravel()))
+        return self.dt * (self.turning_rates @ (self.turns.T @ internal_gradient.ravel()))
 
     def residual(self, velocities: np.ndarray, tension: MuscleTension | None) -> np.ndarray:
         """(N, 3) N s, left side less right side of the equation without contact forces; not finite where an element is
@@ -119,24 +120,22 @@ class StepProblem:
         """The derivative of the residual at ``velocities`` (N, 3), or a definite one near it, factored by
         ``factors``. Raises ``UnsolvableStepError`` where it has no factors.
         """
-        definite = factors.update(self._entries(velocities, projected=False))
+        definite = self._factor(factors, velocities, projected=False)
         if tension is not None:
             across, rates = tension.hessian(self.end_positions(velocities)).factors(least=NEGLIGIBLE)
             if factors.add(across, self.dt**2 * rates):
                 return Tangent(self, factors)
         if not definite:
-            factors.update(self._entries(velocities, projected=True))
+            self._factor(factors, velocities, projected=True)
         if not factors.ready:
             raise UnsolvableStepError(UNSOLVABLE)
         return Tangent(self, factors)
 
-    def _entries(self, velocities: np.ndarray, *, projected: bool) -> np.ndarray:
-        """Upper entries of S = (1 + dt alpha) M + dt C + dt^2 K at the end of ``velocities``."""
-        assembly = self.body.assembly
+    def _factor(self, factors: Factors, velocities: np.ndarray, *, projected: bool) -> bool:
+        """S = (1 + dt alpha) M + dt C + dt^2 K at the end of ``velocities``; whether it is definite."""
         end = self.end_positions(velocities)
-        entries = assembly.hessian_entries(end, self.damping, factor=self.dt**2, projected=projected)
-        entries[assembly.diagonal_entries] += (1.0 + self.dt * self.drag) * np.repeat(self.body.node_mass, 3)
-        return entries
+        entries = self.body.assembly.entries_for(factors, end, self.damping, factor=self.dt**2, projected=projected)
+        return factors.update(entries, (1.0 + self.dt * self.drag) * np.repeat(self.body.node_mass, 3))
 
 
 @dataclass(frozen=True)

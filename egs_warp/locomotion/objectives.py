@@ -1,7 +1,7 @@
 """What a motion asks of a step's end: weighted squares of linear functions of it (docs/concepts/motions.md).
 
-Each kind says what it measures in the end of a step: ``slopes`` (j, k) for each of k unknowns that change the end
-velocity by columns (3N, k) and the angular momentum by ``torques`` (3, k), and its ``gap`` (j,) at one end; both in
+Each kind says what it measures in the end of a step: by ``rows`` of the end velocity, or by ``slopes`` (j, k) for each
+of k unknowns that change the angular momentum by ``torques`` (3, k); and its ``gap`` (j,) at one end, as the slopes in
 units of ``speed`` m/s, sqrt(g H).
 """
 
@@ -31,12 +31,6 @@ class Objective:
     """(k,) m/s."""
     weight: float
 
-    def slopes(
-        self, problem: StepProblem, contacts: ContactSet, columns: np.ndarray, torques: np.ndarray, speed: float
-    ) -> np.ndarray:
-        """See the module."""
-        return (self.rows @ columns) / speed
-
     def gap(
         self, problem: StepProblem, contacts: ContactSet, velocities: np.ndarray, gained: np.ndarray, speed: float
     ) -> np.ndarray:
@@ -61,9 +55,7 @@ class SpinObjective:
     """(3,) kg m^2/s."""
     weight: float
 
-    def slopes(
-        self, problem: StepProblem, contacts: ContactSet, columns: np.ndarray, torques: np.ndarray, speed: float
-    ) -> np.ndarray:
+    def slopes(self, problem: StepProblem, contacts: ContactSet, torques: np.ndarray, speed: float) -> np.ndarray:
         """See the module."""
         return torques / self._unit(problem, speed)
 
@@ -92,15 +84,13 @@ class LoadObjective:
     """(k,)."""
     weight: float
 
-    def slopes(
-        self, problem: StepProblem, contacts: ContactSet, columns: np.ndarray, torques: np.ndarray, speed: float
-    ) -> np.ndarray:
+    def slopes(self, problem: StepProblem, contacts: ContactSet, torques: np.ndarray, speed: float) -> np.ndarray:
         """One row for each contact nearest to one of the nodes; the contact forces, in body weights, are the last
         unknowns.
         """
         loaded = self._loaded(contacts)
-        rows = np.zeros((len(loaded), columns.shape[1]))
-        rows[np.arange(len(loaded)), columns.shape[1] - 3 * contacts.count + 3 * loaded] = 1.0
+        rows = np.zeros((len(loaded), torques.shape[1]))
+        rows[np.arange(len(loaded)), torques.shape[1] - 3 * contacts.count + 3 * loaded] = 1.0
         return rows
 
     def gap(

@@ -9,18 +9,16 @@ from functools import cached_property
 
 import numpy as np
 
-from egs_warp.contact.coupled_step import ContactResponse
 from egs_warp.fem.body import SoftBody
 from egs_warp.fem.factors import Factors
-from egs_warp.launching import beside
 from egs_warp.locomotion.contact_pieces import ContactPieces
+from egs_warp.locomotion.linear_step import LinearStep, LinearSteps, Prospect
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.settings import LocomotionSettings
-from egs_warp.locomotion.step_cost import Horizon, LinearStep, QuadraticCost, effort_cost, objectives_cost
+from egs_warp.locomotion.step_cost import Horizon, QuadraticCost, effort_cost, objectives_cost
 from egs_warp.locomotion.strategies import Foreseen, search_program
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.muscles.muscle_set import MuscleSet
-from egs_warp.muscles.tension import GroupImpulses
 
 STEPS_A_UNIT = 19.0
 """Least number of steps in sqrt(H / g) within which a body can be steered."""
@@ -31,21 +29,6 @@ _REGULAR = 1e-7
 
 
 @dataclass(frozen=True)
-class Prospect:
-    """Where a step would end under some activations, and the tangent there."""
-
-    response: ContactResponse
-    shift: np.ndarray
-    """(n,) m/s, the constants of the contacts' normal measures."""
-    activations: np.ndarray
-    """(M,) metres."""
-    velocities: np.ndarray
-    """(N, 3) m/s."""
-    forces: np.ndarray
-    """(n, 3) newtons."""
-
-
-@dataclass(frozen=True)
 class StepProgram:
     """What is asked of a step, and what it is asked of."""
 
@@ -53,6 +36,8 @@ class StepProgram:
     foreseen: Foreseen
     linear: LinearStep
     """Of the activations of the synergies in their bounds, and of contact forces in body weights."""
+    speeds: np.ndarray
+    """(3n, k + 1) m/s of the contacts, as its velocities."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +73,7 @@ class StepPlanner:
     settings: LocomotionSettings
     factors: Factors
     """Of the effort's horizon."""
+    linear_steps: LinearSteps
 
     def plan(self, prospect: Prospect, last: np.ndarray, objectives: Sequence[AnyObjective], clock: StageClock) -> Plan:
         """Activations for what the ``objectives`` ask, after ``last`` (M,) metres of the step before."""
@@ -107,10 +93,11 @@ class StepPlanner:
         if found.x is None:
             return Plan(last, prospect.velocities, prospect.forces, found.qp_count, found.infeasible)
         activations = (self.synergies.members @ found.x[:m]) * self.muscles.bounds
-        moved = program.linear.base + program.linear.columns[:, :m] @ found.x[:m]
+        moved = program.speeds[:, -1] + program.speeds[:, :m] @ found.x[:m]
         asked = self.body.weight * found.x[m:].reshape(-1, 3)
         forces, _ = prospect.response.forces(moved, prospect.shift, self.friction, asked)
-        velocities = (moved + prospect.response.columns @ forces.ravel()).reshape(prospect.velocities.shape)
+        end = program.linear.end(np.append(found.x[:m], forces / self.body.weight))
+        velocities = end.reshape(prospect.velocities.shape)
         clock.lap("contact")
         if not problem.feasible(velocities):
             velocities = prospect.velocities
@@ -120,28 +107,17 @@ class StepPlanner:
         """What is asked of the step, linear about the ``prospect``; ``last`` (M,) are the step before's activations."""
         response, foreseen, body = prospect.response, prospect.velocities, self.body
         problem, contacts = response.tangent.problem, response.contacts
-        weight, m, speed = body.weight, self.synergies.count, body.speed_unit
-        # Without muscles and contact.
-        free = problem.residual(foreseen, None).ravel()
-        impulses = self._impulses.beside(free, problem.end_positions(foreseen), problem.dt)
+        weight, speed = body.weight, body.speed_unit
         # What the kernels of elasticity are needed for goes on in one thread alone.
-        solved, horizon = beside(
-            lambda: response.tangent.solve(impulses), lambda: Horizon.of(problem, foreseen, self.factors)
-        )
-        velocities = np.empty((free.size, m + 3 * contacts.count + 1))
-        velocities[:, :m] = solved[:, :-1]
-        np.multiply(weight, response.columns, out=velocities[:, m:-1])
-        np.subtract(foreseen.ravel(), solved[:, -1], out=velocities[:, -1])
-        torques = problem.dt * weight * contacts.speeds(problem.turns).T
-        linear = LinearStep(velocities, np.hstack([np.zeros((3, m)), torques]))
+        linear, horizon = self.linear_steps.about(prospect, lambda: Horizon.of(problem, foreseen, self.factors))
         previous = self.synergies.mean(last / self.muscles.bounds)
         cost = (
             objectives_cost(problem, linear, contacts, objectives, speed)
             + effort_cost(problem, linear, foreseen.ravel(), horizon)
-            + self._activation_cost(problem.dt, previous, linear.columns.shape[1])
+            + self._activation_cost(problem.dt, previous, linear.count)
         )
-        rows = np.hstack([contacts.speeds(solved[:, :-1]), weight * response.delassus]) / speed
-        offset = contacts.speeds(linear.base) / speed
+        speeds = linear.speeds(contacts)
+        rows, offset = speeds[:, :-1] / speed, speeds[:, -1] / speed
         offset[::3] += prospect.shift / speed
         reach = _FASTEST * problem.dt / body.time_unit
         pieces = ContactPieces(
@@ -150,7 +126,7 @@ class StepPlanner:
         )
         slip = contacts.speeds(foreseen.ravel()).reshape(-1, 3) / speed
         start = self.synergies.mean(prospect.activations / self.muscles.bounds)
-        return StepProgram(pieces, Foreseen(start, prospect.forces / weight, slip), linear)
+        return StepProgram(pieces, Foreseen(start, prospect.forces / weight, slip), linear, speeds)
 
     def _activation_cost(self, dt: float, previous: np.ndarray, count: int) -> QuadraticCost:
         """Of ``count`` unknowns that begin with the activations, how large they are and how they change from
@@ -164,10 +140,6 @@ class StepPlanner:
         diagonal[: len(previous)] = 2.0 * (size + change) + _REGULAR
         q[: len(previous)] = -2.0 * change * previous
         return QuadraticCost(np.diag(diagonal), q, float(change @ previous**2))
-
-    @cached_property
-    def _impulses(self) -> GroupImpulses:
-        return GroupImpulses(self.muscles, self.synergies.group_from_muscle)
 
     @cached_property
     def _strengths(self) -> tuple[np.ndarray, np.ndarray]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -14,33 +15,14 @@ from egs_warp.contact.detection import ContactSet
 from egs_warp.fem.elastic_maps import Damping
 from egs_warp.fem.factors import Factors
 from egs_warp.fem.step_problem import StepProblem, UnsolvableStepError
-from egs_warp.locomotion.objectives import AnyObjective
+from egs_warp.locomotion.linear_step import LinearStep
+from egs_warp.locomotion.objectives import AnyObjective, Objective
 
 EFFORT = 1.0
 """Cost of m g H of elastic and damping energy."""
 HORIZON = 0.16
 """Of sqrt(H / g): how far ahead that energy is foreseen. One step ahead, a body that holds itself bent gains next to
 nothing by letting go."""
-
-
-@dataclass(frozen=True)
-class LinearStep:
-    """End velocity and change of angular momentum of a step, linear in x = (activations, contact forces)."""
-
-    velocities: np.ndarray
-    """(3N, k + 1) m/s for each of x, and without muscles and contact."""
-    torques: np.ndarray
-    """(3, k) kg m^2/s for each of x."""
-
-    @property
-    def columns(self) -> np.ndarray:
-        """(3N, k) m/s for each of x."""
-        return self.velocities[:, :-1]
-
-    @property
-    def base(self) -> np.ndarray:
-        """(3N,) m/s without muscles and contact."""
-        return self.velocities[:, -1]
 
 
 @dataclass(frozen=True)
@@ -65,11 +47,13 @@ def objectives_cost(
     speed: float,
 ) -> QuadraticCost:
     """The weighted squares that a motion asks for, in units of ``speed`` m/s, sqrt(g H)."""
-    count = linear.columns.shape[1]
-    P, q, constant = np.zeros((count, count)), np.zeros(count), 0.0
+    form = linear.squares([each for each in objectives if isinstance(each, Objective)]) / speed**2
+    P, q, constant = form[:-1, :-1], form[:-1, -1], 0.5 * float(form[-1, -1])
     for objective in objectives:
-        rows = objective.slopes(problem, contacts, linear.columns, linear.torques, speed)
-        gap = objective.gap(problem, contacts, linear.base, np.zeros(3), speed)
+        if isinstance(objective, Objective):
+            continue
+        rows = objective.slopes(problem, contacts, linear.torques, speed)
+        gap = objective.gap(problem, contacts, np.zeros(0), np.zeros(3), speed)
         P += 2.0 * objective.weight * rows.T @ rows
         q += 2.0 * objective.weight * rows.T @ gap
         constant += objective.weight * float(gap @ gap)
@@ -101,8 +85,8 @@ class Horizon:
     """Seconds after the start of the step."""
     damping: Damping
     """Until then."""
-    entries: np.ndarray
-    """(nnz,) upper entries of the elements' stiffness at the end, made semi-definite."""
+    entries: Any
+    """(nnz,) upper entries of the elements' stiffness at the end, made semi-definite, where ``factors`` are."""
     factors: Factors
     """Of the step's matrix."""
 
@@ -113,10 +97,8 @@ class Horizon:
         body = problem.body
         assembly, time = body.assembly, max(horizon * body.time_unit, problem.dt)
         end, damping = problem.end_positions(foreseen), assembly.damping(problem.state.positions, time)
-        entries = assembly.hessian_entries(end, damping, projected=True)
-        implicit = time**2 * entries
-        implicit[assembly.diagonal_entries] += np.repeat(body.node_mass, 3)
-        factors.update(implicit)
+        entries = assembly.entries_for(factors, end, damping, projected=True)
+        factors.update(time**2 * entries, np.repeat(body.node_mass, 3))
         if not factors.ready:
             raise UnsolvableStepError("the matrix of what is foreseen has no factors")
         return cls(end, time, damping, entries, factors)

@@ -10,17 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from egs_warp.contact.coupled_step import ContactResponse, CoupledResult, CoupledSolver
+from egs_warp.contact.coupled_step import CoupledResult, CoupledSolver
 from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet
 from egs_warp.contact.points import ContactPoints
+from egs_warp.contact.response import ContactResponse, HostResponder, Responder, responder_by
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.factors import factors_on
 from egs_warp.fem.step_problem import StepProblem
+from egs_warp.locomotion.linear_step import HostLinearSteps, LinearSteps, Prospect
 from egs_warp.locomotion.objectives import AnyObjective
-from egs_warp.locomotion.planner import STEPS_A_UNIT, Plan, Prospect, StageClock, StepPlanner
+from egs_warp.locomotion.planner import STEPS_A_UNIT, Plan, StageClock, StepPlanner
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.step_cost import objectives_missed
-from egs_warp.locomotion.synergies import find_synergies
+from egs_warp.locomotion.synergies import Synergies, find_synergies
 from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleTension, muscle_columns
@@ -98,6 +100,7 @@ class LocomotionStepper:
             self._factors,
             push_out_cap=self.settings.push_out_cap * body.speed_unit,
             penetration_tolerance=self.settings.penetration_tolerance * body.height,
+            respond=responder_by(self._factors, body, muscles),
         )
         rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
         # On one thread: what is found here must not hang on how many there are.
@@ -113,6 +116,7 @@ class LocomotionStepper:
             geometry.friction,
             self.settings,
             factors_on(body.assembly.device, body.assembly.upper_pattern),
+            _linear_steps_by(self.solver.respond, muscles, synergies),
         )
 
     def with_friction(self, friction: float) -> LocomotionStepper:
@@ -140,7 +144,7 @@ class LocomotionStepper:
         """A step of ``dt`` s without muscles."""
         problem = StepProblem(self.body, state, dt)
         contacts = self._detect(problem, memory)
-        response = ContactResponse.of(problem.tangent(self._factors, problem.start, None), contacts)
+        response = self.solver.respond(problem.tangent(self._factors, problem.start, None), contacts)
         forces = self.points.matched(contacts.points, memory.points, memory.forces)
         return self.solver.solve(response, None, velocities=problem.start, forces=forces)
 
@@ -231,7 +235,7 @@ class LocomotionStepper:
         """The muscles went further than the tangent knows the way: asked again from where they have brought it. Of the
         two ends the one that costs the objectives less."""
         tangent = problem.tangent(self._factors, result.velocities, MuscleTension.of(self.muscles, plan.activations))
-        response = ContactResponse.of(tangent, result.contacts)
+        response = self.solver.respond(tangent, result.contacts)
         shift = self.solver.shift(result.contacts, problem.dt)
         prospect = Prospect(response, shift, plan.activations, result.velocities, result.forces)
         other = self.planner.plan(prospect, memory.activations, objectives, clock)
@@ -271,21 +275,20 @@ class LocomotionStepper:
         shift = self.solver.shift(contacts, problem.dt)
         # What tension adds to the stiffness is left to the solve: what is foreseen serves no better with it.
         tangent = problem.tangent(self._factors, velocities, None)
-        pushes = problem.dt * contacts.pushes(known)
-        missing = problem.residual(velocities, tension).ravel() - pushes
-        ahead = velocities - tangent.solve(missing).reshape(velocities.shape)
-        if problem.feasible(ahead):
+        ahead = self.solver.respond.ahead(tangent, contacts, tension, velocities, known)
+        if ahead is not None:
             velocities = ahead
             tangent = problem.tangent(self._factors, velocities, None)
-        response = ContactResponse.of(tangent, contacts)
+        response = self.solver.respond(tangent, contacts)
+        now = response.at(tension, velocities, known)
+        forces = known
         for _ in range(LOOKS):
-            free = velocities.ravel() - tangent.solve(problem.residual(velocities, tension).ravel())
-            forces, _ = response.forces(free, shift, self.geometry.friction, known)
-            ahead = (free + response.columns @ forces.ravel()).reshape(velocities.shape)
-            if not problem.feasible(ahead):
+            forces, _ = response.forces(now.speeds, shift, self.geometry.friction, now.forces)
+            ahead = now.toward(forces)
+            if not ahead.feasible:
                 break
-            velocities, known = ahead, forces
-        return Prospect(response, shift, activations, velocities, forces)
+            now = ahead
+        return Prospect(response, shift, activations, now.velocities, forces)
 
     def _finish(
         self, problem: StepProblem, plan: Plan, result: CoupledResult, clock: StageClock
@@ -311,3 +314,14 @@ class LocomotionStepper:
             milliseconds=clock.milliseconds,
         )
         return after, StepMemory.after(report), report
+
+
+def _linear_steps_by(respond: Responder, muscles: MuscleSet, synergies: Synergies) -> LinearSteps:
+    """Where the responses of contact are."""
+    if isinstance(respond, HostResponder):
+        return HostLinearSteps(muscles, synergies)
+    from egs_warp.contact.device_response import DeviceResponder
+    from egs_warp.locomotion.device_linear_step import DeviceLinearSteps
+
+    assert isinstance(respond, DeviceResponder)
+    return DeviceLinearSteps(respond, muscles, synergies)

@@ -39,7 +39,7 @@ def states(creature: Creature) -> list[BodyState]:
         BodyState(nodes, still),
         BodyState(nodes, still + unit * np.array([0.5, -0.3, 0.0])),
         BodyState(nodes + np.array([0.0, 0.0, 0.01]), still - unit * np.array([0.0, 0.1, 0.8])),
-        BodyState(leaning, still - unit * np.array([0.3, 0.0, 0.6])),
+        BodyState(leaning, still - unit * np.array([0.3, 0.0, 0.9])),
         BodyState(nodes + np.array([0.0, 0.0, 1.0]), still + unit * np.array([0.0, 0.2, 0.1])),
     ]
 

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from egs_warp.contact import coupled_step
-from egs_warp.contact.coupled_step import ContactResponse, CoupledResult
+from egs_warp.contact import response as responses
+from egs_warp.contact.coupled_step import CoupledResult
 from egs_warp.contact.detection import ContactDetector
+from egs_warp.contact.response import ContactResponse
 from egs_warp.fem.body import BodyState, SoftBody, make_body
 from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem, Tangent
@@ -283,7 +284,9 @@ def test_foreseen_forces_press_and_rub_no_more_than_they_may() -> None:
     for seed in range(8):
         pace = 0.6 if seed % 2 else 0.02
         free = np.random.default_rng(seed).standard_normal(x.shape) * [pace, pace, 0.1] - [0.0, 0.0, 0.05 * seed]
-        forces, missed = response.forces(free.ravel(), solver.shift(contacts, DT), 0.5, np.zeros((contacts.count, 3)))
+        forces, missed = response.forces(
+            contacts.speeds(free.ravel()), solver.shift(contacts, DT), 0.5, np.zeros((contacts.count, 3))
+        )
         speed = (contacts.frame @ free.ravel() + response.delassus @ forces.ravel()).reshape(-1, 3)
         slip, pull = np.linalg.norm(speed[:, 1:], axis=1), np.linalg.norm(forces[:, 1:], axis=1)
         assert missed < 1e-11 and forces[:, 0].min() >= 0.0 and speed[:, 0].min() > -1e-6
@@ -313,7 +316,7 @@ def test_forces_that_miss_coulombs_law_end_no_step(monkeypatch: pytest.MonkeyPat
     """The motion may obey its equation: where the forces do not theirs, another tangent is tried, and then the step is
     told to be done in halves.
     """
-    resting, answered = block(sag=0.01, damping_ratio=0.5), coupled_step.coulomb_forces
+    resting, answered = block(sag=0.01, damping_ratio=0.5), responses.coulomb_forces
     for _ in range(5):
         resting.advance(DT)
     start = resting.state, resting.points, resting.forces
@@ -325,7 +328,7 @@ def test_forces_that_miss_coulombs_law_end_no_step(monkeypatch: pytest.MonkeyPat
             found, size = answered(*given)
             return found, missed.pop(0) if missed else size
 
-        monkeypatch.setattr(coupled_step, "coulomb_forces", forces)
+        monkeypatch.setattr(responses, "coulomb_forces", forces)
         return resting.advance(DT)[1]
 
     plain = advance([])

@@ -324,8 +324,8 @@ def test_coulomb_forces_of_forty_points_under_a_rigid_base(regularisation: float
 
 
 def test_gaps_are_those_of_the_place_asked_for(device: str) -> None:
-    """Over more places than are kept, in any order, a place changed in its own memory among them; what is given is the
-    caller's to write to."""
+    """Over more places than are kept, in any order, a place changed in its own memory among them; what is given, which
+    is kept, nobody can write to."""
     mesh = block_mesh()
     geometry = contact_geometry(surface_cloud(mesh, 50, lowest=0.05), mesh, (FLOOR,), device=device)
     kept, place = ContactDetector(geometry, device=device), mesh.nodes.copy()
@@ -335,4 +335,6 @@ def test_gaps_are_those_of_the_place_asked_for(device: str) -> None:
         for _ in range(2):
             gaps, nearest = kept.gaps(place)
             assert np.array_equal(gaps, expected) and np.array_equal(nearest, faces)
-            gaps[:], nearest[:] = np.nan, -1
+            for given in (gaps, nearest):
+                with pytest.raises(ValueError, match="read-only"):
+                    given[:] = -1

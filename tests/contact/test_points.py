@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -81,3 +83,19 @@ def test_cells_are_as_few_wherever_the_ground_is() -> None:
     ]
     assert 0.5 * MOST_AT_REST < len(np.unique(points[0].cell_from_point)) <= MOST_AT_REST
     assert np.array_equal(points[0].cell_from_point, points[1].cell_from_point)
+
+
+def test_rounding_chooses_neither_cells_nor_points(geometry: ContactGeometry) -> None:
+    """The last bits of weights and gaps are others on every machine: of what lies alike on the ground the one
+    next to the middle of its cell is taken."""
+    random = np.random.default_rng(0)
+    weights = geometry.weights + 1e-15 * random.standard_normal(geometry.weights.shape)
+    other = ContactPoints(replace(geometry, weights=weights), near=NEAR, lower=1e-3)
+    points, gaps = ContactPoints(geometry, near=NEAR, lower=1e-3), gaps_of(geometry)
+    assert np.array_equal(points.cell_from_point, other.cell_from_point)
+    none = np.zeros(0, int), np.zeros(0, bool)
+    chosen = points.choose(*none, gaps)
+    for _ in range(5):
+        shaken = gaps + 1e-15 * random.standard_normal(gaps.shape)
+        assert np.array_equal(other.choose(*none, shaken), chosen)
+        assert np.array_equal(points.deeper(chosen, shaken - 0.02, 0.01), points.deeper(chosen, gaps - 0.02, 0.01))

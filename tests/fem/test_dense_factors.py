@@ -33,6 +33,25 @@ def pattern(count: int) -> sparse.csc_matrix:
 
 
 @pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("count", [1, 7, 64, 65, 130, 259])
+def test_matrices_of_every_size_are_inverted_by_halves(count: int, device: str) -> None:
+    """With what is added to their diagonals, by dense factors as by sparse ones; no number is no matrix."""
+    upper = pattern(count)
+    dense, thin = DenseFactors(upper, device=device), SparseFactors(upper)
+    random = np.random.default_rng(count)
+    right = random.normal(size=(count, 3))
+    for seed in range(3):
+        entries, diagonal = entries_of(upper, seed, 1.0), 40.0 + random.random(count)
+        assert dense.update(entries, diagonal) and thin.update(entries, diagonal)
+        half = sparse.csc_matrix((entries, upper.indices, upper.indptr), upper.shape).toarray()
+        matrix = half + np.triu(half, 1).T + np.diag(diagonal)
+        for factors in (dense, thin):
+            assert np.abs(matrix @ factors.solve(right) - right).max() < 1e-11
+    entries[-1] = np.nan
+    assert not dense.update(entries, diagonal) and not dense.ready and not thin.update(entries, diagonal)
+
+
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("diagonal", [30.0, 1.0])
 def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
     """Solutions and strains of moves to rounding, with a sum and without; an indefinite matrix has no dense factors,

@@ -11,8 +11,9 @@ from egs_warp.fem.body import BodyState, make_body
 from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.plane import Plane
+from egs_warp.locomotion.linear_step import LinearStep
 from egs_warp.locomotion.objectives import LoadObjective, SpinObjective, centre_of_mass_velocity
-from egs_warp.locomotion.step_cost import Horizon, LinearStep, QuadraticCost, effort_cost, objectives_cost
+from egs_warp.locomotion.step_cost import Horizon, QuadraticCost, effort_cost, objectives_cost
 from tests.support.meshes import block_mesh
 
 BODY = make_body(block_mesh(), Plane(np.array([0.0, 0.0, 1.0]), 0.0), device="cpu")

@@ -15,6 +15,7 @@ import warp as wp
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.fem.body import BodyState, SoftBody, make_body
+from egs_warp.fem.element_kernels import ElementKernels
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.objectives import (
@@ -184,6 +185,8 @@ def test_a_gpu_s_factors_make_the_same_hop(device: str, monkeypatch: pytest.Monk
         return made[-1]
 
     monkeypatch.setattr("egs_warp.locomotion.stepper.factors_on", dense)
+    # A GPU's kernels on a CPU, too.
+    monkeypatch.setattr("egs_warp.fem.elasticity.ElementVectors", ElementKernels)
     got, reports = run_hop(muscular_block(device, feet=corners), steps)
     assert len(made) == 2 and len(got) == len(expected) and max(len(one.forces) for one in reports) > 3
     for one, other in zip(got, expected, strict=True):

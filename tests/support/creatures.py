@@ -22,9 +22,9 @@ from tests.support.meshes import UP
 from tests.support.places import DT, FLOOR
 
 
-def coarse_pawn(*, friction: float = 0.8) -> Creature:
+def coarse_pawn(*, friction: float = 0.8, device: str = "cpu") -> Creature:
     """The built-in pawn of few Gaussians, made by the package in a cage of about 50 nodes."""
-    made = pawn(gaussian_count=3000)
+    made = pawn(gaussian_count=3000, device=device)
     return make_creature(made.cloud, plane=made.plane, nodes=50, friction=friction)
 
 

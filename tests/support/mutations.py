@@ -83,10 +83,10 @@ EQUATIONS: dict[int, Mutation] = {
             "contact/test_detection.py::test_coulomb_forces_on_random_problems",
         ),
         (
-            *(10, "the normal measure of the foreseen contact", "contact/coupled_step.py"),
+            *(10, "the normal measure of the foreseen contact", "contact/response.py"),
             *(
-                "self.contacts.speeds(free), shift, friction, start",
-                "self.contacts.speeds(free), shift + 0.1, friction, start",
+                "(self._regular, speeds, shift, friction, start)",
+                "(self._regular, speeds, shift + 0.1, friction, start)",
             ),
             "contact/test_coupled_step.py::test_foreseen_forces_press_and_rub_no_more_than_they_may",
         ),

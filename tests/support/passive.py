@@ -6,9 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from egs_warp.contact.coupled_step import ContactResponse, CoupledResult, CoupledSolver
+from egs_warp.contact.coupled_step import CoupledResult, CoupledSolver
 from egs_warp.contact.detection import ContactDetector, ContactGeometry
 from egs_warp.contact.points import ContactPoints
+from egs_warp.contact.response import ContactResponse
 from egs_warp.deformation.embedding import embed_points
 from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.sparse_factors import SparseFactors

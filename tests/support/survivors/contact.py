@@ -25,8 +25,8 @@ CONTACT = [
     ),
     Survivor(
         "contact/points.py",
-        "lowest = self._lowest(np.flatnonzero(gaps < self.near), gaps)",
-        "lowest = self._lowest(np.flatnonzero(gaps <= self.near), gaps)",
+        "lowest = self._lowest(gaps < self.near, gaps)",
+        "lowest = self._lowest(gaps <= self.near, gaps)",
         "a gap that is the very bound is as near",
     ),
     Survivor(

@@ -1,0 +1,129 @@
+"""Work of torch and Warp that is done again and again on the same memory: on a GPU one graph, launched at once."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+_MOST = 64
+"""Works of one kind that are kept: steps of other lengths and other numbers of contacts are others."""
+
+
+class GraphStream:
+    """Where torch and Warp both work: on a GPU on Warp's stream, so that neither has to wait for the other."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self._stream: Any = None
+        if device.type == "cuda":
+            self._stream = wp.stream_to_torch(wp.get_device(str(device)).stream)
+        self._entered: list[AbstractContextManager[Any]] = []
+        self._pool: Any = None
+        self._first: Any = None
+
+    def __enter__(self) -> None:
+        context = nullcontext() if self._stream is None else torch.cuda.stream(self._stream)
+        context.__enter__()
+        self._entered.append(context)
+
+    def __exit__(self, *raised: Any) -> None:
+        self._entered.pop().__exit__(*raised)
+
+    def wait(self) -> None:
+        """Until all is done that was begun."""
+        if self._stream is not None:
+            self._stream.synchronize()
+
+    def recorded(self, work: Callable[[], None]) -> Callable[[], None]:
+        """``work``, which is run as it is the first time: nothing may be compiled or made while it is recorded, the
+        second time. It must not wait for the device."""
+        return work if self._stream is None else _Graph(work, self)
+
+    def record(self, work: Callable[[], None]) -> torch.cuda.CUDAGraph:
+        """What ``work`` asks of the device, none of which is done.
+
+        What graphs make on their way lies in the same memory: they run one after the other, and leave nothing there.
+        The first is kept, since with the last of them that memory would go.
+        """
+        if self._pool is None:
+            self._pool = torch.cuda.graph_pool_handle()
+        self.wait()
+        graph = torch.cuda.CUDAGraph()
+        graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
+        try:
+            work()
+        finally:
+            graph.capture_end()
+        self._first = self._first or graph
+        return graph
+
+    def pinned(self, count: int) -> torch.Tensor:
+        """(count,) of zeros on the host, which a GPU reads and writes by itself."""
+        return torch.zeros(count, dtype=torch.float64, pin_memory=self._stream is not None)
+
+
+class Upload:
+    """Numbers that go to the device in one piece."""
+
+    def __init__(self, stream: GraphStream, count: int) -> None:
+        self.here, self._stream = stream.pinned(count), stream
+        self.there = torch.zeros(count, dtype=torch.float64, device=stream.device)
+
+    def take(self, *parts: np.ndarray) -> None:
+        """``parts`` one behind the other, zeros behind the last."""
+        here, at = self.here.numpy(), 0
+        # What was told before may still be on its way.
+        self._stream.wait()
+        for part in parts:
+            here[at : at + part.size] = part.ravel()
+            at += part.size
+        here[at:] = 0.0
+        self.send()
+
+    def send(self) -> None:
+        """What lies ``here`` now."""
+        self.there.copy_(self.here, non_blocking=True)
+
+
+class Recordings:
+    """Works by their keys, of which the last are kept."""
+
+    def __init__(self, stream: GraphStream) -> None:
+        self._stream = stream
+        self._kept: OrderedDict[Hashable, Callable[[], None]] = OrderedDict()
+
+    def run(self, key: Hashable, work: Callable[[], None]) -> None:
+        """``work``, or what was recorded of that with the same ``key``."""
+        if key not in self._kept:
+            self._kept[key] = self._stream.recorded(work)
+            while len(self._kept) > _MOST:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(key)
+        self._kept[key]()
+
+    def forget(self) -> None:
+        """All of them."""
+        self._kept.clear()
+
+
+class _Graph:
+    """Work, and its graph once there is one."""
+
+    def __init__(self, work: Callable[[], None], stream: GraphStream) -> None:
+        self._work, self._stream, self._warm = work, stream, False
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def __call__(self) -> None:
+        if not self._warm:
+            self._warm = True
+            self._work()
+            return
+        if self._graph is None:
+            self._graph = self._stream.record(self._work)
+        self._graph.replay()

@@ -1,0 +1,109 @@
+"""Responses and iterates that stay on the device are those of the host, on every device."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+from egs_warp.contact.device_response import DeviceResponder
+from egs_warp.contact.response import ContactResponse, Iterate
+from egs_warp.fem.body import BodyState
+from egs_warp.fem.step_problem import StepProblem
+from egs_warp.locomotion.stepper import LocomotionStepper
+from egs_warp.muscles.tension import MuscleTension
+from egs_warp.pipelines.creature import Creature
+from tests.support.creatures import coarse_pawn
+from tests.support.device_steps import on_device
+
+
+@pytest.fixture(scope="module")
+def creature() -> Creature:
+    return coarse_pawn()
+
+
+def pulled(creature: Creature, seed: int, strength: float = 0.3) -> MuscleTension:
+    muscles = creature.muscles
+    shares = np.random.default_rng(seed).standard_normal(muscles.segment_count)
+    return MuscleTension.of(muscles, strength * muscles.bounds * shares)
+
+
+def problems(stepper: LocomotionStepper, creature: Creature) -> list[StepProblem]:
+    """Of a body that falls and trembles, without drag and with it, in steps of two lengths."""
+    nodes, random = creature.start.positions, np.random.default_rng(0)
+    state = BodyState(nodes, np.array([0.1, 0.0, -0.3]) + 0.02 * random.standard_normal(nodes.shape))
+    return [StepProblem(stepper.body, state, dt, drag) for dt, drag in ((0.01, 0.0), (0.005, 0.3), (0.01, 0.0))]
+
+
+def assert_alike(one: Iterate, other: Iterate) -> None:
+    assert other.size == pytest.approx(one.size, rel=1e-9) and one.feasible == other.feasible
+    for got, expected in zip((other.speeds, other.velocities), (one.speeds, one.velocities), strict=True):
+        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(other.forces, one.forces, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("points", [np.array([0, 7, 13, 24]), np.zeros(0, int), np.arange(11)])
+def test_iterates_go_the_host_s_way(
+    creature: Creature, points: np.ndarray, device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Begun, tried in whole and in part, from there on, by another tangent with the muscles' stiffness in it, and on:
+    twice, for what a GPU has recorded the first time it plays the second."""
+    stepper = on_device(creature, device, monkeypatch)
+    respond, factors = stepper.solver.respond, stepper.solver.factors
+    assert isinstance(respond, DeviceResponder)
+    for number, problem in enumerate(problems(stepper, creature)):
+        contacts = creature.stepper.solver.detector.contact_set(points, problem.state.positions)
+        tension, random = pulled(creature, number), np.random.default_rng(number)
+        first, second, third = random.standard_normal((3, len(points), 3))
+        tangent = problem.tangent(factors, problem.start, None)
+        host, there = ContactResponse.of(tangent, contacts), respond(tangent, contacts)
+        columns = there.columns.cpu().numpy()
+        np.testing.assert_allclose(columns, host.columns, rtol=0, atol=1e-13 * np.abs(host.columns).max(initial=1e-300))
+        np.testing.assert_allclose(there.delassus, host.delassus, rtol=1e-10, atol=1e-16)
+        one, other = host.at(tension, problem.start, first), there.at(tension, problem.start, first)
+        assert_alike(one, other)
+        assert_alike(one.toward(second), other.toward(second))
+        one, other = one.toward(third, 0.5), other.toward(third, 0.5)
+        assert_alike(one, other)
+        one, other = one.toward(second), other.toward(second)
+        assert_alike(one, other)
+        stiff = problem.tangent(factors, one.velocities, tension)
+        host, there = ContactResponse.of(stiff, contacts), respond(stiff, contacts)
+        one, moved = one.by(host), other.by(there)
+        assert_alike(one, moved)
+        assert_alike(one.toward(first), moved.toward(first))
+        assert_alike(host.at(None, problem.start, third), there.at(None, problem.start, third))
+
+
+def test_what_inverts_an_element_is_no_number(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And the place before it is still there to go on from."""
+    stepper = on_device(creature, device, monkeypatch)
+    respond, (problem, *_) = stepper.solver.respond, problems(stepper, creature)
+    contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
+    tangent = problem.tangent(stepper.solver.factors, problem.start, None)
+    forces = np.zeros((6, 3))
+    assert respond.ahead(tangent, contacts, pulled(creature, 1, 1e4), problem.start, forces) is None
+    there, crushed = respond(tangent, contacts), np.full((6, 3), 1e4 * creature.body.weight)
+    place = there.at(None, problem.start, forces)
+    assert place.feasible and not place.toward(crushed).feasible
+    host = ContactResponse.of(tangent, contacts).at(None, problem.start, forces)
+    near = place.toward(crushed, 1e-6)
+    assert near.feasible and near.size == pytest.approx(host.toward(crushed, 1e-6).size, rel=1e-6)
+
+
+def test_what_is_at_hand_no_more_cannot_go_on(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Memory is there for one response and two places: others fail, in place of going on from what is not theirs."""
+    stepper = on_device(creature, device, monkeypatch)
+    respond, (problem, *_) = stepper.solver.respond, problems(stepper, creature)
+    contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
+    tangent = problem.tangent(stepper.solver.factors, problem.start, None)
+    old, forces = respond(tangent, contacts), np.zeros((6, 3))
+    first = old.at(None, problem.start, forces)
+    second = first.toward(forces)
+    second.toward(forces)
+    with pytest.raises(AssertionError):
+        first.toward(forces)
+    respond(tangent, contacts)
+    with pytest.raises(AssertionError):
+        old.at(None, problem.start, forces)

@@ -1,0 +1,59 @@
+"""What is recorded does again what it did, with what lies in its memory then."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+import torch
+
+from egs_warp.fem import graphs
+from egs_warp.fem.graphs import GraphStream, Recordings, Upload
+
+
+def test_recorded_work_reads_what_is_told_each_time(device: str) -> None:
+    stream = GraphStream(torch.device(device))
+    told, here = Upload(stream, 4), stream.pinned(4)
+    runs = []
+
+    def work() -> None:
+        runs.append(len(runs))
+        here.copy_((told.there @ told.there) * told.there, non_blocking=True)
+
+    again = stream.recorded(work)
+    for number in range(5):
+        with stream:
+            told.take(np.array([1.0, number]), np.array([2.0]))
+            again()
+            stream.wait()
+        expected = np.array([1.0, number, 2.0, 0.0]) * (5.0 + number**2)
+        np.testing.assert_array_equal(here.numpy(), expected)
+    # A GPU has it run once, and once to record it.
+    assert len(runs) == (5 if device == "cpu" else 2)
+
+
+def test_the_last_works_are_kept_by_their_keys(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """More of them than are kept, again and again; what is forgotten is run anew, with what it is then."""
+    monkeypatch.setattr(graphs, "_MOST", 3)
+    stream = GraphStream(torch.device(device))
+    told, here = Upload(stream, 1), stream.pinned(1)
+    works = Recordings(stream)
+
+    def run(factor: float, value: float) -> float:
+        def work() -> None:
+            here.copy_(factor * told.there, non_blocking=True)
+
+        with stream:
+            told.take(np.array([value]))
+            works.run(factor, work)
+            stream.wait()
+        return float(here[0])
+
+    for turn in range(4):
+        for factor in (1.0, 2.0, 3.0, 4.0, 4.0, 4.0):
+            assert run(factor, turn + 0.5) == factor * (turn + 0.5)
+    assert list(works._kept) == [2.0, 3.0, 4.0]
+    works.forget()
+    assert run(2.0, 1.0) == 2.0 and len(works._kept) == 1
