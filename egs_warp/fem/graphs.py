@@ -49,7 +49,8 @@ class GraphStream:
         """What ``work`` asks of the device, none of which is done.
 
         What graphs make on their way lies in the same memory: they run one after the other, and leave nothing there.
-        The first is kept, since with the last of them that memory would go.
+        The first is kept, since with the last of them that memory would go. No other thread may work on the device
+        meanwhile: what it begins would be recorded, too.
         """
         if self._pool is None:
             self._pool = torch.cuda.graph_pool_handle()
