@@ -9,10 +9,11 @@ import numpy as np
 import torch
 import warp as wp
 
+from egs_warp.contact.coulomb import ASTRAY, SOFT
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.contact.points import ContactPoints
 from egs_warp.errors import ArgumentError
-from egs_warp.fem.worlds import Worlds, launch_on, shared, tiled
+from egs_warp.fem.worlds import Worlds, indices, launch_on, shared, tiled
 from egs_warp.kernels.contact import batch_contacts as kernels
 from egs_warp.kernels.contact import coulomb
 from egs_warp.kernels.contact.gaps import point_gaps_kernel
@@ -236,9 +237,36 @@ def coulomb_forces_of_many(
     by which they miss contact and friction. ``delassus`` (c, 3K, 3K), ``free_velocity`` (c, 3K), ``shift`` (c, K),
     ``frictions`` (c,), ``start`` (c, K, 3)."""
     worlds, most, _ = start.shape
-    forces, missed, size = start.clone(), start.new_zeros(worlds), 3 * most
     if worlds == 0 or most == 0:
-        return forces, missed
+        return start.clone(), start.new_zeros(worlds)
+    found, missed = _found(counts, delassus, free_velocity, shift, frictions, start)
+    astray = indices(missed > ASTRAY)
+    if len(astray) == 0:
+        return found, missed
+    counts, operators, free, shift, frictions, forces = (
+        each[astray].contiguous() for each in (counts, delassus, free_velocity, shift, frictions, start)
+    )
+    diagonal = operators.diagonal(dim1=1, dim2=2)
+    mean = diagonal.sum(dim=1, keepdim=True) / (3 * counts[:, None])
+    for softness in (*SOFT, 0.0):
+        soft = operators + torch.diag_embed((softness * mean).expand_as(diagonal))
+        forces, left = _found(counts, soft, free, shift, frictions, forces)
+    better = left < missed[astray]
+    found[astray[better]], missed[astray[better]] = forces[better], left[better]
+    return found, missed
+
+
+def _found(
+    counts: torch.Tensor,
+    delassus: torch.Tensor,
+    free_velocity: torch.Tensor,
+    shift: torch.Tensor,
+    frictions: torch.Tensor,
+    start: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The same by the kernel alone."""
+    worlds, most, _ = start.shape
+    forces, missed, size = start.clone(), start.new_zeros(worlds), 3 * most
     vectors = start.new_empty((worlds, 5, size))
     numbers = torch.empty((worlds, 2, size), dtype=torch.int32, device=start.device)
     matrices = start.new_empty((worlds, size, (size + 4) // 4, 4))

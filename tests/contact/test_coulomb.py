@@ -4,14 +4,20 @@ tangents differ. The laws themselves are in ``test_detection.py``.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 import warp as wp
 
+from egs_warp.contact import coulomb, response
 from egs_warp.contact.batch_contacts import coulomb_forces_of_many
 from egs_warp.contact.coulomb import contacts_of, coulomb_forces
 from egs_warp.kernels.contact.coulomb import sweeps_kernel
+from egs_warp.motions.script import motion
+from egs_warp.pipelines.performance import simulate
+from tests.support.creatures import coarse_pawn
 
 COUNT = 5
 
@@ -152,3 +158,33 @@ def test_what_was_solved_before_changes_nothing() -> None:
         coulomb_forces(other, free, shift, 0.7, start)
         got, again = coulomb_forces(delassus, free, shift, 0.4, start)
         assert np.array_equal(got, expected) and again == missed
+
+
+def test_forces_of_more_points_than_nodes_are_found_where_contacts_give_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first step of a jump on 32 points of a coarse foot, from muscles at rest to those of the whole step: from the
+    forces at hand the kernel alone finds none, and where contacts give way a little it does; many worlds likewise."""
+    creature = coarse_pawn()
+    first = simulate(creature, motion("jump"), frames=2).simulation.reports[0]
+    problems: list[tuple[Any, ...]] = []
+
+    def recorded(*given: Any) -> tuple[np.ndarray, float]:
+        problems.append(given)
+        return coulomb_forces(*given)
+
+    monkeypatch.setattr(response, "coulomb_forces", recorded)
+    stepper = creature.stepper
+    _, _, report = stepper.held_step(creature.start, stepper.initial_memory(), first.activations, first.dt)
+    assert report.converged and len(problems) > 1
+    monkeypatch.setattr(coulomb, "SOFT", ())
+    alone = [coulomb_forces(*given)[1] for given in problems]
+    monkeypatch.undo()
+    together = [coulomb_forces(*given) for given in problems]
+    assert max(alone) > 1e-5 and max(missed for _, missed in together) < 1e-12
+    delassus, free, shift, friction, start = (np.stack(each) for each in zip(*problems, strict=True))
+    many, missed = coulomb_forces_of_many(
+        torch.full((len(start),), start.shape[1], dtype=torch.int32),
+        *(torch.from_numpy(each) for each in (delassus, free, shift, friction, start)),
+    )
+    assert float(missed.max()) < 1e-12
+    for world, (forces, _) in enumerate(together):
+        np.testing.assert_allclose(delassus[world] @ (many[world].numpy() - forces).ravel(), 0.0, atol=1e-9)

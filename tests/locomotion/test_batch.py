@@ -170,7 +170,8 @@ def test_what_does_not_converge_is_done_in_halves_as_alone(creature: Creature) -
 
 def test_what_a_world_does_does_not_hang_on_its_neighbours(creature: Creature) -> None:
     """Whatever the others do meanwhile: stand, fall, go in halves, or break. To rounding: products of fewer or more
-    worlds, and with more contacts, round otherwise."""
+    worlds, and with more contacts, round otherwise, and of 32 points on a coarse base an operator next to singular
+    makes that larger."""
     starts, activations, dt = rough(creature)
     stood = starts[1]
     broken = replace(stood, velocities=np.full_like(stood.velocities, np.nan))
@@ -185,7 +186,7 @@ def test_what_a_world_does_does_not_hang_on_its_neighbours(creature: Creature) -
             state, _, _ = stepper.advance(state, row[state.worlds], dt)
         ends.append(state.positions[state.worlds.tolist().index(1)].numpy())
     for end in ends[1:]:
-        np.testing.assert_allclose(end, ends[0], rtol=0, atol=1e-13 * creature.body.height)
+        np.testing.assert_allclose(end, ends[0], rtol=0, atol=1e-12 * creature.body.height)
 
 
 def test_small_chunks_change_nothing(creature: Creature) -> None:
