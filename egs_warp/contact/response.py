@@ -10,11 +10,7 @@ import numpy as np
 
 from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.contact.detection import ContactSet
-from egs_warp.fem.body import SoftBody
-from egs_warp.fem.factors import Factors
-from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import Tangent
-from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleTension
 
 SINGULAR = 1e-7
@@ -209,14 +205,3 @@ class HostIterate:
         other = replace(self, response=response)
         vars(other)["_free"] = self._free
         return other
-
-
-def responder_by(factors: Factors, body: SoftBody, muscles: MuscleSet) -> Responder:
-    """Of tangents of ``body`` by ``factors``: on the host, or where the factors are."""
-    if isinstance(factors, SparseFactors):
-        return HostResponder()
-    from egs_warp.contact.device_response import DeviceResponder
-    from egs_warp.fem.dense_factors import DenseFactors
-
-    assert isinstance(factors, DenseFactors)
-    return DeviceResponder(factors, body, muscles)

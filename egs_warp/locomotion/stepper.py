@@ -13,9 +13,10 @@ import numpy as np
 from egs_warp.contact.coupled_step import CoupledResult, CoupledSolver
 from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet
 from egs_warp.contact.points import ContactPoints
-from egs_warp.contact.response import ContactResponse, HostResponder, Responder, responder_by
+from egs_warp.contact.response import ContactResponse, HostResponder, Responder
 from egs_warp.fem.body import BodyState, SoftBody
-from egs_warp.fem.factors import factors_on
+from egs_warp.fem.factors import Factors, factors_on
+from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.linear_step import HostLinearSteps, LinearSteps, Prospect
 from egs_warp.locomotion.objectives import AnyObjective
@@ -100,7 +101,7 @@ class LocomotionStepper:
             self._factors,
             push_out_cap=self.settings.push_out_cap * body.speed_unit,
             penetration_tolerance=self.settings.penetration_tolerance * body.height,
-            respond=responder_by(self._factors, body, muscles),
+            respond=_responder_by(self._factors, body, muscles),
         )
         rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
         # On one thread: what is found here must not hang on how many there are.
@@ -314,6 +315,17 @@ class LocomotionStepper:
             milliseconds=clock.milliseconds,
         )
         return after, StepMemory.after(report), report
+
+
+def _responder_by(factors: Factors, body: SoftBody, muscles: MuscleSet) -> Responder:
+    """Of tangents of ``body`` by ``factors``: on the host, or where these are."""
+    if isinstance(factors, SparseFactors):
+        return HostResponder()
+    from egs_warp.contact.device_response import DeviceResponder
+    from egs_warp.fem.dense_factors import DenseFactors
+
+    assert isinstance(factors, DenseFactors)
+    return DeviceResponder(factors, body, muscles)
 
 
 def _linear_steps_by(respond: Responder, muscles: MuscleSet, synergies: Synergies) -> LinearSteps:
