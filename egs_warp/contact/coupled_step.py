@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -49,6 +49,8 @@ class CoupledResult:
     iterations: int
     tangents: int
     """Factorisations made on the way."""
+    response: ContactResponse
+    """By the last of them: of the contacts of the end."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,8 @@ class CoupledSolver:
         iterations = tangents = 0
         start_gaps, _ = self.detector.gaps(problem.state.positions)
         for number in range(ROUNDS):
-            result, response = self._round(response, tension, velocities, forces)
+            result = self._round(response, tension, velocities, forces)
+            response = result.response
             iterations, tangents = iterations + result.iterations, tangents + result.tangents
             velocities, forces = result.velocities, result.forces
             gaps, _ = self.detector.gaps(problem.end_positions(velocities))
@@ -100,13 +103,11 @@ class CoupledSolver:
             contacts = self.detector.contact_set(np.concatenate([contacts.points, added]), problem.state.positions)
             response = response.wider(contacts)
             forces = np.vstack([forces, np.zeros((len(added), 3))])
-        return CoupledResult(
-            velocities, response.contacts, forces, result.converged, result.residual, iterations, tangents
-        )
+        return replace(result, iterations=iterations, tangents=tangents)
 
     def _round(
         self, response: ContactResponse, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray
-    ) -> tuple[CoupledResult, ContactResponse]:
+    ) -> CoupledResult:
         problem, contacts = response.tangent.problem, response.contacts
         shift = self.shift(contacts, problem.dt)
         friction = self.detector.geometry.friction
@@ -132,7 +133,7 @@ class CoupledSolver:
                 recent = [*recent[1 - MEMORY :], now.size]
                 # After a whole step the contact velocities are those that were solved for, by linearity.
                 if length == 1.0 and now.size <= self.tolerance and missed <= answered:
-                    return _result(now, True, iteration, tangents), response
+                    return _result(now, True, iteration, tangents)
                 slow = (iteration > 1 and now.size > SLOW * before.size) or length < 1.0 or missed > answered
             else:
                 slow = True
@@ -145,9 +146,11 @@ class CoupledSolver:
                 response = self.respond(problem.tangent(self.factors, now.velocities, tension), contacts)
                 now = now.by(response)
                 tangents, fresh = tangents + 1, True
-        return _result(now, False, iteration, tangents), response
+        return _result(now, False, iteration, tangents)
 
 
 def _result(end: Iterate, converged: bool, iterations: int, tangents: int) -> CoupledResult:
-    contacts = end.response.contacts
-    return CoupledResult(end.velocities, contacts, end.forces, converged, end.size, iterations, tangents)
+    response = end.response
+    return CoupledResult(
+        end.velocities, response.contacts, end.forces, converged, end.size, iterations, tangents, response
+    )

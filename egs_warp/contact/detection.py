@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sparse
 import warp as wp
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
@@ -95,11 +96,22 @@ class ContactSet:
         return len(self.points)
 
     @cached_property
-    def frame(self) -> np.ndarray:
+    def rows(self) -> sparse.csr_matrix:
         """(3n, 3N): rows 3i, 3i+1, 3i+2 give the velocity of contact i along its normal and two tangents."""
-        frame = np.zeros((self.count, 3, self.node_count, 3))
-        frame[np.arange(self.count)[:, None], :, self.nodes] = self.weights[:, :, None, None] * self.axes[:, None]
-        return frame.reshape(3 * self.count, 3 * self.node_count)
+        shares = self.weights[:, None, :, None] * self.axes[:, :, None]
+        places = 3 * self.nodes[:, None, :, None] + np.arange(3, dtype=np.int32)
+        offsets = np.arange(0, shares.size + 1, 12, dtype=np.int32)
+        indices = np.broadcast_to(places, shares.shape).reshape(-1)
+        return sparse.csr_matrix((shares.reshape(-1), indices, offsets), (3 * self.count, 3 * self.node_count))
+
+    @cached_property
+    def _columns(self) -> sparse.csc_matrix:
+        return self.rows.T
+
+    @property
+    def frame(self) -> np.ndarray:
+        """(3n, 3N) ``rows`` with their zeros."""
+        return self.rows.toarray()
 
     @property
     def nearest(self) -> np.ndarray:
@@ -107,17 +119,12 @@ class ContactSet:
         return self.nodes[np.arange(self.count), np.argmax(self.weights, axis=1)]
 
     def speeds(self, velocities: np.ndarray) -> np.ndarray:
-        """``frame`` times nodal velocities (3N,) or (3N, k), by the four nodes that each contact knows."""
-        each = velocities[3 * self.nodes[:, :, None] + np.arange(3)].reshape(self.count, 4, velocities[:3].size)
-        at_points = (self.weights[:, None, :] @ each).reshape(self.count, 3, velocities[0].size)
-        return (self.axes @ at_points).reshape(3 * self.count, *velocities.shape[1:])
+        """``rows`` times nodal velocities (3N,) or (3N, k)."""
+        return self.rows @ velocities
 
     def pushes(self, forces: np.ndarray) -> np.ndarray:
-        """(3N,) ``frame`` transposed times ``forces`` (n, 3), newtons on each node's axes."""
-        at_points = (forces[:, None, :] @ self.axes)[:, 0]
-        nodal = np.zeros((self.node_count, 3))
-        np.add.at(nodal, self.nodes, self.weights[:, :, None] * at_points[:, None, :])
-        return nodal.ravel()
+        """(3N,) ``rows`` transposed times ``forces`` (n, 3), newtons on each node's axes."""
+        return self._columns @ forces.ravel()
 
     def end_gaps(self, dt: float, velocities: np.ndarray) -> np.ndarray:
         """(n,) gap after a step of ``dt`` with nodal end velocities (N, 3), to the tangent plane of the start where the
@@ -272,10 +279,13 @@ class ContactDetector:
             coefficients = wp.array(geometry.field.coefficients, dtype=real, device=device)
             axes, origin = Mat33(*geometry.field.axes.ravel().tolist()), Vec3(*geometry.field.origin.tolist())
             self._field = [axes, origin, real(geometry.field.spacing), coefficients]
+        self._corners = wp.array(geometry.mesh.tets[geometry.tet_from_point], dtype=wp.vec4i, device=device)
+        self._heights = wp.zeros(len(rows) * len(geometry.mesh.nodes), dtype=real, device=device)
         self._positions = wp.zeros(len(geometry.mesh.nodes), dtype=Vec3, device=device)
         count = len(geometry.tet_from_point)
         self._gaps = wp.zeros(count, dtype=real, device=device)
         self._nearest = wp.zeros(count, dtype=int, device=device)
+        self._frames = np.array([[plane.normal, *plane.tangents()] for plane in geometry.planes]).reshape(-1, 3, 3)
         self._only_face: np.ndarray | None = None
         if len(geometry.planes) == 1:
             self._only_face = np.zeros(count, np.int32)
@@ -298,20 +308,17 @@ class ContactDetector:
 
     def _find(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         put(self._positions, positions)
-        launch_again(
-            kernels.point_gaps_kernel,
-            len(self.geometry.tet_from_point),
-            inputs=[
-                self._tets,
-                self._tet_from_point,
-                self._weights,
-                self._planes,
-                self._solids,
-                self._positions,
-            ],
-            outputs=[self._gaps, self._nearest],
-            device=self._device,
-        )
+        solids, outputs = [self._planes, self._solids, self._positions], [self._gaps, self._nearest]
+        if self._device.is_cpu:
+            inputs = [self._corners, self._weights, *solids]
+            launch_again(
+                kernels.all_gaps_kernel, 1, inputs=inputs, outputs=[self._heights, *outputs], device=self._device
+            )
+        else:
+            inputs = [self._tets, self._tet_from_point, self._weights, *solids]
+            launch_again(
+                kernels.point_gaps_kernel, len(self._gaps), inputs=inputs, outputs=outputs, device=self._device
+            )
         if self._field:
             wp.launch(
                 ground_gaps_kernel,
@@ -339,7 +346,7 @@ class ContactDetector:
         nodes = self.geometry.mesh.tets[self.geometry.tet_from_point[points]]
         weights = self.geometry.weights[points]
         faces = nearest[points]
-        axes = np.stack([np.stack([p.normal, *p.tangents()]) for p in self.geometry.planes])[faces]
+        axes = self._frames[faces]
         if self.geometry.field is not None:
             uneven = faces == 0
             places = np.einsum("nw,nwi->ni", weights[uneven], positions[nodes[uneven]])

@@ -93,8 +93,7 @@ class DeviceResponder:
             return
         self._problem = problem
         state = problem.state
-        arms = state.positions - problem.body.centre_of_mass(state.positions)
-        self._start.take(state.positions, state.velocities, arms, problem.turns, problem.turning_rates)
+        self._start.take(state.positions, state.velocities, problem.arms, problem.turns, problem.turning_rates)
         wp.copy(self.gradients, problem.damping.start)
 
     def enqueue_gradient(self, ends: wp.array, dt: float, tensions: wp.array, gradient: wp.array) -> None:

@@ -45,6 +45,7 @@ class ContactPoints:
         self.cell_from_point, away = _few_cells(places, heights, sole, spacing, MOST_AT_REST)
         self.order = np.lexsort((np.rint(away / self.alike), self.cell_from_point))
         """(P,) points cell by cell, those next to its middle first."""
+        self._cells = int(self.cell_from_point.max()) + 1
 
     def choose(self, previous: np.ndarray, loaded: np.ndarray, gaps: np.ndarray) -> np.ndarray:
         """(n,) points of the next step in ascending order; ``previous`` (m,) were the last's, ``loaded`` (m,) bool
@@ -53,7 +54,7 @@ class ContactPoints:
         cells = self.cell_from_point
         near = gaps[previous] < 2.0 * self.near
         lowest = self._lowest(gaps < self.near, gaps)
-        low = np.full(cells.max() + 1, np.inf)
+        low = np.full(self._cells, np.inf)
         low[cells[lowest]] = gaps[lowest]
         kept = previous[near & (loaded | (gaps[previous] <= low[cells[previous]] + self.lower))]
         fresh = lowest[~np.isin(cells[lowest], cells[kept])]
@@ -70,9 +71,9 @@ class ContactPoints:
     def _lowest(self, among: np.ndarray, gaps: np.ndarray) -> np.ndarray:
         """(k,) of the points ``among`` (P,) bool the lowest of each cell, the lowest of all first; of those that lie
         alike the one next to the cell's middle."""
+        if not among.any():
+            return self.order[:0]
         points = self.order[among[self.order]]
-        if len(points) == 0:
-            return points
         cells, heights = self.cell_from_point[points], np.rint(gaps[points] / self.alike)
         begins = np.flatnonzero(np.diff(cells, prepend=-1))
         least = np.repeat(np.minimum.reduceat(heights, begins), np.diff(begins, append=len(points)))
@@ -86,7 +87,7 @@ class ContactPoints:
         others.
         """
         matched = np.zeros((len(points), 3))
-        _, now, then = np.intersect1d(points, before, return_indices=True)
+        now, then = np.nonzero(points[:, None] == before)
         matched[now] = forces[then]
         return matched
 

@@ -10,6 +10,8 @@ import numpy as np
 
 from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.contact.detection import ContactSet
+from egs_warp.contact.newton_room import NewtonRoom, NewtonState, address_of, newton_room
+from egs_warp.fem.element_vectors import ElementVectors
 from egs_warp.fem.step_problem import Tangent
 from egs_warp.muscles.tension import MuscleTension
 
@@ -38,6 +40,11 @@ class ContactResponse:
         return cls(tangent, contacts, columns, delassus)
 
     @cached_property
+    def columns_at(self) -> int:
+        """Address of the ``columns`` on the host."""
+        return address_of(self.columns)
+
+    @cached_property
     def _regular(self) -> np.ndarray:
         regular = self.delassus.copy()
         regular[np.diag_indices_from(regular)] += SINGULAR * regular.diagonal().mean()
@@ -60,6 +67,8 @@ class ContactResponse:
 
     def at(self, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray) -> Iterate:
         """The step's equation at ``velocities`` (N, 3) and contact ``forces`` (n, 3), under ``tension``."""
+        if _elements_are_here(self.tangent):
+            return VectorIterate.at(self, tension, velocities, forces)
         return HostIterate(self, tension, velocities, forces)
 
 
@@ -100,6 +109,11 @@ class HostResponder:
     ) -> np.ndarray | None:
         """See ``Responder``. One right-hand side, where a response has three for each contact."""
         problem = tangent.problem
+        if _elements_are_here(tangent):
+            room, state = newton_room(contacts.node_count), NewtonState.of(contacts, velocities, forces)
+            room.trial(problem, tension, state)
+            room.newton(tangent, state, rest=True)
+            return state.loose if problem.feasible(state.loose) else None
         missing = problem.residual(velocities, tension).ravel() - problem.dt * contacts.pushes(forces)
         ahead = velocities - tangent.solve(missing).reshape(velocities.shape)
         return ahead if problem.feasible(ahead) else None
@@ -147,9 +161,73 @@ class Iterate(Protocol):
         ...
 
 
+def _elements_are_here(tangent: Tangent) -> bool:
+    """Whether elements and factors both are on a CPU."""
+    return isinstance(tangent.problem.body.assembly.elements, ElementVectors)
+
+
+@dataclass(frozen=True, eq=False)
+class VectorIterate:
+    """``Iterate`` by kernels of a CPU, which say what ``HostIterate`` says."""
+
+    response: ContactResponse
+    tension: MuscleTension | None
+    state: NewtonState
+    size: float
+
+    @classmethod
+    def at(
+        cls, response: ContactResponse, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray
+    ) -> Self:
+        """At ``velocities`` (N, 3) and ``forces`` (n, 3)."""
+        state = NewtonState.of(response.contacts, velocities, forces)
+        return cls(response, tension, *_room_of(response).trial(response.tangent.problem, tension, state))
+
+    @property
+    def velocities(self) -> np.ndarray:
+        """See ``Iterate``."""
+        return self.state.velocities
+
+    @property
+    def forces(self) -> np.ndarray:
+        """See ``Iterate``."""
+        return self.state.forces
+
+    @property
+    def feasible(self) -> bool:
+        """See ``Iterate``."""
+        return bool(np.isfinite(self.size))
+
+    @cached_property
+    def _after(self) -> NewtonState:
+        """The state, with what is after a Newton step without contact forces."""
+        _room_of(self.response).newton(self.response.tangent, self.state)
+        return self.state
+
+    @property
+    def speeds(self) -> np.ndarray:
+        """See ``Iterate``."""
+        return self._after.speeds
+
+    def toward(self, forces: np.ndarray, length: float = 1.0) -> Self:
+        """See ``Iterate``."""
+        response = self.response
+        step = response.columns_at, forces, length
+        found = _room_of(response).trial(response.tangent.problem, self.tension, self._after, step)
+        return type(self)(response, self.tension, *found)
+
+    def by(self, response: ContactResponse) -> Self:
+        """See ``Iterate``."""
+        return replace(self, response=response, state=self.state.copy())
+
+
+def _room_of(response: ContactResponse) -> NewtonRoom:
+    return newton_room(response.contacts.node_count)
+
+
 @dataclass(frozen=True)
 class HostIterate:
-    """``Iterate`` in arrays of the host, each made when it is asked for."""
+    """``Iterate`` in arrays of the host, each made when it is asked for: for elements of a GPU without torch."""
 
     response: ContactResponse
     tension: MuscleTension | None

@@ -31,7 +31,8 @@ class ElementVectors:
         elements.volumes = wp.array(np.r_[maps.volumes, np.zeros(more)], dtype=real, device=device)
         elements.entries = wp.array(_entries_of_pairs(maps)[chosen].ravel(), dtype=int, device=device)
         elements.mu, elements.lam, elements.damping_time = material.mu, material.lam, material.damping_time
-        self._elements = elements
+        self.elements = elements
+        """As the kernels read them."""
         self._no_lines = _no_lines(device)
         self._muscles: _Muscles | None = None
         self._no_start = empty(0, real, device)
@@ -48,7 +49,7 @@ class ElementVectors:
         launch_again(
             kernels.starts_kernel,
             1,
-            inputs=[self._elements, self._positions_array],
+            inputs=[self.elements, self._positions_array],
             outputs=[start],
             device=self._device,
         )
@@ -64,7 +65,7 @@ class ElementVectors:
         launch_again(
             kernels.energy_kernel,
             1,
-            inputs=[self._elements, *self._given(positions, damping)],
+            inputs=[self.elements, *self._given(positions, damping)],
             outputs=[self._energy_array, self._determinants_array],
             device=self._device,
         )
@@ -72,17 +73,20 @@ class ElementVectors:
 
     def gradient(self, positions: np.ndarray, damping: Damping | None, tension: MuscleTension | None) -> np.ndarray:
         """(N, 3) newtons."""
-        lines = self._no_lines if tension is None else self._lines_of(tension)
+        lines = self.lines_of(tension)
         launch_again(
             kernels.gradient_kernel,
             1,
-            inputs=[self._elements, lines, *self._given(positions, damping)],
+            inputs=[self.elements, lines, *self._given(positions, damping)],
             outputs=[self._gradient_array],
             device=self._device,
         )
         return self._gradient.copy()
 
-    def _lines_of(self, tension: MuscleTension) -> Any:
+    def lines_of(self, tension: MuscleTension | None) -> Any:
+        """The segments of ``tension``, or none, as the kernels read them."""
+        if tension is None:
+            return self._no_lines
         if self._muscles is None or self._muscles.rows is not tension.rows:
             self._muscles = _Muscles(tension, self._device)
         self._muscles.tensions[:] = tension.tensions
@@ -95,7 +99,7 @@ class ElementVectors:
         launch_again(
             kernels.hessian_kernel,
             1,
-            inputs=[self._elements, *self._given(positions, damping), factor, int(projected), OFF, SWEEPS],
+            inputs=[self.elements, *self._given(positions, damping), factor, int(projected), OFF, SWEEPS],
             outputs=[self._entries_array],
             device=self._device,
         )

@@ -118,7 +118,7 @@ class SparseFactors:
         positive, inverse = inverse_and_positives(small)
         if self.negative_pivots + positive != int((rates > 0.0).sum()):
             return False
-        self._added = across, through, inverse
+        self._added = np.ascontiguousarray(across), np.ascontiguousarray(through), np.ascontiguousarray(inverse)
         return True
 
     @property
@@ -186,6 +186,16 @@ class SparseFactors:
             beside(launch, launch)
         else:
             launch()
+
+    def solving_one(self, kept: Kept) -> tuple[list[Any], list[int], wp.array]:
+        """What ``kernels.fem.supernodal.solved_one`` is told of the factors and of what is ``kept``; of what is added
+        the directions, their number first, with addresses of what ``add`` has made of them; memory to work in."""
+        assert self._ready, "update() comes first"
+        added = [0, 0, 0, 0]
+        if self._added is not None:
+            across, through, small = self._added
+            added = [across.shape[1], across.ctypes.data, through.ctypes.data, small.ctypes.data]
+        return [*self._solving, self._keeping.of(kept)], added, self._room_for(1)
 
     @property
     def _solving(self) -> list[Any]:

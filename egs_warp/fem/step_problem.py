@@ -54,11 +54,13 @@ class StepProblem:
 
     @cached_property
     def turns(self) -> np.ndarray:
-        """(3N, 3) nodal velocities e_k x r of the rigid turns about the centre of mass, arms r at the start of the
-        step.
-        """
-        arms = self.state.positions - self.body.centre_of_mass(self.state.positions)
-        return turning(arms).reshape(-1, 3)
+        """(3N, 3) nodal velocities e_k x r of the rigid turns about the centre of mass, ``arms`` r."""
+        return turning(self.arms).reshape(-1, 3)
+
+    @cached_property
+    def arms(self) -> np.ndarray:
+        """(N, 3) metres from the centre of mass at the start of the step."""
+        return self.state.positions - self.body.centre_of_mass(self.state.positions)
 
     @cached_property
     def momenta(self) -> np.ndarray:
@@ -151,7 +153,8 @@ class Tangent:
     factors: Factors
 
     @cached_property
-    def _kept(self) -> Kept:
+    def kept(self) -> Kept:
+        """Of the rigid turns of the step."""
         problem = self.problem
         ratio, momenta = 1.0 + problem.dt * problem.drag, np.ascontiguousarray(problem.momenta.T)
         turned = self.factors.solve(momenta)
@@ -159,4 +162,4 @@ class Tangent:
 
     def solve(self, impulses: np.ndarray) -> np.ndarray:
         """(3N,) or (3N, m) m/s that ``impulses`` of that shape, N s, bring about."""
-        return self.factors.solve(impulses, self._kept)
+        return self.factors.solve(impulses, self.kept)

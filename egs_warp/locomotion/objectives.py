@@ -314,7 +314,7 @@ def held_contacts(contacts: ContactSet, loads: np.ndarray, weight: float) -> Obj
     """That no contact slides, each weighted by its share of the weight in ``loads`` (n,)."""
     shares = np.sqrt(np.repeat(loads, 3))
     shares[::3] = 0.0
-    rows = sparse.csr_matrix(shares[:, None] * contacts.frame)
+    rows = sparse.csr_matrix(contacts.rows.multiply(shares[:, None]))
     return Objective("hold", rows, np.zeros(3 * contacts.count), weight)
 
 

@@ -235,8 +235,7 @@ class LocomotionStepper:
     ) -> tuple[Plan, CoupledResult]:
         """The muscles went further than the tangent knows the way: asked again from where they have brought it. Of the
         two ends the one that costs the objectives less."""
-        tangent = problem.tangent(self._factors, result.velocities, MuscleTension.of(self.muscles, plan.activations))
-        response = self.solver.respond(tangent, result.contacts)
+        response = result.response
         shift = self.solver.shift(result.contacts, problem.dt)
         prospect = Prospect(response, shift, plan.activations, result.velocities, result.forces)
         other = self.planner.plan(prospect, memory.activations, objectives, clock)

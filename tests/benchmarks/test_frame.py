@@ -41,11 +41,14 @@ def test_steps_are_told_by_their_contacts(frame: ModuleType) -> None:
 
 
 def test_aims(frame: ModuleType) -> None:
-    """541 nodes take 35.7 ms in the mean: ten times as fast as 360 ms, not as 350."""
+    """541 nodes take 35.7 ms in the mean: ten times as fast as 360 ms, not as 350; captures count as the pawn does."""
     for old, fast in ((360.0, True), (350.0, False)):
         aims = frame.summary(records(), old, "cpu")["aims"]
         assert (aims["cpu_541"], aims["cpu_10x"], aims["cpu_250_realtime"]) == (True, fast, True)
         assert aims["gpu_541"] is aims["gpu_1000"] is aims["gpu_frame_60hz"] is None
+    for mean, fast in ((35.0, True), (36.0, False)):
+        captures = [{"body": "monkey", "nodes": 800, "mean": mean, "old_ms": 350.0}]
+        assert frame.summary(records(), 360.0, "cpu", captures)["aims"]["cpu_10x"] == fast
     assert not frame.summary(records(2.0), 400.0, "cpu")["aims"]["cpu_541"]
     assert frame.summary(records(), None, "cpu")["why_null"]["cpu_10x"]
 

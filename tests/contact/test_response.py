@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egs_warp.contact.response import ContactResponse, HostResponder
+from egs_warp.contact.response import ContactResponse, HostIterate, HostResponder
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
@@ -100,3 +100,24 @@ def test_a_step_ahead_is_newton_s_with_forces_as_they_are(creature: Creature) ->
     torn = MuscleTension(tension.rows, 1e4 * tension.tensions, tension.rest_lengths)
     assert respond.ahead(tangent, contacts, torn, problem.start, forces) is None
     assert not respond(tangent, contacts).at(torn, problem.start, forces).toward(forces).feasible
+
+
+@pytest.mark.parametrize("pulled", [True, False])
+def test_kernels_say_what_arrays_say(creature: Creature, pulled: bool) -> None:
+    """Sizes, contact speeds and Newton steps, whole and in part; with the muscles' stiffness in the tangent, too."""
+    problem, tension, random = falling(creature)
+    contacts = creature.stepper.solver.detector.contact_set(np.arange(0, 36, 5), problem.state.positions)
+    stiff = tension if pulled else None
+    tangent = problem.tangent(SparseFactors(creature.body.assembly.upper_pattern), problem.start, stiff)
+    response = ContactResponse.of(tangent, contacts)
+    first, wanted = 0.1 * creature.body.weight * random.standard_normal((2, contacts.count, 3))
+    arrays = HostIterate(response, tension, problem.start, first)
+    vectors = response.at(tension, problem.start, first)
+    assert type(vectors) is not HostIterate
+    for length in (1.0, 0.3, None):
+        assert vectors.feasible and vectors.size == pytest.approx(arrays.size, rel=1e-11)
+        np.testing.assert_allclose(vectors.speeds, arrays.speeds, rtol=0, atol=1e-12 * np.abs(arrays.speeds).max())
+        np.testing.assert_allclose(vectors.velocities, arrays.velocities, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(vectors.forces, arrays.forces, rtol=1e-14)
+        if length is not None:
+            vectors, arrays = vectors.toward(wanted, length), arrays.toward(wanted, length)

@@ -118,6 +118,18 @@ def parts(creature: Creature) -> tuple[SoftBody, MuscleSet, ContactGeometry]:
     return creature.body, creature.muscles, creature.geometry
 
 
+def on_its_rim(geometry: ContactGeometry, count: int = 12) -> ContactGeometry:
+    """With no contact points but ``count`` of the base, the outermost all around."""
+    corners = geometry.mesh.nodes[geometry.mesh.tets[geometry.tet_from_point]]
+    places = np.einsum("pw,pwi->pi", geometry.weights, corners)
+    heights = geometry.ground_heights(places)
+    base = np.flatnonzero(heights < 0.01)
+    angles = 2.0 * np.pi * np.arange(count) / count
+    reach = (places[base, :2] - places[base, :2].mean(axis=0)) @ np.stack([np.cos(angles), np.sin(angles)])
+    chosen = np.unique(base[np.argmax(reach, axis=0)])
+    return replace(geometry, tet_from_point=geometry.tet_from_point[chosen], weights=geometry.weights[chosen])
+
+
 def rough(creature: Creature) -> tuple[list[BodyState], np.ndarray, float]:
     """Starts, activations (2, 3, M) and the step of two worlds that fall on their ground with all muscles at odds, in
     steps too long for that, and one between them that stands."""
@@ -170,9 +182,10 @@ def test_what_does_not_converge_is_done_in_halves_as_alone(creature: Creature) -
 
 def test_what_a_world_does_does_not_hang_on_its_neighbours(creature: Creature) -> None:
     """Whatever the others do meanwhile: stand, fall, go in halves, or break. To rounding: products of fewer or more
-    worlds, and with more contacts, round otherwise, and of 32 points on a coarse base an operator next to singular
-    makes that larger."""
+    worlds, and with more contacts, round otherwise. It stands on its rim: of 32 points on so coarse a base an operator
+    next to singular makes rounding a thousand times as large."""
     starts, activations, dt = rough(creature)
+    geometry = on_its_rim(creature.geometry)
     stood = starts[1]
     broken = replace(stood, velocities=np.full_like(stood.velocities, np.nan))
     given = np.repeat(0.1 * activations[:, :1], 3, axis=1)
@@ -180,13 +193,13 @@ def test_what_a_world_does_does_not_hang_on_its_neighbours(creature: Creature) -
     other[:, 1] = given[:, 1]
     ends = []
     for states, muscles in (([stood] * 3, given), (starts, other), ([broken, stood, stood], given)):
-        stepper = BatchStepper(*parts(creature), FRICTIONS)
+        stepper = BatchStepper(creature.body, creature.muscles, geometry, FRICTIONS)
         state = stepper.start(states)
         for row in muscles:
             state, _, _ = stepper.advance(state, row[state.worlds], dt)
         ends.append(state.positions[state.worlds.tolist().index(1)].numpy())
     for end in ends[1:]:
-        np.testing.assert_allclose(end, ends[0], rtol=0, atol=1e-12 * creature.body.height)
+        np.testing.assert_allclose(end, ends[0], rtol=0, atol=1e-13 * creature.body.height)
 
 
 def test_small_chunks_change_nothing(creature: Creature) -> None:

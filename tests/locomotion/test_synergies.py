@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -33,6 +35,11 @@ def test_alike_are_grouped_and_few_are_left_alone() -> None:
     expected = [values[found.group_from_muscle == g].mean() for g in range(5)]
     assert np.allclose(found.mean(values), expected)
     assert np.array_equal(found.members @ np.arange(5.0), found.group_from_muscle)
+    # As many as the cage has nodes for: 0.32 of them, between 80 and 120.
+    for nodes, most in ((100, 80), (250, 80), (300, 96), (2000, 120)):
+        many = replace(muscles, segments=np.tile(muscles.segments, (1 + 150 // count, 1)))
+        made = random.standard_normal((3 * nodes, many.segment_count))
+        assert find_synergies(many, made, np.ones(nodes)).count == most
     alone = find_synergies(muscles, effects, body.node_mass, most=count)
     assert alone.count == count and np.array_equal(alone.group_from_muscle, np.arange(count))
 

@@ -47,8 +47,8 @@ EQUATIONS: dict[int, Mutation] = {
             "contact/test_detection.py::test_endpoints_are_shortened_to_the_plane_at_rest",
         ),
         (
-            *(4, "the weight's factor dt", "fem/step_problem.py"),
-            *("- self.dt * self.body.gravity - turned", "- 1.01 * self.dt * self.body.gravity - turned"),
+            *(4, "the weight's factor dt", "contact/newton_room.py"),
+            *("state.velocities + problem.dt * problem", "state.velocities + 1.01 * problem.dt * problem"),
             "fem/test_step_problem.py::test_free_fall_follows_the_discrete_parabola",
         ),
         (
@@ -57,11 +57,8 @@ EQUATIONS: dict[int, Mutation] = {
             "fem/test_elasticity.py::test_gradient_is_derivative_of_energy",
         ),
         (
-            *(6, "the drag on the end velocity", "fem/step_problem.py"),
-            *(
-                "change = (1.0 + self.dt * self.drag) * velocities",
-                "change = velocities + self.dt * self.drag * self.state.velocities",
-            ),
+            *(6, "the drag on the end velocity", "kernels/contact/iterate_cpu.py"),
+            *("(ratio * v[i + t] - known[i + t]", "(v[i + t] + (ratio - 1.0) * known[i + t] - known[i + t]"),
             "fem/test_step_problem.py::test_drag_slows_free_flight_exponentially",
         ),
         (
@@ -71,7 +68,7 @@ EQUATIONS: dict[int, Mutation] = {
         ),
         (
             *(8, "the plane's offset", "kernels/contact/gaps.py"),
-            *("plane[2] * x[2] + plane[3]", "plane[2] * x[2] - plane[3]"),
+            *("plane[2] * x[3 * i + 2] + plane[3]", "plane[2] * x[3 * i + 2] - plane[3]"),
             "contact/test_detection.py::test_gaps_kernel_equals_its_twin",
         ),
         (

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from egs_warp.kernels.vectors import on_cpu
 from egs_warp.precision import Vec3, Vec4, real
 
 wp.set_module_options({"enable_backward": False})
@@ -50,3 +51,76 @@ def point_gaps_kernel(
             solid_gap = real(-wp.inf)
     gaps_out[point] = nearest_gap
     planes_out[point] = nearest
+
+
+@wp.func_native(
+    on_cpu(
+        """
+    const int planes_count = planes.shape[0], nodes_count = positions.shape[0], points = nodes.shape[0];
+    const double *const x = (const double*)positions.data, *const w = (const double*)weights.data;
+    double* const height = heights.data;
+    const int* const corners = (const int*)nodes.data;
+    for (int p = 0; p < planes_count; ++p) {
+        const double* const plane = (const double*)planes.data + 4 * p;
+        double* const row = height + p * nodes_count;
+        for (int i = 0; i < nodes_count; ++i)
+            row[i] = plane[0] * x[3 * i] + plane[1] * x[3 * i + 1] + plane[2] * x[3 * i + 2] + plane[3];
+    }
+    for (int i = 0; i < points; ++i) {
+        const int* const corner = corners + 4 * i;
+        const double* const share = w + 4 * i;
+        double nearest_gap = __builtin_inf(), solid_gap = -__builtin_inf();
+        int nearest = 0, facing = 0;
+        for (int p = 0; p < planes_count; ++p) {
+            const double* const row = height + p * nodes_count;
+            const double gap = (share[0] * row[corner[0]] + share[1] * row[corner[1]])
+                + (share[2] * row[corner[2]] + share[3] * row[corner[3]]);
+            if (gap > solid_gap) {
+                solid_gap = gap;
+                facing = p;
+            }
+            if (p + 1 == planes_count || solid_from_plane.data[p + 1] != solid_from_plane.data[p]) {
+                if (solid_gap < nearest_gap) {
+                    nearest_gap = solid_gap;
+                    nearest = facing;
+                }
+                solid_gap = -__builtin_inf();
+            }
+        }
+        gaps_out.data[i] = nearest_gap;
+        planes_out.data[i] = nearest;
+    }
+"""
+    )
+)
+def write_gaps(
+    nodes: wp.array[wp.vec4i],
+    weights: wp.array[Vec4],
+    planes: wp.array[Vec4],
+    solid_from_plane: wp.array[int],
+    positions: wp.array[Vec3],
+    heights: wp.array[real],
+    gaps_out: wp.array[real],
+    planes_out: wp.array[int],
+) -> None:
+    """See ``all_gaps_kernel``."""
+    ...
+
+
+@wp.kernel
+def all_gaps_kernel(
+    # Model:
+    nodes: wp.array[wp.vec4i],
+    weights: wp.array[Vec4],
+    planes: wp.array[Vec4],
+    solid_from_plane: wp.array[int],
+    # In:
+    positions: wp.array[Vec3],
+    # Out:
+    heights: wp.array[real],
+    gaps_out: wp.array[real],
+    planes_out: wp.array[int],
+):
+    """``point_gaps_kernel`` of all points, each among four ``nodes``, by one thread of a CPU: ``heights``, room for
+    planes times nodes, are those of the nodes, between which they are linear."""
+    write_gaps(nodes, weights, planes, solid_from_plane, positions, heights, gaps_out, planes_out)

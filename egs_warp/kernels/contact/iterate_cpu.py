@@ -1,0 +1,276 @@
+"""``kernels.contact.iterate`` on a CPU: a trial of Newton's method, and the Newton step from there, in one thread each
+(Eq. 4, 8)."""
+
+import warp as wp
+
+from egs_warp.kernels.fem.elasticity_cpu import Elements, Lines, written_gradient
+from egs_warp.kernels.fem.supernodal import Fronts, Kept, solved_one
+from egs_warp.kernels.vectors import on_cpu
+from egs_warp.precision import real
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Step:
+    """``fem.StepProblem`` of N nodes."""
+
+    positions: wp.array[real]
+    """(3N,) metres at the start."""
+    known: wp.array[real]
+    """(3N,) m/s, the velocities at the start after gravity alone."""
+    arms: wp.array[real]
+    """(3N,) metres from the centre of mass."""
+    rates: wp.array[real]
+    """(9,) 1/(kg m^2), the inverse of the inertia."""
+    masses: wp.array[real]
+    """(N,) kg."""
+
+
+@wp.func_native(
+    on_cpu("""
+    const int unknowns = ends.shape[0] * 3;
+    const double *const old = (const double*)base, *const free = (const double*)loose;
+    const double* const c = (const double*)columns;
+    const double *const before = (const double*)forces, *const then = (const double*)wanted;
+    double *const v = (double*)velocities_out, *const f = (double*)forces_out, *const x = (double*)ends.data;
+    for (int k = 0; k < width; ++k) f[k] = before[k] + length * (then[k] - before[k]);
+    for (int i = 0; i < unknowns; ++i) {
+        v[i] = old[i];
+        if (length != 0.0) {
+            v4 sums = 0.0;
+            const double* const row = c + (long long)i * width;
+            int k = 0;
+            for (; k + 4 <= width; k += 4) sums += *(const v4*)(row + k) * *(const v4*)(then + k);
+            double end = free[i] + ((sums[0] + sums[1]) + (sums[2] + sums[3]));
+            for (; k < width; ++k) end += row[k] * then[k];
+            v[i] += length * (end - old[i]);
+        }
+        x[i] = starts.data[i] + dt * v[i];
+    }
+""")
+)
+def gone(
+    starts: wp.array[real],
+    dt: real,
+    base: wp.uint64,
+    loose: wp.uint64,
+    columns: wp.uint64,
+    width: wp.int32,
+    forces: wp.uint64,
+    wanted: wp.uint64,
+    length: real,
+    velocities_out: wp.uint64,
+    ends: wp.array2d[real],
+    forces_out: wp.uint64,
+):
+    """``length`` of the way from ``base`` velocities (3N,) and ``forces`` (3n,) to the end of a Newton step, which
+    moves at ``loose`` (3N,) without contact forces, by ``columns`` (3N, 3n) with those that are ``wanted`` (3n,);
+    where the nodes are then."""
+    ...
+
+
+@wp.func_native(
+    on_cpu(
+        """
+    const int nodes_count = step.masses.shape[0];
+    const double *const v = (const double*)velocities, *const f = (const double*)forces, *const in = gradient.data;
+    const int* const node = (const int*)contact_nodes;
+    const double *const weight = (const double*)contact_weights, *const axis = (const double*)contact_axes;
+    const double *const r = step.arms.data, *const known = step.known.data, *const rate = step.rates.data;
+    double *const free = (double*)free_out, *const missed = (double*)rest.data;
+    double torque[3] = {0.0, 0.0, 0.0}, spin[3];
+    for (int i = 0; i < 3 * nodes_count; i += 3) {
+        torque[0] += r[i + 1] * in[i + 2] - r[i + 2] * in[i + 1];
+        torque[1] += r[i + 2] * in[i] - r[i] * in[i + 2];
+        torque[2] += r[i] * in[i + 1] - r[i + 1] * in[i];
+    }
+    for (int t = 0; t < 3; ++t)
+        spin[t] = dt * (rate[3 * t] * torque[0] + rate[3 * t + 1] * torque[1] + rate[3 * t + 2] * torque[2]);
+    for (int n = 0, i = 0; n < nodes_count; ++n, i += 3) {
+        const double turned[3] = {spin[1] * r[i + 2] - spin[2] * r[i + 1], spin[2] * r[i] - spin[0] * r[i + 2],
+                                  spin[0] * r[i + 1] - spin[1] * r[i]};
+        for (int t = 0; t < 3; ++t)
+            missed[i + t] = free[i + t] = step.masses.data[n] * (ratio * v[i + t] - known[i + t] - turned[t])
+                + dt * in[i + t];
+    }
+    for (int c = 0; c < contacts; ++c) {
+        double push[3];
+        for (int t = 0; t < 3; ++t)
+            push[t] = dt * (axis[9 * c + t] * f[3 * c] + axis[9 * c + 3 + t] * f[3 * c + 1]
+                + axis[9 * c + 6 + t] * f[3 * c + 2]);
+        for (int k = 0; k < 4; ++k)
+            for (int t = 0; t < 3; ++t) missed[3 * node[4 * c + k] + t] -= weight[4 * c + k] * push[t];
+    }
+    double square = 0.0;
+    for (int i = 0; i < 3 * nodes_count; ++i) square += missed[i] * missed[i];
+    return __builtin_sqrt(square);
+""",
+        elsewhere="return 0.0;",
+    )
+)
+def missed_by(
+    step: Step,
+    dt: real,
+    ratio: real,
+    contacts: wp.int32,
+    contact_nodes: wp.uint64,
+    contact_weights: wp.uint64,
+    contact_axes: wp.uint64,
+    gradient: wp.array2d[real],
+    velocities: wp.uint64,
+    forces: wp.uint64,
+    free_out: wp.uint64,
+    rest: wp.array2d[real],
+) -> real:
+    """``StepProblem.residual`` without contact forces (3N,) and with them (N, 3), and the norm of that."""
+    ...
+
+
+@wp.func_native(
+    on_cpu("""
+    const int k = directions;
+    const double *const u = (const double*)across, *const z = (const double*)through;
+    const double *const small = (const double*)inverse, *const given = (const double*)right;
+    double *const x = (double*)solved, *const along = room.data, *const by = along + k;
+    for (int j = 0; j < k; ++j) along[j] = 0.0;
+    for (int i = 0; i < unknowns; ++i)
+        for (int j = 0; j < k; ++j) along[j] += u[(long long)i * k + j] * x[i];
+    for (int a = 0; a < k; ++a) {
+        by[a] = 0.0;
+        for (int j = 0; j < k; ++j) by[a] += small[a * k + j] * along[j];
+    }
+    double missing[3] = {0.0, 0.0, 0.0}, turn[3] = {0.0, 0.0, 0.0};
+    for (int i = 0; i < unknowns; ++i) {
+        double away = 0.0;
+        for (int j = 0; j < k; ++j) away += z[(long long)i * k + j] * by[j];
+        x[i] -= away;
+        for (int t = 0; t < 3; ++t)
+            missing[t] += kept.turns.data[3 * i + t] * given[i]
+                - kept.ratio.data[0] * kept.momenta.data[3 * i + t] * x[i];
+    }
+    for (int t = 0; t < 9; ++t) turn[t / 3] += kept.inverse.data[t] * missing[t % 3];
+    for (int i = 0; i < unknowns; ++i)
+        for (int t = 0; t < 3; ++t) x[i] += kept.turned.data[3 * i + t] * turn[t];
+""")
+)
+def add_sum(
+    unknowns: wp.int32,
+    directions: wp.int32,
+    across: wp.uint64,
+    through: wp.uint64,
+    inverse: wp.uint64,
+    kept: Kept,
+    right: wp.uint64,
+    room: wp.array[real],
+    solved: wp.uint64,
+) -> None:
+    """To what is ``solved`` (3N,) of the ``right`` side (3N,) by the factors alone: Woodbury's formula for a sum of so
+    many ``directions``, see ``SparseFactors.add``, then what is ``kept``."""
+    ...
+
+
+@wp.func_native(
+    on_cpu("""
+    const double *const v = (const double*)velocities, *const w = (const double*)contact_weights;
+    const double* const axis = (const double*)contact_axes;
+    const int* const node = (const int*)contact_nodes;
+    double *const x = (double*)solved, *const speeds = (double*)speeds_out;
+    for (int i = 0; i < unknowns; ++i) x[i] = v[i] - x[i];
+    for (int c = 0; c < contacts; ++c) {
+        double at[3] = {0.0, 0.0, 0.0};
+        for (int k = 0; k < 4; ++k)
+            for (int t = 0; t < 3; ++t) at[t] += w[4 * c + k] * x[3 * node[4 * c + k] + t];
+        for (int a = 0; a < 3; ++a)
+            speeds[3 * c + a] = axis[9 * c + 3 * a] * at[0] + axis[9 * c + 3 * a + 1] * at[1]
+                + axis[9 * c + 3 * a + 2] * at[2];
+    }
+""")
+)
+def let_go(
+    unknowns: wp.int32,
+    contacts: wp.int32,
+    contact_nodes: wp.uint64,
+    contact_weights: wp.uint64,
+    contact_axes: wp.uint64,
+    velocities: wp.uint64,
+    solved: wp.uint64,
+    speeds_out: wp.uint64,
+) -> None:
+    """What is ``solved`` (3N,) becomes what it leaves of the ``velocities`` (3N,), and the contacts' speeds (3n,)."""
+    ...
+
+
+@wp.kernel
+def trial_kernel(
+    # Model:
+    elements: Elements,
+    lines: Lines,
+    step: Step,
+    starts: wp.array[real],
+    dt: real,
+    ratio: real,
+    contacts: wp.int32,
+    contact_nodes: wp.uint64,
+    contact_weights: wp.uint64,
+    contact_axes: wp.uint64,
+    columns: wp.uint64,
+    # In:
+    base: wp.uint64,
+    loose: wp.uint64,
+    forces: wp.uint64,
+    wanted: wp.uint64,
+    length: real,
+    # Out:
+    ends: wp.array2d[real],
+    gradient: wp.array2d[real],
+    rest_out: wp.array2d[real],
+    velocities_out: wp.uint64,
+    forces_out: wp.uint64,
+    free_out: wp.uint64,
+    size_out: wp.array[real],
+):
+    """See ``gone``, then ``missed_by``; no ``loose`` and no ``columns`` where the ``length`` is 0."""
+    gone(
+        step.positions, dt, base, loose, columns, 3 * contacts, forces, wanted, length, velocities_out, ends, forces_out
+    )  # fmt: skip
+    written_gradient(elements, lines, ends, starts, dt, gradient)
+    size_out[0] = missed_by(
+        step, dt, ratio, contacts, contact_nodes, contact_weights, contact_axes, gradient, velocities_out, forces_out,
+        free_out, rest_out,
+    )  # fmt: skip
+
+
+@wp.kernel
+def newton_kernel(
+    # Model:
+    fronts: Fronts,
+    blocks: wp.int32,
+    unknowns: wp.int32,
+    factor: wp.array[real],
+    inverses: wp.array[real],
+    reciprocals: wp.array[real],
+    kept: Kept,
+    directions: wp.int32,
+    across: wp.uint64,
+    through: wp.uint64,
+    inverse: wp.uint64,
+    contacts: wp.int32,
+    contact_nodes: wp.uint64,
+    contact_weights: wp.uint64,
+    contact_axes: wp.uint64,
+    # In:
+    right: wp.uint64,
+    velocities: wp.uint64,
+    # Out:
+    room: wp.array[real],
+    loose_out: wp.uint64,
+    speeds_out: wp.uint64,
+):
+    """(3N,) m/s after the step that takes off the ``right`` side (3N,), N s, and the contacts' speeds (3n,) then."""
+    if directions == 0:
+        solved_one(fronts, blocks, unknowns, factor, inverses, reciprocals, right, 1, kept, room, loose_out)
+    else:
+        solved_one(fronts, blocks, unknowns, factor, inverses, reciprocals, right, 1, Kept(), room, loose_out)
+        add_sum(unknowns, directions, across, through, inverse, kept, right, room, loose_out)
+    let_go(unknowns, contacts, contact_nodes, contact_weights, contact_axes, velocities, loose_out, speeds_out)
