@@ -23,7 +23,7 @@ from egs_warp.geometry.rows import distinct_rows
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.kernels.contact import gaps as kernels
 from egs_warp.kernels.contact.height_field import ground_gaps_kernel
-from egs_warp.launching import launch_again, put
+from egs_warp.launching import Mirror, launch_again
 from egs_warp.precision import Mat33, Vec3, Vec4, real
 
 LEAST_OUTSIDE = 0.1
@@ -282,9 +282,11 @@ class ContactDetector:
         self._corners = wp.array(geometry.mesh.tets[geometry.tet_from_point], dtype=wp.vec4i, device=device)
         self._heights = wp.zeros(len(rows) * len(geometry.mesh.nodes), dtype=real, device=device)
         self._positions = wp.zeros(len(geometry.mesh.nodes), dtype=Vec3, device=device)
+        self._positions_here = Mirror(self._positions)
         count = len(geometry.tet_from_point)
         self._gaps = wp.zeros(count, dtype=real, device=device)
         self._nearest = wp.zeros(count, dtype=int, device=device)
+        self._gaps_here, self._nearest_here = Mirror(self._gaps), Mirror(self._nearest)
         self._frames = np.array([[plane.normal, *plane.tangents()] for plane in geometry.planes]).reshape(-1, 3, 3)
         self._only_face: np.ndarray | None = None
         if len(geometry.planes) == 1:
@@ -307,7 +309,7 @@ class ContactDetector:
         return self._found[place]
 
     def _find(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        put(self._positions, positions)
+        self._positions_here.put(positions)
         solids, outputs = [self._planes, self._solids, self._positions], [self._gaps, self._nearest]
         if self._device.is_cpu:
             inputs = [self._corners, self._weights, *solids]
@@ -327,9 +329,9 @@ class ContactDetector:
                 outputs=[self._gaps, self._nearest],
                 device=self._device,
             )
-        gaps, nearest = self._gaps.numpy().copy(), self._only_face
+        gaps, nearest = self._gaps_here.get(), self._only_face
         if nearest is None:
-            nearest = self._nearest.numpy().copy()
+            nearest = self._nearest_here.get()
             nearest.flags.writeable = False
         gaps.flags.writeable = False
         return gaps, nearest

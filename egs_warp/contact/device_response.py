@@ -72,6 +72,8 @@ class DeviceResponder:
         with torch.no_grad(), self.stream:
             self._take(tangent.problem)
             delassus = room.respond(tangent.problem, contacts)
+            if not tangent.settle():
+                delassus = room.respond(tangent.problem, contacts)
         columns = room.columns[:, : 3 * count]
         self.at_hand = DeviceResponse(tangent, contacts, columns, delassus[: 3 * count, : 3 * count], self, room)
         return self.at_hand

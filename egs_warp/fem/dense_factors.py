@@ -40,10 +40,15 @@ class DenseFactors:
         self._factored = self.stream.recorded(self._factor)
         self._strain_told, self._strain_entries = Upload(self.stream, 3 * count), torch.zeros_like(self._entries)
         self._strain_here, self._strains = self.stream.pinned(0), Recordings(self.stream)
-        self._finite = self._ready = False
+        self._finite = self._ready = self._begun = False
 
     def update(self, entries: np.ndarray | torch.Tensor, diagonal: np.ndarray | None = None) -> bool:
         """See ``Factors``; what is not positive definite has no factors."""
+        self.begin(entries, diagonal)
+        return self.ready
+
+    def begin(self, entries: np.ndarray | torch.Tensor, diagonal: np.ndarray | None = None) -> None:
+        """See ``Factors``."""
         with self.stream:
             self._entries.copy_(self._take(entries))
             if diagonal is None:
@@ -51,10 +56,7 @@ class DenseFactors:
             else:
                 self._diagonal.copy_(self._take(diagonal))
             self._factored()
-            self.stream.wait()
-        finite, definite = self._told.tolist()
-        self._finite, self._ready = finite > 0.0, finite > 0.0 and definite > 0.0
-        return self._ready
+        self._begun = True
 
     def _factor(self) -> None:
         """L^-1 of what lies in the entries and the diagonal, and whether these are finite and make it definite."""
@@ -67,7 +69,7 @@ class DenseFactors:
 
     def add(self, across: np.ndarray, rates: np.ndarray) -> bool:
         """See ``Factors``; S keeps its own factor where the sum has none."""
-        if not self._finite or not (np.isfinite(across).all() and np.isfinite(rates).all()):
+        if (not self.ready and not self._finite) or not (np.isfinite(across).all() and np.isfinite(rates).all()):
             return False
         with self.stream:
             directions = self._take(across)
@@ -82,10 +84,16 @@ class DenseFactors:
     @property
     def ready(self) -> bool:
         """See ``Factors``."""
+        if self._begun:
+            self.stream.wait()
+            self._begun = False
+            finite, definite = self._told.tolist()
+            self._finite, self._ready = finite > 0.0, finite > 0.0 and definite > 0.0
         return self._ready
 
     def solve(self, right: np.ndarray, kept: Kept | None = None) -> np.ndarray:
         """See ``Factors``."""
+        assert self.ready, "update() comes first"
         with self.stream:
             plain = self._give(self._solve(self._take(right)))
         return plain if kept is None else kept.corrected(right, plain)
@@ -96,7 +104,6 @@ class DenseFactors:
         return self._triangle.inverse
 
     def _solve(self, right: torch.Tensor) -> torch.Tensor:
-        assert self._ready, "update() comes first"
         return self.inverse.T @ (self.inverse @ right)
 
     def strain_ahead(
@@ -134,7 +141,7 @@ class DenseFactors:
         return form.reshape(count, count).copy(), along.copy()
 
     def _strain(self, given: torch.Tensor, near: float, far: float) -> torch.Tensor:
-        """Form and slope, one behind the other, with what was told."""
+        """Form and slope, one behind the other, with what was told; no numbers where there are no factors."""
         slope, weights, away = self._strain_told.there.split([len(given)] * 3)
         moves = near * given + far * self._solve(weights[:, None] * given)
         moves[:, -1] -= away

@@ -10,7 +10,7 @@ import warp as wp
 
 from egs_warp.fem.elastic_maps import Damping, ElasticMaps, Material
 from egs_warp.kernels.fem import elasticity as kernels
-from egs_warp.launching import empty, launch_again, put
+from egs_warp.launching import Mirror, empty, launch_again
 from egs_warp.muscles.tension import FULL, SLACK, MuscleTension
 from egs_warp.precision import Mat33, Vec3, real
 
@@ -25,6 +25,7 @@ class MuscleLines:
         self._lines = [*self._index(self.rows), wp.array(tension.rest_lengths, dtype=real, device=device), SLACK, FULL]
         count = len(tension.rest_lengths)
         self._tensions = wp.zeros(count, dtype=real, device=device)
+        self._tensions_here = Mirror(self._tensions)
         self._pulls = wp.zeros(count, dtype=Vec3, device=device)
 
     def _index(self, rows: sparse.csr_matrix) -> list[wp.array]:
@@ -44,7 +45,7 @@ class MuscleLines:
 
     def told(self, tension: MuscleTension) -> wp.array:
         """(M,) its tensions, where the kernels are."""
-        put(self._tensions, tension.tensions)
+        self._tensions_here.put(tension.tensions)
         return self._tensions
 
 
@@ -69,11 +70,14 @@ class ElementKernels:
         self._no_ends = [empty(0, int, device), empty(0, int, device), self._no_shares]
         self._muscles: MuscleLines | None = None
         self._positions = wp.zeros(node_count, dtype=Vec3, device=device)
+        self._positions_here = Mirror(self._positions)
         # Both come to the host at once.
         self._energies_and_determinants = wp.zeros((2, tet_count), dtype=real, device=device)
         self._energies, self._determinants = self._energies_and_determinants[0], self._energies_and_determinants[1]
+        self._energies_here = Mirror(self._energies_and_determinants)
         self._corner_gradients = wp.zeros((tet_count, 4), dtype=Vec3, device=device)
         self._node_gradients = wp.zeros(node_count, dtype=Vec3, device=device)
+        self._gradients_here = Mirror(self._node_gradients)
         self._blocks = wp.zeros((tet_count, 16), dtype=Mat33, device=device)
         self._entries = wp.zeros(maps.upper_pattern.nnz, dtype=real, device=device)
 
@@ -85,7 +89,7 @@ class ElementKernels:
     def start(self, positions: np.ndarray) -> wp.array:
         """What damping needs of a step's start at ``positions`` (N, 3)."""
         gradients = empty(len(self._tets), Mat33, self._device)
-        put(self._positions, positions)
+        self._positions_here.put(positions)
         launch_again(
             kernels.deformation_gradients_kernel,
             len(self._tets),
@@ -105,7 +109,7 @@ class ElementKernels:
 
     def energy(self, positions: np.ndarray, damping: Damping | None) -> tuple[float, np.ndarray]:
         """Joules, and det F (T,)."""
-        put(self._positions, positions)
+        self._positions_here.put(positions)
         launch_again(
             kernels.element_energies_kernel,
             len(self._tets),
@@ -113,17 +117,17 @@ class ElementKernels:
             outputs=[self._energies, self._determinants],
             device=self._device,
         )
-        energies, determinants = self._energies_and_determinants.numpy().copy()
+        energies, determinants = self._energies_here.get()
         return float(energies.sum()), determinants
 
     def gradient(self, positions: np.ndarray, damping: Damping | None, tension: MuscleTension | None) -> np.ndarray:
         """(N, 3) newtons."""
-        put(self._positions, positions)
+        self._positions_here.put(positions)
         lines = None if tension is None else self.muscle_lines(tension)
         tensions = self._no_shares if lines is None or tension is None else lines.told(tension)
         start, dt = (self._no_gradients, 0.0) if damping is None else (damping.start, damping.dt)
         self.enqueue_gradient(self._positions, start, dt, lines, tensions, self._node_gradients)
-        return self._node_gradients.numpy().copy()
+        return self._gradients_here.get()
 
     def enqueue_gradient(
         self,
@@ -171,7 +175,7 @@ class ElementKernels:
 
     def _made(self, positions: np.ndarray, damping: Damping | None, factor: float, projected: bool) -> wp.array:
         """(nnz,) upper entries, overwritten the next time."""
-        put(self._positions, positions)
+        self._positions_here.put(positions)
         hessian = kernels.element_projected_hessians_kernel if projected else kernels.element_hessians_kernel
         launch_again(
             hessian,

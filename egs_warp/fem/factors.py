@@ -23,6 +23,10 @@ class Factors(Protocol):
         definite."""
         ...
 
+    def begin(self, entries: Any, diagonal: np.ndarray | None = None) -> None:
+        """``update``, for which nobody waits: ``ready`` does. A GPU goes on with it meanwhile."""
+        ...
+
     def add(self, across: np.ndarray, rates: np.ndarray) -> bool:
         """From now on solve with S + U diag(r) U^T, ``across`` U (n, k) and ``rates`` r (k,); False, and nothing is
         added, if that is not positive definite. Once after ``update`` with success."""
@@ -30,7 +34,7 @@ class Factors(Protocol):
 
     @property
     def ready(self) -> bool:
-        """Whether there is something to solve with."""
+        """Whether there is something to solve with. Of factors that are begun, once they are there."""
         ...
 
     def solve(self, right: np.ndarray, kept: Kept | None = None) -> np.ndarray:

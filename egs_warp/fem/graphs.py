@@ -40,6 +40,14 @@ class GraphStream:
         if self._stream is not None:
             self._stream.synchronize()
 
+    def mark(self, event: Any) -> Any:
+        """An event after all that was begun, for which somebody may wait: ``event``, or a new one."""
+        if self._stream is None:
+            return None
+        event = event or torch.cuda.Event()
+        event.record(self._stream)
+        return event
+
     def recorded(self, work: Callable[[], None]) -> Callable[[], None]:
         """``work``, which is run as it is the first time: nothing may be compiled or made while it is recorded, the
         second time. It must not wait for the device."""
@@ -74,18 +82,21 @@ class Upload:
 
     def __init__(self, stream: GraphStream, count: int) -> None:
         self.here, self._stream = stream.pinned(count), stream
+        self._sent: Any = None
         self.there = torch.zeros(count, dtype=torch.float64, device=stream.device)
 
     def take(self, *parts: np.ndarray) -> None:
         """``parts`` one behind the other, zeros behind the last."""
         here, at = self.here.numpy(), 0
-        # What was told before may still be on its way.
-        self._stream.wait()
+        if self._sent is not None:
+            # What was told before may still be on its way.
+            self._sent.synchronize()
         for part in parts:
             here[at : at + part.size] = part.ravel()
             at += part.size
         here[at:] = 0.0
         self.send()
+        self._sent = self._stream.mark(self._sent)
 
     def send(self) -> None:
         """What lies ``here`` now."""

@@ -103,6 +103,10 @@ class SparseFactors:
         self._ready, self.negative_pivots = bool(self._negative[0] >= 0), int(self._negative[0])
         return self.negative_pivots == 0
 
+    def begin(self, entries: np.ndarray, diagonal: np.ndarray | None = None) -> None:
+        """See ``Factors``."""
+        self.update(entries, diagonal)
+
     def add(self, across: np.ndarray, rates: np.ndarray) -> bool:
         """See ``Factors``: by Woodbury's formula, also where S alone is not definite."""
         if not self.ready:

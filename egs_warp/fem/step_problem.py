@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -120,24 +121,35 @@ class StepProblem:
 
     def tangent(self, factors: Factors, velocities: np.ndarray, tension: MuscleTension | None) -> Tangent:
         """The derivative of the residual at ``velocities`` (N, 3), or a definite one near it, factored by
-        ``factors``. Raises ``UnsolvableStepError`` where it has no factors.
+        ``factors``. Raises ``UnsolvableStepError`` where it has no factors, or, of what is only begun, ``settle`` does.
         """
+        if tension is None and not factors.host:
+            factors.begin(*self._matrix(factors, velocities, projected=False))
+            return Tangent(self, factors, velocities)
         definite = self._factor(factors, velocities, projected=False)
         if tension is not None:
             across, rates = tension.hessian(self.end_positions(velocities)).factors(least=NEGLIGIBLE)
             if factors.add(across, self.dt**2 * rates):
                 return Tangent(self, factors)
         if not definite:
-            self._factor(factors, velocities, projected=True)
+            self.factor_near(factors, velocities)
+        return Tangent(self, factors)
+
+    def factor_near(self, factors: Factors, velocities: np.ndarray) -> None:
+        """A definite matrix near S. Raises ``UnsolvableStepError`` where that has no factors."""
+        self._factor(factors, velocities, projected=True)
         if not factors.ready:
             raise UnsolvableStepError(UNSOLVABLE)
-        return Tangent(self, factors)
 
     def _factor(self, factors: Factors, velocities: np.ndarray, *, projected: bool) -> bool:
         """S = (1 + dt alpha) M + dt C + dt^2 K at the end of ``velocities``; whether it is definite."""
+        return factors.update(*self._matrix(factors, velocities, projected=projected))
+
+    def _matrix(self, factors: Factors, velocities: np.ndarray, *, projected: bool) -> tuple[Any, np.ndarray]:
+        """Entries and diagonal of S for ``factors``."""
         end = self.end_positions(velocities)
         entries = self.body.assembly.entries_for(factors, end, self.damping, factor=self.dt**2, projected=projected)
-        return factors.update(entries, (1.0 + self.dt * self.drag) * np.repeat(self.body.node_mass, 3))
+        return entries, (1.0 + self.dt * self.drag) * np.repeat(self.body.node_mass, 3)
 
 
 @dataclass(frozen=True)
@@ -151,6 +163,16 @@ class Tangent:
 
     problem: StepProblem
     factors: Factors
+    begun_at: np.ndarray | None = None
+    """(N, 3) m/s at which the matrix is whose factors are only begun; None if they are there."""
+
+    def settle(self) -> bool:
+        """Wait for factors that are begun; whether they are there. If not, those of a definite matrix near by are
+        then. Raises ``UnsolvableStepError`` if that has none."""
+        if self.begun_at is None or self.factors.ready:
+            return True
+        self.problem.factor_near(self.factors, self.begun_at)
+        return False
 
     @cached_property
     def kept(self) -> Kept:
@@ -162,4 +184,5 @@ class Tangent:
 
     def solve(self, impulses: np.ndarray) -> np.ndarray:
         """(3N,) or (3N, m) m/s that ``impulses`` of that shape, N s, bring about."""
+        self.settle()
         return self.factors.solve(impulses, self.kept)

@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -102,17 +104,10 @@ class AdmmPrograms:
                 x[: len(start)] = start
         self._programs.lower = self._on_device(_padded(lower, (k, m)))
         self._programs.upper = self._on_device(_padded(upper, (k, m)))
-        iterates, memory = scaled.Iterates(), scaled.Memory()
+        iterates = scaled.Iterates()
         iterates.x, iterates.y, iterates.rho = map(self._on_device, (self._x, self._y, self._rho))
-        square, table = ((k, n, n), real), ((k, m, n), real)
-        (memory.P, memory.inverse, memory.rows, memory.columns, memory.by_variable, memory.by_row, ended, taken) = (
-            empty_together(
-                self._device,
-                *(square, square, table, ((k, n, m), real), ((k, scaled.BY_VARIABLE, n), real)),
-                *(((k, scaled.BY_ROW, m), real), (k, int), (k, int)),
-            )
-        )
-        block = 1 if self._device.is_cpu else kernels.BLOCK
+        memory, ended, taken = _memory(self._device, k, m, n)
+        block = _block(self._device)
         wp.launch(
             kernels.admm_kernel,
             k * block,
@@ -136,6 +131,81 @@ class AdmmPrograms:
 
     def _on_device(self, values: np.ndarray) -> wp.array:
         return wp.array(values, dtype=real, device=self._device, copy=False)
+
+
+class AdmmNear:
+    """Iterations on min 1/2 x^T x over rows A, of so many rows and unknowns: memory and a launch are made once, for
+    only numbers change, which come and go in one piece. They begin where they are told to."""
+
+    def __init__(
+        self, rows: int, unknowns: int, device: str, *, accuracy: float, iterations: int, adapt: int, rho: float
+    ) -> None:
+        """See ``AdmmPrograms``."""
+        self._device, self._rho = wp.get_device(device), rho
+        m, n = rows, unknowns
+        self._parts = np.cumsum([m * n, m, m, n, m, 1])
+        size, pinned = int(self._parts[-1]), self._device.is_cuda
+        self._here, self._there = wp.zeros(size, real, "cpu", pinned=pinned), wp.zeros(size, real, self._device)
+        programs, iterates = scaled.Programs(), scaled.Iterates()
+        begins = [0, *self._parts.tolist()]
+        A, lower, upper, x, y, iterates.rho = (self._there[a:b] for a, b in pairwise(begins))
+        programs.A, programs.lower, programs.upper = A.reshape((1, m, n)), lower.reshape((1, m)), upper.reshape((1, m))
+        iterates.x, iterates.y = x.reshape((1, n)), y.reshape((1, m))
+        programs.P = wp.array(np.eye(n)[None], dtype=real, device=self._device)
+        programs.q = wp.zeros((1, n), dtype=real, device=self._device)
+        programs.rows, programs.variables = (wp.array([size], dtype=int, device=self._device) for size in (m, n))
+        memory, self._ended, self._taken = _memory(self._device, 1, m, n)
+        self._how, self._count = (wp.zeros(1, int, "cpu", pinned=pinned) for _ in range(2))
+        self._held = programs, iterates, memory
+        block = _block(self._device)
+        self._launch: Any = wp.launch(
+            kernels.admm_kernel,
+            block,
+            inputs=[programs, accuracy, iterations, 0, adapt, memory, iterates],
+            outputs=[self._ended, self._taken],
+            device=self._device,
+            block_dim=block,
+            record_cmd=True,
+        )
+
+    def run(self, rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> Iterate:
+        """With ``rows`` A (m, n), which may be fewer than there is room for, and bounds l <= A x <= u (m,), from
+        ``start`` (n,), or from 0."""
+        m, n = rows.shape
+        A, low, high, x, y, rho = np.split(self._here.numpy(), self._parts[:-1])
+        A[: m * n], A[m * n :] = rows.ravel(), 0.0
+        low[:m], low[m:], high[:m], high[m:] = lower, -1.0, upper, 1.0
+        x[:], y[:], rho[:] = 0.0 if start is None else start, 0.0, self._rho
+        wp.copy(self._there, self._here)
+        self._launch.launch()
+        # The iterates lie behind what they are told of.
+        behind = int(self._parts[2])
+        wp.copy(self._here, self._there, behind, behind, len(self._there) - behind)
+        wp.copy(self._how, self._ended)
+        wp.copy(self._count, self._taken)
+        wp.synchronize_stream(self._device)
+        ending = Ending(int(self._how.numpy()[0]))
+        if not np.isfinite(x).all() or not np.isfinite(y).all():
+            ending = Ending.FAILED
+        return Iterate(ending, x.copy(), y[:m].copy(), int(self._count.numpy()[0]))
+
+
+def _memory(device: wp.Device, k: int, m: int, n: int) -> tuple[Any, wp.array, wp.array]:
+    """Of k programs of so many rows and variables: to work in, how they end, and after how many iterations."""
+    memory = scaled.Memory()
+    square, table = ((k, n, n), real), ((k, m, n), real)
+    memory.P, memory.inverse, memory.rows, memory.columns, memory.by_variable, memory.by_row, ended, taken = (
+        empty_together(
+            device,
+            *(square, square, table, ((k, n, m), real), ((k, scaled.BY_VARIABLE, n), real)),
+            *(((k, scaled.BY_ROW, m), real), (k, int), (k, int)),
+        )
+    )
+    return memory, ended, taken
+
+
+def _block(device: wp.Device) -> int:
+    return 1 if device.is_cpu else kernels.BLOCK
 
 
 def _padded(values: Sequence[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Protocol
 
 import numpy as np
 import osqp
 import scipy.sparse as sparse
+import warp as wp
 
 from egs_warp.launching import Device, kept_by_thread
-from egs_warp.locomotion.admm import AdmmPrograms, Dense, Ending, Iterate
+from egs_warp.locomotion.admm import AdmmNear, AdmmPrograms, Dense, Ending, Iterate
 
 SCALING = 4
 """Passes of the equilibration."""
@@ -167,15 +168,16 @@ class AdmmSplitting:
 
     def near(self, units: np.ndarray, lower: np.ndarray, upper: np.ndarray, start: np.ndarray | None) -> Iterate:
         """See ``Splitting``."""
-        n = units.shape[1]
-        program = Dense(np.eye(n), np.zeros(n), units)
-        programs = AdmmPrograms([program], device=self._device, scaling=0, adapt=ADAPT, rho=RHO)
-        return AdmmIterations(programs, _ENOUGH, NEAR).run(lower, upper, start)
+        rows = -(-len(units) // _ROWS) * _ROWS
+        return _near_by_kernels(rows, units.shape[1], str(wp.get_device(self._device))).run(units, lower, upper, start)
 
     def on(self, A: np.ndarray, iterations: int) -> AdmmIterations:
         """See ``Splitting``."""
         programs = AdmmPrograms([Dense(self._P, self._q, A)], device=self._device, scaling=SCALING, adapt=ADAPT)
         return AdmmIterations(programs, self._accuracy, iterations)
+
+
+_near_by_kernels = kept_by_thread(16)(partial(AdmmNear, accuracy=_ENOUGH, iterations=NEAR, adapt=ADAPT, rho=RHO))
 
 
 @dataclass(frozen=True)

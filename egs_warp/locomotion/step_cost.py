@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from egs_warp.contact.detection import ContactSet
-from egs_warp.fem.elastic_maps import Damping
 from egs_warp.fem.factors import Factors
 from egs_warp.fem.step_problem import StepProblem, UnsolvableStepError
 from egs_warp.locomotion.linear_step import LinearStep
@@ -83,8 +82,10 @@ class Horizon:
     """(N, 3) metres."""
     time: float
     """Seconds after the start of the step."""
-    damping: Damping
-    """Until then."""
+    energy: float
+    """Elastic, and what damping takes until then, joules."""
+    slope: np.ndarray
+    """(3N,) newtons, its derivative by the positions."""
     entries: Any
     """(nnz,) upper entries of the elements' stiffness at the end, made semi-definite, where ``factors`` are."""
     factors: Factors
@@ -97,11 +98,11 @@ class Horizon:
         body = problem.body
         assembly, time = body.assembly, max(horizon * body.time_unit, problem.dt)
         end, damping = problem.end_positions(foreseen), assembly.damping(problem.state.positions, time)
+        energy, slope = assembly.energy(end, damping), assembly.gradient(end, damping).ravel()
         entries = assembly.entries_for(factors, end, damping, projected=True)
-        factors.update(time**2 * entries, np.repeat(body.node_mass, 3))
-        if not factors.ready:
-            raise UnsolvableStepError("the matrix of what is foreseen has no factors")
-        return cls(end, time, damping, entries, factors)
+        # Last: what a GPU has begun it goes on with while the host does other things.
+        factors.begin(time**2 * entries, np.repeat(body.node_mass, 3))
+        return cls(end, time, energy, slope, entries, factors)
 
 
 def effort_cost(
@@ -114,19 +115,27 @@ def effort_cost(
     it has stored: without this, muscles work against each other. What is stiff goes on only until it is slack, as in
     one implicit step over the horizon: carried on at its speed, what lets go would seem to be strained the other way.
     """
-    body, assembly, factors = problem.body, problem.body.assembly, horizon.factors
+    body, factors = problem.body, horizon.factors
+    if factors.host:
+        _insist(factors)
     quadratic, force = factors.strain_ahead(
         horizon.entries,
-        assembly.gradient(horizon.end, horizon.damping).ravel(),
+        horizon.slope,
         np.repeat(body.node_mass, 3),
         linear.velocities,
         near=problem.dt,
         far=horizon.time - problem.dt,
         away=problem.dt * foreseen,
     )
+    _insist(factors)
     unit = weight / (body.weight * body.height)
     return QuadraticCost(
         unit * quadratic[:-1, :-1],
         unit * (force[:-1] + quadratic[:-1, -1]),
-        unit * (assembly.energy(horizon.end, horizon.damping) + float(force[-1] + 0.5 * quadratic[-1, -1])),
+        unit * (horizon.energy + float(force[-1] + 0.5 * quadratic[-1, -1])),
     )
+
+
+def _insist(factors: Factors) -> None:
+    if not factors.ready:
+        raise UnsolvableStepError("the matrix of what is foreseen has no factors")
