@@ -10,6 +10,7 @@ from egs_warp.contact.detection import ContactDetector, ContactSet, push_out_spe
 from egs_warp.contact.points import ContactPoints
 from egs_warp.contact.response import ContactResponse, HostResponder, Iterate, Responder
 from egs_warp.fem.factors import Factors
+from egs_warp.fem.step_problem import StepProblem
 from egs_warp.muscles.tension import MuscleTension
 
 ITERATIONS = 60
@@ -86,24 +87,30 @@ class CoupledSolver:
         """
         problem = response.tangent.problem
         iterations = tangents = 0
-        start_gaps, _ = self.detector.gaps(problem.state.positions)
         for number in range(ROUNDS):
             result = self._round(response, tension, velocities, forces)
             response = result.response
             iterations, tangents = iterations + result.iterations, tangents + result.tangents
             velocities, forces = result.velocities, result.forces
-            gaps, _ = self.detector.gaps(problem.end_positions(velocities))
             contacts = response.contacts
-            # What is deep already is held where it is only once it would go deeper.
-            allowed = np.where(gaps < -self.penetration_tolerance, CREEPS, SINKS) * self.penetration_tolerance
-            sinking = np.where(gaps < start_gaps - allowed, gaps, 0.0)
-            added = self.points.deeper(contacts.points, sinking, ADDED * self.penetration_tolerance)
+            added = self._sinking(problem, contacts, velocities)
             if not result.converged or len(added) == 0 or number == ROUNDS - 1:
                 break
             contacts = self.detector.contact_set(np.concatenate([contacts.points, added]), problem.state.positions)
             response = response.wider(contacts)
             forces = np.vstack([forces, np.zeros((len(added), 3))])
         return replace(result, iterations=iterations, tangents=tangents)
+
+    def _sinking(self, problem: StepProblem, contacts: ContactSet, velocities: np.ndarray) -> np.ndarray:
+        """(k,) points not among ``contacts`` that would end too deep."""
+        gaps, _ = self.detector.gaps(problem.end_positions(velocities))
+        depth = ADDED * self.penetration_tolerance
+        if gaps.min() >= -depth:
+            return contacts.points[:0]
+        start_gaps, _ = self.detector.gaps(problem.state.positions)
+        # What is deep already is held where it is only once it would go deeper.
+        allowed = np.where(gaps < -self.penetration_tolerance, CREEPS, SINKS) * self.penetration_tolerance
+        return self.points.deeper(contacts.points, np.where(gaps < start_gaps - allowed, gaps, 0.0), depth)
 
     def _round(
         self, response: ContactResponse, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray
