@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from contextlib import AbstractContextManager, nullcontext
@@ -58,17 +59,21 @@ class GraphStream:
 
         What graphs make on their way lies in the same memory: they run one after the other, and leave nothing there.
         The first is kept, since with the last of them that memory would go. No other thread may work on the device
-        meanwhile: what it begins would be recorded, too.
+        meanwhile: what it begins would be recorded, too. Nor may Python look for garbage: what it found of the device's
+        memory it would give back, which waits for all that goes on there.
         """
         if self._pool is None:
             self._pool = torch.cuda.graph_pool_handle()
         self.wait()
-        graph = torch.cuda.CUDAGraph()
+        graph, looks = torch.cuda.CUDAGraph(), gc.isenabled()
+        gc.disable()
         graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
         try:
             work()
         finally:
             graph.capture_end()
+            if looks:
+                gc.enable()
         self._first = self._first or graph
         return graph
 

@@ -148,7 +148,8 @@ class AdmmNear:
         self._here, self._there = wp.zeros(size, real, "cpu", pinned=pinned), wp.zeros(size, real, self._device)
         programs, iterates = scaled.Programs(), scaled.Iterates()
         begins = [0, *self._parts.tolist()]
-        A, lower, upper, x, y, iterates.rho = (self._there[a:b] for a, b in pairwise(begins))
+        there: Any = self._there
+        A, lower, upper, x, y, iterates.rho = (there[a:b] for a, b in pairwise(begins))
         programs.A, programs.lower, programs.upper = A.reshape((1, m, n)), lower.reshape((1, m)), upper.reshape((1, m))
         iterates.x, iterates.y = x.reshape((1, n)), y.reshape((1, m))
         programs.P = wp.array(np.eye(n)[None], dtype=real, device=self._device)

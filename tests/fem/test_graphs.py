@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 import numpy as np
 import pytest
 
@@ -57,3 +59,13 @@ def test_the_last_works_are_kept_by_their_keys(device: str, monkeypatch: pytest.
     assert list(works._kept) == [2.0, 3.0, 4.0]
     works.forget()
     assert run(2.0, 1.0) == 2.0 and len(works._kept) == 1
+
+
+def test_nobody_looks_for_garbage_while_work_is_recorded(device: str) -> None:
+    """What is found would be given back to the device, which waits for what goes on there."""
+    stream, looks = GraphStream(torch.device(device)), []
+    again = stream.recorded(lambda: looks.append(gc.isenabled()))
+    for _ in range(3):
+        with stream:
+            again()
+    assert gc.isenabled() and looks == ([True] * 3 if device == "cpu" else [True, False])
