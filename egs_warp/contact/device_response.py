@@ -18,6 +18,7 @@ from egs_warp.fem.element_kernels import ElementKernels
 from egs_warp.fem.graphs import Recordings, Upload
 from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.fem.worlds import shared
+from egs_warp.kernels.contact import batch_contacts as of_worlds
 from egs_warp.kernels.contact import iterate as kernels
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleTension
@@ -117,6 +118,9 @@ class ContactRoom:
             self._contact_nodes,
             *(shared(weights.view(-1, 4), Vec4), shared(axes.view(-1, 3, 3), Mat33)),
         ]
+        # As one of many worlds.
+        counts = wp.array([places], dtype=int, device=self._device)
+        self._world = [counts, *(each.reshape((1, places)) for each in self._contacts)]
         self.columns = owner.zeros(size, width)
         self._right, self._delassus = owner.zeros(size, 3 + width), owner.zeros(width, width)
         self._delassus_here = owner.stream.pinned(width * width)
@@ -153,13 +157,16 @@ class ContactRoom:
     def speeds(self, velocities: torch.Tensor) -> torch.Tensor:
         """(3K, j) m/s of the contacts for nodal ``velocities`` (3N, j)."""
         made = velocities.new_empty((3 * self.places, velocities.shape[1]))
-        self._launch(
-            kernels.delassus_kernel,
-            (self.places, velocities.shape[1]),
-            [*self._contacts, shared(velocities, real)],
-            [shared(made, real)],
-        )
+        self._enqueue_speeds(velocities, made)
         return made
+
+    def _enqueue_speeds(self, velocities: torch.Tensor, made: torch.Tensor) -> None:
+        self._launch(
+            of_worlds.contact_speeds_kernel,
+            (1, self.places, velocities.shape[1]),
+            [*self._world, shared(velocities[None], real)],
+            [shared(made[None], real)],
+        )
 
     def respond(self, problem: StepProblem, contacts: ContactSet) -> np.ndarray:
         """(3K, 3K) m/(N s) of ``contacts``, which are those of this room from now on, by the factors at hand."""
@@ -178,19 +185,15 @@ class ContactRoom:
         momenta, impulses = self._right[:, :3], self._right[:, 3:]
         torch.mul(owner.turns, owner.masses.repeat_interleave(3)[:, None], out=momenta)
         impulses.zero_()
-        self._launch(kernels.columns_kernel, (self.places, 3), [*self._contacts, dt], [shared(self._right, real)])
+        self._launch(of_worlds.contact_rows_kernel, (1, self.places), self._world, [shared(impulses[None], real)])
+        impulses.mul_(dt)
         solved = inverse.T @ (inverse @ self._right)
         owner.turned.copy_(solved[:, :3])
         torch.mm(momenta.T, owner.turned, out=self._held[0])
         self._launch(kernels.holding_kernel, 1, [ratio, shared(self._held[:1], Mat33)], [shared(self._held[1:], Mat33)])
         torch.mm(self._held[1], owner.turns.T - ratio * owner.turned.T, out=owner.keeping)
         torch.addmm(solved[:, 3:], owner.turned, owner.keeping @ impulses, out=self.columns)
-        self._launch(
-            kernels.delassus_kernel,
-            (self.places, 3 * self.places),
-            [*self._contacts, shared(self.columns, real)],
-            [shared(self._delassus, real)],
-        )
+        self._enqueue_speeds(self.columns, self._delassus)
         self._delassus_here.copy_(self._delassus.view(-1), non_blocking=True)
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
@@ -219,16 +222,16 @@ class ContactRoom:
         told = self._told.here.numpy()
         told[:3], told[3:] = (length, float(push), base), 0.0
         told[3 : 3 + wanted.size] = wanted.ravel()
-        return self._ask(self._enqueue_trial, problem)
+        return self._ask(self._enqueue_trial, problem.dt, 1.0 + problem.dt * problem.drag)
 
-    def again(self, problem: StepProblem, *, base: float) -> tuple[np.ndarray, ...]:
+    def again(self, *, base: float) -> tuple[np.ndarray, ...]:
         """The ``base`` by the response at hand: no number, the contacts' speeds, no numbers."""
         self._told.here[2] = base
-        return self._ask(self._enqueue_again, problem)
+        return self._ask(self._enqueue_again)
 
-    def _ask(self, work: Callable[..., None], problem: StepProblem) -> tuple[np.ndarray, ...]:
+    def _ask(self, work: Callable[..., None], *given: float) -> tuple[np.ndarray, ...]:
         with torch.no_grad(), self.owner.stream:
-            self._do(work, problem.dt, 1.0 + problem.dt * problem.drag)
+            self._do(work, *given)
             self.owner.stream.wait()
         asked = self._asked_here.numpy()
         return asked[0], asked[1 : 1 + 3 * self.places], asked[1 + 3 * self.places :]
@@ -242,7 +245,7 @@ class ContactRoom:
             [shared(self._base, real)],
         )
 
-    def _enqueue_again(self, dt: float, ratio: float) -> None:
+    def _enqueue_again(self) -> None:
         self._enqueue_base()
         self._enqueue_newton(self._base)
 
@@ -259,12 +262,7 @@ class ContactRoom:
             [shared(owner.turned, real), _vectors(velocities), _vectors(self._solved), shared(self._turn, real)],
             [_vectors(loose)],
         )
-        self._launch(
-            kernels.speeds_kernel,
-            self.places,
-            [*self._contacts, _vectors(loose)],
-            [_vectors(self._asked[1 : 1 + 3 * self.places])],
-        )
+        self._enqueue_speeds(loose[:, None], self._asked[1 : 1 + 3 * self.places, None])
         self._asked_here.copy_(self._asked, non_blocking=True)
 
     def _enqueue_trial(self, dt: float, ratio: float) -> None:
@@ -365,7 +363,7 @@ class DeviceIterate:
         """See ``Iterate``."""
         assert isinstance(response, DeviceResponse) and response.room is self.response.room
         room = response.room
-        _, speeds, _ = room.again(response.tangent.problem, base=self._base())
+        _, speeds, _ = room.again(base=self._base())
         room.at_base = replace(self, response=response, speeds=speeds[: len(self.speeds)].copy())
         return room.at_base
 

@@ -82,7 +82,7 @@ def launch_on(
 
 
 def shared(tensor: torch.Tensor, dtype: Any) -> wp.array:
-    """A contiguous ``tensor`` as an array of Warp's, where it lies."""
+    """A ``tensor`` as an array of Warp's, where it lies."""
     return wp.from_torch(tensor, dtype=dtype)
 
 
