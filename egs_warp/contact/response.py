@@ -162,7 +162,7 @@ class Iterate(Protocol):
 
 
 def _elements_are_here(tangent: Tangent) -> bool:
-    """Whether elements and factors both are on a CPU."""
+    """Whether the elements are on a CPU; the factors are, then."""
     return isinstance(tangent.problem.body.assembly.elements, ElementVectors)
 
 
