@@ -69,7 +69,8 @@ class DenseFactors:
 
     def add(self, across: np.ndarray, rates: np.ndarray) -> bool:
         """See ``Factors``; S keeps its own factor where the sum has none."""
-        if (not self.ready and not self._finite) or not (np.isfinite(across).all() and np.isfinite(rates).all()):
+        self._settle()
+        if not self._finite or not (np.isfinite(across).all() and np.isfinite(rates).all()):
             return False
         with self.stream:
             directions = self._take(across)
@@ -84,12 +85,16 @@ class DenseFactors:
     @property
     def ready(self) -> bool:
         """See ``Factors``."""
+        self._settle()
+        return self._ready
+
+    def _settle(self) -> None:
+        """Wait for what is begun, and see what it has come to."""
         if self._begun:
             self.stream.wait()
             self._begun = False
             finite, definite = self._told.tolist()
             self._finite, self._ready = finite > 0.0, finite > 0.0 and definite > 0.0
-        return self._ready
 
     def solve(self, right: np.ndarray, kept: Kept | None = None) -> np.ndarray:
         """See ``Factors``."""

@@ -67,11 +67,13 @@ class GraphStream:
         self.wait()
         graph, looks = torch.cuda.CUDAGraph(), gc.isenabled()
         gc.disable()
-        graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
         try:
-            work()
+            graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
+            try:
+                work()
+            finally:
+                graph.capture_end()
         finally:
-            graph.capture_end()
             if looks:
                 gc.enable()
         self._first = self._first or graph
