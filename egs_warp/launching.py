@@ -14,7 +14,6 @@ import threading
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from functools import cache, lru_cache
 from itertools import pairwise
@@ -25,6 +24,7 @@ import numpy as np
 import warp as wp
 
 from egs_warp.errors import ArgumentError, UserError
+from egs_warp.helpers import helpers
 
 Shape: TypeAlias = int | tuple[int, ...]
 T = TypeVar("T")
@@ -153,14 +153,15 @@ def launch_rows(
                 launch.set_param_at_index_from_ctype(0, first)
             launch.launch()
 
-    helpers = [_pool().submit(launch_chunks) for _ in range(min(threads, len(edges) - 1) - 1)]
+    tasks = [helpers().begin(launch_chunks) for _ in range(min(threads, len(edges) - 1) - 1)]
     try:
         launch_chunks()
     finally:
-        # A helper that has not begun has nothing left to do; in a forked process none ever begins.
-        for helper in helpers:
-            if not helper.cancel():
-                helper.result()
+        # Who has not begun would find nothing left to do.
+        for task in tasks:
+            task.settle()
+    for task in tasks:
+        task.result()
 
 
 class _Recorded(threading.local):
@@ -255,21 +256,14 @@ def beside(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
     """Both results; ``second`` runs in another thread where one is free."""
     if available_threads() == 1:
         return first(), second()
-    helper = _pool().submit(second)
+    task = helpers().begin(second)
     try:
         done = first()
     except BaseException:
         # What it works with may be used again at once.
-        if not helper.cancel():
-            wait([helper])
+        task.settle()
         raise
-    # One that has not begun is done here; in a forked process none ever begins.
-    return done, second() if helper.cancel() else helper.result()
-
-
-@cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max_workers=max(1, (os.cpu_count() or 1) - 1))
+    return done, task.result()
 
 
 def device_of(array: wp.array) -> wp.Device:
