@@ -329,7 +329,11 @@ class Jump:
         heading = self.facing.landed_heading(self.pose, state.positions)
         # Upright, wherever the centre of mass is now: a body that leans with it is never called back.
         pose = self.pose.over_base(np.array([*goal[:2], seen.com[2] + dt * velocity[2]]), seen.base, heading)
-        upright = self._landed_share(state.time + dt) * self._upright(state, pose)
+        # What still comes up to its feet is turned until these are flat, for whoever stands on his heels cannot brake:
+        # upright in the mean while it is sheared back, its sole would point up by half of that.
+        coming = seen.com[:2] - goal[:2]
+        flat = self.pose.over_base(seen.com, seen.base, heading) if coming @ seen.velocity[:2] < 0.0 else pose
+        upright = self._landed_share(state.time + dt) * self._upright(state, flat)
         velocity, spin = self.pose.balanced(state, seen, velocity, upright, dt)
         # Little is asked of what comes to rest by itself.
         urgent = (self.pose.urgency(seen) - URGENT) / (1.0 - URGENT)

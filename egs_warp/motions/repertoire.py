@@ -72,7 +72,7 @@ def _repeated(request: MotionRequest, asked: Mapping[str, float], begin: Callabl
 
 def _jumps(request: MotionRequest, height: float) -> list[Part]:
     target = _target(request.asked, height)
-    return _repeated(request, request.asked, lambda place: Jump(place, target))
+    return _repeated(request, request.asked, lambda place: Jump(place, place.landing(target)))
 
 
 def _hops(request: MotionRequest, height: float) -> list[Part]:

@@ -16,6 +16,7 @@ from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
 from egs_warp.motions.feet import Base, Foot, base_of, find_feet
+from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.limbs import Limbs
 from egs_warp.motions.stance import Ground, heading_between, sole_shares
 from egs_warp.motions.style import Style
@@ -100,6 +101,13 @@ class Place:
         """Metres from ``point`` (3,) up to the highest surface over or under it; 0 if there is none."""
         rise = surface_above(self.solids, point, self.ground.axes[2])
         return rise if np.isfinite(rise) else 0.0
+
+    def landing(self, target: JumpTarget) -> JumpTarget:
+        """The ``target`` on what is ahead of the feet there, higher or lower, cleared by half of the asked height at
+        least."""
+        feet = sole_shares(self.body, self.ground, self.standing) @ self.standing
+        rise = self.rise_at(feet + target.distance * self.ground.axes[0]) - self.rise_at(feet)
+        return replace(target, rise=rise, height=max(target.height, rise + 0.5 * target.height))
 
     def facing(self, direction: np.ndarray) -> Place:
         """The same stance with another way forward (3,); the body is not turned."""

@@ -27,7 +27,7 @@ WIDEST = 1.15
 
 def twist(place: Place, target: JumpTarget, turn: float) -> Jump:
     """A jump that lands facing ``turn`` radians, counter-clockwise from above, from where it faced at the start."""
-    return Jump(place, target, facing=Turning(place, turn))
+    return Jump(place, place.landing(target), facing=Turning(place, turn))
 
 
 class Turning:
