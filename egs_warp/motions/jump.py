@@ -57,6 +57,8 @@ feet are ahead, and on its heels it would be thrown over them.
 """
 BLEND = 0.3
 """Of sqrt(H / g): the time in which a phase's pose takes over from the last one's."""
+LETTING_GO = 0.6
+"""Of sqrt(H / g): the time after take-off in which the pose of the landing is taken up."""
 URGENT = 0.5
 """Of the way from the middle of the feet to their edge: with its capture point beyond, a body that lands is balanced
 with more than the usual share of the weights."""
@@ -306,16 +308,20 @@ class Jump:
         spin = np.linalg.solve(self.body.inertia(state.positions), momentum)
         pose = self.facing.airborne_pose(pose, momentum, self.ground.axes[2], left)
         velocity = seen.velocity - np.array([0.0, 0.0, self.gravity * dt])
-        return [*self._write(state, velocity, pose, spin, dt, left=left), *self._swung(state, pose, left)]
+        # What was strained by the thrust is let go of first.
+        share = self._grown(state.time + dt, LETTING_GO)
+        held = self._write(state, velocity, pose, spin, dt, left=left, share=share)
+        return [*held, *self._swung(state, pose, left, share)]
 
-    def _swung(self, state: BodyState, pose: np.ndarray, left: float) -> list[AnyObjective]:
-        """Soles go to where the ``pose`` (3, 3) of the landing has them, in ``left`` s."""
+    def _swung(self, state: BodyState, pose: np.ndarray, left: float, share: float) -> list[AnyObjective]:
+        """Soles go to where the ``pose`` (3, 3) of the landing has them, in ``left`` s, for a ``share`` of their
+        weight."""
         rate = min(IN_TIME / left, 6.0 / self._time_unit)
         com, about = self.body.centre_of_mass(state.positions), Coordinates(np.eye(3), True)
 
         def swung(sole: BodyPart) -> AnyObjective:
             way = pose @ sole.centre(self.pose.arms) - (sole.centre(state.positions) - com)
-            return part_velocity(self.body, sole, rate * way, self._swing, about)
+            return part_velocity(self.body, sole, rate * way, share * self._swing, about)
 
         return [swung(sole) for sole in self._soles]
 
@@ -333,15 +339,17 @@ class Jump:
         # upright in the mean while it is sheared back, its sole would point up by half of that.
         coming = seen.com[:2] - goal[:2]
         flat = self.pose.over_base(seen.com, seen.base, heading) if coming @ seen.velocity[:2] < 0.0 else pose
-        upright = self._landed_share(state.time + dt) * self._upright(state, flat)
+        share = self._grown(state.time + dt, TOUCHING_DOWN)
+        upright = share * self._upright(state, flat)
         velocity, spin = self.pose.balanced(state, seen, velocity, upright, dt)
-        # Little is asked of what comes to rest by itself.
+        # The ground catches what comes down; then little is asked of what comes to rest by itself.
         urgent = (self.pose.urgency(seen) - URGENT) / (1.0 - URGENT)
-        return self._write(state, velocity, pose, spin, dt, urgent=urgent)
+        share *= max(self.weights.landing, min(urgent, 1.0))
+        return self._write(state, velocity, pose, spin, dt, share=share)
 
-    def _landed_share(self, time: float) -> float:
-        """How much is asked for at ``time`` s of what a standing body is asked for."""
-        share = min((time - self._entered) / (TOUCHING_DOWN * self._time_unit), 1.0)
+    def _grown(self, time: float, unit: float) -> float:
+        """Share of the weight at ``time`` s of what grows to all of it over ``unit`` sqrt(H / g) of a phase."""
+        share = min((time - self._entered) / (unit * self._time_unit), 1.0)
         return share * share * (3.0 - 2.0 * share)
 
     def _following(self, seen: Measurement, position: np.ndarray, velocity: np.ndarray, dt: float) -> np.ndarray:
@@ -397,13 +405,12 @@ class Jump:
         dt: float,
         *,
         left: float | None = None,
-        urgent: float = 0.0,
+        share: float = 1.0,
     ) -> list[AnyObjective]:
-        """``left``: seconds before the landing, of a body in the air; ``urgent``: share of their weight with which one
-        that lands is balanced, if that is more than the usual one."""
+        """``left``: seconds before the landing, of a body in the air; ``share``: of their weight with which one that
+        lands is balanced, and the pose of one in the air held."""
         # Where a phase begins with another pose than the last ended with, the way between them is gone in some steps.
-        share = min((state.time + dt - self._entered) / (BLEND * self._time_unit), 1.0)
-        pose = self._pose_before + share * share * (3.0 - 2.0 * share) * (pose - self._pose_before)
+        pose = self._pose_before + self._grown(state.time + dt, BLEND) * (pose - self._pose_before)
         rate = (pose - self._last_pose) / dt
         if np.abs(rate).max() > 5.0 / self._time_unit:
             rate = np.zeros((3, 3))
@@ -412,10 +419,10 @@ class Jump:
         falling = self.phase is JumpPhase.FLIGHT and float(com_velocity[2]) < 0.0
         follow, weights = 6.0 / self._time_unit, self.weights
         if self.phase is JumpPhase.LAND or falling:
-            share = 0.0 if falling else max(weights.landing, min(urgent, 1.0))
-            weights = replace(weights, com=share * weights.com, up=share * weights.up, spin=share * weights.spin)
+            asked = 0.0 if falling else share
+            weights = replace(weights, com=asked * weights.com, up=asked * weights.up, spin=asked * weights.spin)
         if left is not None:
-            follow, weights = min(IN_TIME / left, follow), replace(weights, pose=self._airborne)
+            follow, weights = min(IN_TIME / left, follow), replace(weights, pose=share * self._airborne)
         return self.pose.objectives(
             state,
             com_velocity=com_velocity,
