@@ -309,7 +309,7 @@ class Jump:
         pose = self.facing.airborne_pose(pose, momentum, self.ground.axes[2], left)
         velocity = seen.velocity - np.array([0.0, 0.0, self.gravity * dt])
         # What was strained by the thrust is let go of first.
-        share = self._grown(state.time + dt, LETTING_GO)
+        share = self._gently(state.time + dt, LETTING_GO)
         held = self._write(state, velocity, pose, spin, dt, left=left, share=share)
         return [*held, *self._swung(state, pose, left, share)]
 
@@ -339,13 +339,16 @@ class Jump:
         # upright in the mean while it is sheared back, its sole would point up by half of that.
         coming = seen.com[:2] - goal[:2]
         flat = self.pose.over_base(seen.com, seen.base, heading) if coming @ seen.velocity[:2] < 0.0 else pose
-        share = self._grown(state.time + dt, TOUCHING_DOWN)
-        upright = share * self._upright(state, flat)
+        upright = self._grown(state.time + dt, TOUCHING_DOWN) * self._upright(state, flat)
         velocity, spin = self.pose.balanced(state, seen, velocity, upright, dt)
         # The ground catches what comes down; then little is asked of what comes to rest by itself.
         urgent = (self.pose.urgency(seen) - URGENT) / (1.0 - URGENT)
-        share *= max(self.weights.landing, min(urgent, 1.0))
+        share = self._gently(state.time + dt, TOUCHING_DOWN) * max(self.weights.landing, min(urgent, 1.0))
         return self._write(state, velocity, pose, spin, dt, share=share)
+
+    def _gently(self, time: float, unit: float) -> float:
+        """As ``_grown``, at once of what has a turn to steer."""
+        return 1.0 if self.facing.turn else self._grown(time, unit)
 
     def _grown(self, time: float, unit: float) -> float:
         """Share of the weight at ``time`` s of what grows to all of it over ``unit`` sqrt(H / g) of a phase."""

@@ -10,7 +10,7 @@ import pytest
 from egs_warp.fem.body import BodyState
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.locomotion.objectives import Objective, SpinObjective
-from egs_warp.motions.jump import FOOTHOLD, Jump
+from egs_warp.motions.jump import BASE_SWING, FOOTHOLD, Jump
 from egs_warp.motions.jump_plan import JumpPhase, JumpTarget, stopping_time
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.twist import Turning
@@ -55,16 +55,49 @@ def test_soles_swing_ahead_of_a_body_in_the_air(mesh: TetMesh | None, soles: int
 
 
 def test_a_landing_that_may_fail_is_balanced_in_full() -> None:
-    """Asked little of while its capture point is near the middle of its feet, everything once that is at their edge."""
+    """Asked little of while its capture point is near the middle of its feet, everything once that is at their edge;
+    next to nothing in the first step, in which the ground catches it."""
     place = block_place()
     weights = []
-    for speed in (0.0, 2.0):
+    for time, speed in ((1.0, 0.0), (1.0, 2.0), (0.0, 2.0)):
         jump = Jump(place, JumpTarget(0.0, 0.3))
         jump.phase = JumpPhase.LAND
         moving = np.tile([speed, 0.0, 0.0], (len(place.standing), 1))
-        asked = jump.objectives(BodyState(place.standing, moving, 0.01), None, DT)
+        asked = jump.objectives(BodyState(place.standing, moving, time), None, DT)
         weights.append(next(objective.weight for objective in asked if isinstance(objective, SpinObjective)))
-    assert weights == pytest.approx([jump.weights.landing * jump.weights.spin, jump.weights.spin])
+    assert weights[:2] == pytest.approx([jump.weights.landing * jump.weights.spin, jump.weights.spin])
+    assert 0.0 < weights[2] < 0.05 * jump.weights.spin
+
+
+def test_what_has_taken_off_takes_up_its_pose_gently() -> None:
+    """Next to nothing of it in the first step in the air, all of it 0.6 sqrt(H / g) later."""
+    place = block_place()
+    jump = Jump(place, JumpTarget(0.5, 0.3))
+    jump.phase = JumpPhase.THRUST
+    flying, speed = place.standing + [0.25, 0.0, 0.3], np.array([0.8, 0.0, 0.0])
+    weights = []
+    for time in (0.0, 0.6 * place.body.time_unit):
+        asked = jump.objectives(BodyState(flying, np.tile(speed, (len(flying), 1)), time), None, DT)
+        swung = [one for one in asked if isinstance(one, Objective) and one.name == "sole velocity"]
+        weights.append(swung[0].weight)
+    assert jump.phase is JumpPhase.FLIGHT
+    assert 0.0 < weights[0] < 0.05 * BASE_SWING and weights[1] == BASE_SWING
+
+
+@pytest.mark.parametrize(("com_speed", "flat"), [(1.0, True), (-1.0, False)])
+def test_what_comes_up_to_its_feet_turns_until_they_are_flat(com_speed: float, flat: bool) -> None:
+    """Sheared back over a flat sole it is turned back in the mean, by half of the shear: as it comes up to its feet it
+    is not told to turn, for its sole would point up; as it falls back from them, it is told to come upright."""
+    place = block_place()
+    height = place.standing[:, 2:] - place.standing[:, 2].min()
+    sheared = place.standing + 0.1 * height / height.max() * [-1.0, 0.0, 0.0]
+    jump = Jump(place, JumpTarget(0.0, 0.3))
+    jump.phase = JumpPhase.LAND
+    moving = np.tile([0.01 * com_speed, 0.0, 0.0], (len(sheared), 1))
+    asked = jump.objectives(BodyState(sheared, moving, 1.0), None, DT)
+    spin = next(objective for objective in asked if isinstance(objective, SpinObjective))
+    rate = np.linalg.solve(place.body.inertia(sheared), spin.target)
+    assert abs(rate[1]) < 0.03 if flat else rate[1] > 0.1
 
 
 @pytest.mark.parametrize("toes", [0.05, 0.2])

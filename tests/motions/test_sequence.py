@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from egs_warp.contact.terrain import Solid
 from egs_warp.errors import UserError
 from egs_warp.fem.body import BodyState
+from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.locomotion.trajectory import Trajectory
@@ -36,6 +40,15 @@ def test_facing_turns_the_way_and_not_the_body(place: Place) -> None:
     other = place.facing(np.array([0.0, 2.0, 5.0]))
     assert np.allclose(other.ground.axes, [[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     assert other.standing is place.standing
+
+
+@pytest.mark.parametrize(("slope", "rise", "height"), [(0.1, 0.05, 0.2), (-0.1, -0.05, 0.2), (0.4, 0.2, 0.3)])
+def test_a_jump_is_to_land_on_what_is_ahead(place: Place, slope: float, rise: float, height: float) -> None:
+    """Half a metre up or down a slope; over what is high by half of the asked 0.2 at least."""
+    normal = np.array([-slope, 0.0, 1.0]) / np.hypot(1.0, slope)
+    target = replace(place, solids=(Solid((Plane(normal, 0.0),)),)).landing(JumpTarget(0.5, 0.2))
+    assert (target.distance, target.rise, target.height) == pytest.approx((0.5, rise, height))
+    assert place.landing(JumpTarget(0.5, 0.2)) == JumpTarget(0.5, 0.2)
 
 
 class Waits:
