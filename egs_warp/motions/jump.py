@@ -55,6 +55,8 @@ FLAT = 0.7
 """Of the lean of the landing: what the body is not to be turned by at touch-down. It shears by so much less than its
 feet are ahead, and on its heels it would be thrown over them.
 """
+COMING = 0.1
+"""Of sqrt(g H): what comes up to its feet as fast has soles to be flat at all costs, what is slower in part."""
 BLEND = 0.3
 """Of sqrt(H / g): the time in which a phase's pose takes over from the last one's."""
 LETTING_GO = 0.6
@@ -337,8 +339,10 @@ class Jump:
         pose = self.pose.over_base(np.array([*goal[:2], seen.com[2] + dt * velocity[2]]), seen.base, heading)
         # What still comes up to its feet is turned until these are flat, for whoever stands on his heels cannot brake:
         # upright in the mean while it is sheared back, its sole would point up by half of that.
-        coming = seen.com[:2] - goal[:2]
-        flat = self.pose.over_base(seen.com, seen.base, heading) if coming @ seen.velocity[:2] < 0.0 else pose
+        ahead = goal[:2] - seen.com[:2]
+        closing = float(ahead @ seen.velocity[:2]) / max(float(np.linalg.norm(ahead)), 1e-9 * self.body.height)
+        coming = min(max(closing / (COMING * self.body.speed_unit), 0.0), 1.0)
+        flat = self.pose.over_base(np.array([*(goal[:2] - coming * ahead), seen.com[2]]), seen.base, heading)
         upright = self._grown(state.time + dt, TOUCHING_DOWN) * self._upright(state, flat)
         velocity, spin = self.pose.balanced(state, seen, velocity, upright, dt)
         # The ground catches what comes down; then little is asked of what comes to rest by itself.
