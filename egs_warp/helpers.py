@@ -5,7 +5,9 @@ from __future__ import annotations
 import atexit
 import os
 import threading
+import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from queue import SimpleQueue
 from typing import Any, Generic, TypeVar
@@ -20,7 +22,8 @@ class Task(Generic[T]):
 
     def __init__(self, work: Callable[[], T]) -> None:
         self._work = work
-        # Plain locks: Ctrl-C, which may come between any two lines of Python, leaves none of them taken for good.
+        # Plain locks: Ctrl-C, which may come between any two lines of Python, can leave one of this task taken, for
+        # which nobody waits any more, but none that a helper needs for the next.
         self._claim, self._over = threading.Lock(), threading.Lock()
         self._over.acquire()
         self._result: Any = None
@@ -55,8 +58,11 @@ class Task(Generic[T]):
 
 
 class Helpers:
-    """At most ``most`` threads, begun as they are needed. Not ``ThreadPoolExecutor``: a KeyboardInterrupt within its
-    ``submit`` can leave a lock taken for which its threads wait, and the end of the process for them."""
+    """At most ``most`` threads, one more begun with each of the first tasks.
+
+    Not ``ThreadPoolExecutor``: a KeyboardInterrupt within its ``submit`` can leave a lock taken for which its threads
+    wait, and the end of the process for them.
+    """
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -67,10 +73,12 @@ class Helpers:
     def begin(self, work: Callable[[], T]) -> Task[T]:
         """``work`` for a helper to do."""
         task = Task(work)
-        if len(self._threads) < self._most and (not self._threads or not self._tasks.empty()):
+        if len(self._threads) < self._most:
             thread = threading.Thread(target=self._help, name="helper", daemon=True)
-            self._threads.append(thread)
-            thread.start()
+            # Where there can be no more of them, who wants the result does the work.
+            with suppress(RuntimeError):
+                thread.start()
+                self._threads.append(thread)
         self._tasks.put(task)
         return task
 
@@ -78,9 +86,9 @@ class Helpers:
         """Helpers stop after what they are at."""
         for _ in self._threads:
             self._tasks.put(None)
+        latest = time.monotonic() + _PATIENCE
         for thread in self._threads:
-            if thread.ident is not None:
-                thread.join(_PATIENCE)
+            thread.join(max(latest - time.monotonic(), 0.0))
 
     def _help(self) -> None:
         while task := self._tasks.get():

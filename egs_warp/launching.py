@@ -258,12 +258,11 @@ def beside(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
         return first(), second()
     task = helpers().begin(second)
     try:
-        done = first()
+        return first(), task.result()
     except BaseException:
         # What it works with may be used again at once.
         task.settle()
         raise
-    return done, task.result()
 
 
 def device_of(array: wp.array) -> wp.Device:

@@ -78,17 +78,35 @@ def test_what_was_settled_never_begins() -> None:
 
 def test_an_error_is_told_to_who_wants_the_result() -> None:
     """And to nobody else: the thread goes on."""
-
-    def fails() -> None:
-        raise ValueError("over")
-
     one = Helpers(1)
     for _ in range(3):
+        begun = threading.Event()
+
+        def fails(begun: threading.Event = begun) -> None:
+            begun.set()
+            raise ValueError("over")
+
         task = one.begin(fails)
-        time.sleep(0.01)
+        assert begun.wait(10.0)
         with pytest.raises(ValueError, match="over"):
             task.result()
     one.end()
+
+
+def test_each_of_the_first_tasks_has_a_thread() -> None:
+    """Though the ones before are busy."""
+    go, begun = threading.Event(), [threading.Event(), threading.Event()]
+
+    def long(number: int) -> bool:
+        begun[number].set()
+        return go.wait(10.0)
+
+    two = Helpers(2)
+    tasks = [two.begin(lambda number=number: long(number)) for number in range(2)]
+    assert all(event.wait(10.0) for event in begun)
+    go.set()
+    assert all(task.result() for task in tasks)
+    two.end()
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")
@@ -96,9 +114,13 @@ def test_a_forked_process_has_helpers_of_its_own() -> None:
     assert helpers().begin(lambda: 3).result() == 3
     child = os.fork()
     if child == 0:
-        seen = threading.Event()
-        helpers().begin(seen.set)
-        os._exit(0 if seen.wait(10.0) else 1)
+        helped = False
+        try:
+            seen = threading.Event()
+            helpers().begin(seen.set)
+            helped = seen.wait(10.0)
+        finally:
+            os._exit(0 if helped else 1)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 

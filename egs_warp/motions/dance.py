@@ -272,7 +272,7 @@ class Dance:
             place = place.facing(way)
         else:
             distance = 0.0
-        target = place.landing(JumpTarget(distance, height))
+        target = JumpTarget(distance, height)
         straight = Jump(place, target, settled=True)
         if not stance.twists:
             return straight

@@ -104,9 +104,12 @@ class Place:
 
     def landing(self, target: JumpTarget) -> JumpTarget:
         """The ``target`` on what is ahead of the feet there, higher or lower, cleared by half of the asked height at
-        least."""
-        feet = sole_shares(self.body, self.ground, self.standing) @ self.standing
-        rise = self.rise_at(feet + target.distance * self.ground.axes[0]) - self.rise_at(feet)
+        least. Level over nothing, and before what is higher than the jump, as a wall or a lintel is."""
+        feet, up = sole_shares(self.body, self.ground, self.standing) @ self.standing, self.ground.axes[2]
+        ahead = surface_above(self.solids, feet + target.distance * self.ground.axes[0], up)
+        rise = ahead - surface_above(self.solids, feet, up)
+        if not np.isfinite(rise) or rise > target.height:
+            return target
         return replace(target, rise=rise, height=max(target.height, rise + 0.5 * target.height))
 
     def facing(self, direction: np.ndarray) -> Place:

@@ -19,6 +19,7 @@ from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.script import motion
 from egs_warp.motions.sequence import MotionSequence, Part, Place
 from egs_warp.motions.turn import Turn
+from egs_warp.motions.twist import twist
 from tests.support.places import DT, moved
 
 
@@ -49,6 +50,25 @@ def test_a_jump_is_to_land_on_what_is_ahead(place: Place, slope: float, rise: fl
     target = replace(place, solids=(Solid((Plane(normal, 0.0),)),)).landing(JumpTarget(0.5, 0.2))
     assert (target.distance, target.rise, target.height) == pytest.approx((0.5, rise, height))
     assert place.landing(JumpTarget(0.5, 0.2)) == JumpTarget(0.5, 0.2)
+
+
+def test_a_jump_is_level_before_a_wall_and_over_an_edge(place: Place) -> None:
+    """And under what is overhead."""
+    ground, asked = Solid((Plane(np.array([0.0, 0.0, 1.0]), 0.0),)), JumpTarget(0.5, 0.2)
+    block = (Plane(np.array([0.0, 0.0, 1.0]), -2.5), Plane(np.array([-1.0, 0.0, 0.0]), 0.3))
+    lintel = Solid((*block, Plane(np.array([0.0, 0.0, -1.0]), 2.0)))
+    table = Solid((ground.faces[0], Plane(np.array([1.0, 0.0, 0.0]), -0.3)))
+    for solids in ((ground, Solid(block)), (ground, lintel), (table,)):
+        assert replace(place, solids=solids).landing(asked) == asked
+
+
+@pytest.mark.parametrize("name", ["jump", "twist"])
+def test_motions_jump_onto_what_is_ahead(place: Place, name: str) -> None:
+    step = Solid((Plane(np.array([0.0, 0.0, 1.0]), -0.1), Plane(np.array([-1.0, 0.0, 0.0]), 0.3)))
+    ground = Solid((Plane(np.array([0.0, 0.0, 1.0]), 0.0),))
+    target, stepped = JumpTarget(0.5, 0.2), replace(place, solids=(ground, step))
+    begun = motion("jump 0.5 0.2").parts(1.0)[0].begin(stepped) if name == "jump" else twist(stepped, target, 0.5)
+    assert isinstance(begun, Jump) and begun.target.rise == pytest.approx(0.1)
 
 
 class Waits:
