@@ -17,6 +17,7 @@ from egs_warp.contact.coupled_step import (
     ANSWERED,
     CREEPS,
     ITERATIONS,
+    JOINING,
     MEMORY,
     PUSH_OUT,
     ROUNDS,
@@ -68,6 +69,8 @@ class BatchResult(Worlds):
     """(c,) int64."""
     lost: torch.Tensor
     """(c,) bool: a tangent had no factors, ``UnsolvableStepError``."""
+    joined: torch.Tensor
+    """(c,) bool: it ended where points were found that are to join."""
 
 
 @dataclass(frozen=True)
@@ -136,20 +139,22 @@ class BatchSolver:
             forces.clone(),
             torch.zeros(count, dtype=torch.bool, device=velocities.device),
             torch.zeros(count, dtype=torch.int64, device=velocities.device),
-            torch.zeros(count, dtype=torch.bool, device=velocities.device),
+            *torch.zeros((2, count), dtype=torch.bool, device=velocities.device),
         )
         todo = every = torch.arange(count, device=velocities.device)
         for number in range(ROUNDS):
             part, touched = problem.kept(todo), contacts.kept(todo)
-            task = _Task(part, touched, self.shift(touched, problem.dt), tensions[todo], frictions[todo])
-            done, left = self._round(task, response, whole.velocities[todo], whole.forces[todo])
+            shift, gaps = self.shift(touched, problem.dt), start_gaps[0][todo]
+            task = _Task(part, touched, shift, tensions[todo], frictions[todo], gaps)
+            last = number == ROUNDS - 1
+            done, left = self._round(task, response, whole.velocities[todo], whole.forces[todo], last=last)
             done = replace(done, iterations=done.iterations + whole.iterations[todo])
             whole.put(todo, done)
-            if number == ROUNDS - 1:
+            if last:
                 break
             with self.stages("detect"):
-                added, ends = self._added(part, touched, done, [each[todo] for each in start_gaps])
-            more = indices(added.any(dim=1) & done.converged)
+                added, ends = self._added(task, done.velocities)
+            more = indices(added.any(dim=1) & (done.converged | done.joined))
             if len(more) == 0:
                 break
             new = self.detector.contacts(added[more], *(each[todo[more]] for each in start_gaps), order=ends[more])
@@ -164,20 +169,20 @@ class BatchSolver:
             response = self.respond(problem.kept(todo), grown, left.turning.of(more))
         return contacts, whole
 
-    def _added(
-        self, problem: BatchProblem, contacts: BatchContacts, done: BatchResult, start_gaps: list[torch.Tensor]
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """(c, P) bool: the points that would end too deep; (c, P) metres, the gaps of all at the end."""
-        gaps, _ = self.detector.gaps(problem.end_positions(done.velocities))
+    def _added(self, task: _Task, velocities: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """(c, P) bool: the points that would end too deep by ``velocities`` (c, N, 3); (c, P) metres, the gaps of all
+        at the end."""
+        gaps, _ = self.detector.gaps(task.problem.end_positions(velocities))
         tolerance = self.penetration_tolerance
         allowed = torch.where(gaps < -tolerance, CREEPS * tolerance, SINKS * tolerance)
-        sinking = torch.where(gaps < start_gaps[0] - allowed, gaps, 0.0)
-        return self.detector.deeper(contacts, sinking, ADDED * tolerance), gaps
+        sinking = torch.where(gaps < task.start_gaps - allowed, gaps, 0.0)
+        return self.detector.deeper(task.contacts, sinking, ADDED * tolerance), gaps
 
     def _round(
-        self, task: _Task, response: BatchResponse, velocities: torch.Tensor, forces: torch.Tensor
+        self, task: _Task, response: BatchResponse, velocities: torch.Tensor, forces: torch.Tensor, *, last: bool
     ) -> tuple[BatchResult, BatchResponse]:
-        """Newton's method with the task's contacts; the last tangents' response comes along."""
+        """Newton's method with the task's contacts, until points are found that are to join, but in the ``last`` round;
+        the last tangents' response comes along."""
         with self.stages("elasticity"):
             every = _Search.begin(velocities, forces, *task.missing(velocities, forces))
         for iteration in range(1, ITERATIONS + 1):
@@ -187,6 +192,9 @@ class BatchSolver:
             part, search = task.kept(active), every.kept(active)
             search.iterations.fill_(iteration)
             slow = self._step(part, search, response.kept(active), first=iteration == 1)
+            looking = indices(search.near)
+            if len(looking) > 0 and not last:
+                self._look(part.kept(looking), search, looking)
             fresh = indices(slow & search.active)
             if len(fresh) > 0:
                 again = part.kept(fresh)
@@ -198,7 +206,15 @@ class BatchSolver:
                 search.active[fresh] = factored
             if search is not every:
                 every.put(active, search)
-        return BatchResult(every.velocities, every.forces, every.converged, every.iterations, every.lost), response
+        ends = every.velocities, every.forces, every.converged, every.iterations, every.lost, every.joined
+        return BatchResult(*ends), response
+
+    def _look(self, task: _Task, search: _Search, places: torch.Tensor) -> None:
+        """Whether points are to join in the worlds of the ``task``, which are at ``places`` of the ``search``."""
+        with self.stages("detect"):
+            added, _ = self._added(task, search.velocities[places])
+        joined = added.any(dim=1)
+        search.joined[places], search.active[places] = joined, ~joined
 
     def _step(self, task: _Task, search: _Search, response: BatchResponse, *, first: bool) -> torch.Tensor:
         """One Newton step of each world in ``search``, which has it then; (c,) bool, where the tangent is to be made
@@ -234,6 +250,7 @@ class BatchSolver:
         recent = torch.cat([search.recent[:, 1:], search.size[:, None]], dim=1)
         search.recent.copy_(torch.where(better[:, None], recent, search.recent))
         search.converged.copy_(whole & (search.size <= self.tolerance) & ~unanswered)
+        search.near.copy_(whole & (before > JOINING) & (search.size <= JOINING) & ~unanswered & ~search.converged)
         given_up = (~better & search.fresh) | (search.unanswered > UNANSWERED)
         search.active.copy_(~search.converged & ~given_up)
         search.fresh.fill_(False)
@@ -253,6 +270,8 @@ class _Task(Worlds):
     """(c, M) newtons."""
     frictions: torch.Tensor
     """(c,)."""
+    start_gaps: torch.Tensor
+    """(c, P) metres."""
 
     def missing(self, velocities: torch.Tensor, forces: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """(c, N, 3) N s, the residual without contact at ``velocities`` (c, N, 3), and (c,) the size of that with
@@ -289,12 +308,16 @@ class _Search(Worlds):
     """(c,) bool."""
     lost: torch.Tensor
     """(c,) bool."""
+    near: torch.Tensor
+    """(c,) bool: by its last step the end is known well enough to look for points that are to join."""
+    joined: torch.Tensor
+    """(c,) bool: there were some."""
 
     @classmethod
     def begin(cls, velocities: torch.Tensor, forces: torch.Tensor, free: torch.Tensor, size: torch.Tensor) -> _Search:
         """All worlds are to go."""
         count, device = len(size), size.device
         numbers = torch.zeros((2, count), dtype=torch.int64, device=device)
-        active, fresh, converged, lost = torch.zeros((4, count), dtype=torch.bool, device=device)
-        recent = size.new_full((count, MEMORY), -1.0)
-        return cls(velocities, forces, free, size, recent, numbers[0], numbers[1], ~active, fresh, converged, lost)
+        flags = torch.zeros((6, count), dtype=torch.bool, device=device)
+        flags[0] = True
+        return cls(velocities, forces, free, size, size.new_full((count, MEMORY), -1.0), *numbers, *flags)

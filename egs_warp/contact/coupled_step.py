@@ -25,6 +25,9 @@ PUSH_OUT = 0.2
 """Of the depth beyond the tolerance, a step."""
 ADDED = 0.6
 """Of the tolerance: points that would end deeper join at once."""
+JOINING = 1e-3
+"""Residual over dt x weight below which a round that comes down to it looks for them, as at its end: by then it is
+known well enough where that is."""
 SINKS = 0.3
 """Of the tolerance: by how much what is deep already may go deeper in a step; by next to nothing beyond the tolerance.
 """
@@ -88,14 +91,13 @@ class CoupledSolver:
         problem = response.tangent.problem
         iterations = tangents = 0
         for number in range(ROUNDS):
-            result = self._round(response, tension, velocities, forces)
+            result, added = self._round(response, tension, velocities, forces, last=number == ROUNDS - 1)
             response = result.response
             iterations, tangents = iterations + result.iterations, tangents + result.tangents
             velocities, forces = result.velocities, result.forces
-            contacts = response.contacts
-            added = self._sinking(problem, contacts, velocities)
-            if not result.converged or len(added) == 0 or number == ROUNDS - 1:
+            if len(added) == 0:
                 break
+            contacts = response.contacts
             contacts = self.detector.contact_set(np.concatenate([contacts.points, added]), problem.state.positions)
             response = response.wider(contacts)
             forces = np.vstack([forces, np.zeros((len(added), 3))])
@@ -113,12 +115,21 @@ class CoupledSolver:
         return self.points.deeper(contacts.points, np.where(gaps < start_gaps - allowed, gaps, 0.0), depth)
 
     def _round(
-        self, response: ContactResponse, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray
-    ) -> CoupledResult:
+        self,
+        response: ContactResponse,
+        tension: MuscleTension | None,
+        velocities: np.ndarray,
+        forces: np.ndarray,
+        *,
+        last: bool,
+    ) -> tuple[CoupledResult, np.ndarray]:
+        """With the contacts of ``response``: where it ends, or where points are found that are to join them, and these
+        (k,); none in the ``last`` round."""
         problem, contacts = response.tangent.problem, response.contacts
         shift = self.shift(contacts, problem.dt)
         friction = self.detector.geometry.friction
         answered = ANSWERED * problem.unit / problem.body.mass
+        none = contacts.points[:0]
         tangents, unanswered, fresh = 0, 0, False
         now = trial = response.at(tension, velocities, forces)
         recent: list[float] = []
@@ -139,8 +150,14 @@ class CoupledSolver:
                 before, now = now, trial
                 recent = [*recent[1 - MEMORY :], now.size]
                 # After a whole step the contact velocities are those that were solved for, by linearity.
-                if length == 1.0 and now.size <= self.tolerance and missed <= answered:
-                    return _result(now, True, iteration, tangents)
+                obeys = length == 1.0 and missed <= answered
+                ended = obeys and now.size <= self.tolerance
+                if obeys and not last and (ended or before.size > JOINING >= now.size):
+                    added = self._sinking(problem, contacts, now.velocities)
+                    if len(added) > 0:
+                        return _result(now, ended, iteration, tangents), added
+                if ended:
+                    return _result(now, True, iteration, tangents), none
                 slow = (iteration > 1 and now.size > SLOW * before.size) or length < 1.0 or missed > answered
             else:
                 slow = True
@@ -153,7 +170,7 @@ class CoupledSolver:
                 response = self.respond(problem.tangent(self.factors, now.velocities, tension), contacts)
                 now = now.by(response)
                 tangents, fresh = tangents + 1, True
-        return _result(now, False, iteration, tangents)
+        return _result(now, False, iteration, tangents), none
 
 
 def _result(end: Iterate, converged: bool, iterations: int, tangents: int) -> CoupledResult:
