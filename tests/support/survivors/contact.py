@@ -109,8 +109,8 @@ CONTACT = [
     ),
     Survivor(
         "contact/batch_step.py",
-        "sinking = torch.where(gaps < start_gaps[0] - allowed, gaps, 0.0)",
-        "sinking = torch.where(gaps < start_gaps[0] - allowed, gaps, 1.0)",
+        "sinking = torch.where(gaps < task.start_gaps - allowed, gaps, 0.0)",
+        "sinking = torch.where(gaps < task.start_gaps - allowed, gaps, 1.0)",
         "what does not sink joins neither at 0 nor at a metre: only what is deep does",
     ),
     Survivor(
