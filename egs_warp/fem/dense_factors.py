@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from functools import cached_property, partial
+from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sparse
@@ -10,6 +12,7 @@ import torch
 
 from egs_warp.fem.graphs import GraphStream, Recordings, Upload
 from egs_warp.fem.kept import Kept
+from egs_warp.fem.slabs import Slabs
 
 _LARGEST = 64
 """Rows of the blocks of a triangle that are inverted at once."""
@@ -18,8 +21,8 @@ _LARGEST = 64
 class DenseFactors:
     """Cholesky factors L of symmetric matrices of one pattern; see ``Factors``.
 
-    L^-1 is made once a matrix, by halves: a triangular solve takes as long for one right-hand side as for a thousand, a
-    product with L^-1 a fiftieth of that.
+    L^-1 is made once a matrix: a triangular solve takes as long for one right-hand side as for a thousand, a product
+    with L^-1 a fiftieth of that.
     """
 
     host = False
@@ -33,9 +36,10 @@ class DenseFactors:
         self.stream = GraphStream(self.device)
         self._upper = torch.from_numpy(rows * count + columns).to(self.device)
         self._lower = torch.from_numpy(columns * count + rows).to(self.device)
-        self._matrix, self._other = torch.zeros((2, count, count), dtype=torch.float64, device=self.device)
-        self._entries, self._diagonal = self._matrix.new_zeros(len(rows)), self._matrix.new_zeros(count)
-        self._triangle = _Triangle(count, self.device)
+        self._root = _InverseRoot(Slabs.of(upper_pattern), self.stream)
+        self._places = self._root.places_of(rows, columns)
+        self._other = torch.zeros((count, count), dtype=torch.float64, device=self.device)
+        self._entries, self._diagonal = self._other.new_zeros(len(rows)), self._other.new_zeros(count)
         self._told = self.stream.pinned(2)
         self._factored = self.stream.recorded(self._factor)
         self._strain_told, self._strain_entries = Upload(self.stream, 3 * count), torch.zeros_like(self._entries)
@@ -59,12 +63,11 @@ class DenseFactors:
         self._begun = True
 
     def _factor(self) -> None:
-        """L^-1 of what lies in the entries and the diagonal, and whether these are finite and make it definite."""
-        self._matrix.view(-1)[self._lower] = self._entries
-        self._matrix.diagonal().add_(self._diagonal)
-        factor, info = torch.linalg.cholesky_ex(self._matrix)
-        self._triangle.invert(factor)
-        told = torch.stack([self._entries.isfinite().all(), info == 0]).to(torch.float64)
+        """Of what lies in the entries and the diagonal, and whether these are finite and make it definite."""
+        self._root.matrix.view(-1)[self._places] = self._entries
+        self._root.matrix.diagonal().add_(self._diagonal[self._root.order])
+        definite = self._root.make()
+        told = torch.stack([self._entries.isfinite().all(), definite]).to(torch.float64)
         self._told.copy_(told, non_blocking=True)
 
     def add(self, across: np.ndarray, rates: np.ndarray) -> bool:
@@ -73,12 +76,8 @@ class DenseFactors:
         if not self._finite or not (np.isfinite(across).all() and np.isfinite(rates).all()):
             return False
         with self.stream:
-            directions = self._take(across)
-            both = torch.addmm(self._matrix, directions * self._take(rates), directions.T)
-            factor, info = torch.linalg.cholesky_ex(both)
-            if int(info) != 0:
+            if not self._root.make_with(self._take(across), self._take(rates)):
                 return False
-            self._triangle.invert(factor)
         self._ready = True
         return True
 
@@ -105,8 +104,8 @@ class DenseFactors:
 
     @property
     def inverse(self) -> torch.Tensor:
-        """(n, n) L^-1, a lower triangle, on the device, always in the same place."""
-        return self._triangle.inverse
+        """(n, n) R of S^-1 = R^T R, L^-1 in another order of unknowns, on the device, always in the same place."""
+        return self._root.inverse
 
     def _solve(self, right: torch.Tensor) -> torch.Tensor:
         return self.inverse.T @ (self.inverse @ right)
@@ -165,8 +164,82 @@ class DenseFactors:
         return values.cpu().numpy()
 
 
+class _InverseRoot:
+    """R of S^-1 = R^T R for symmetric matrices S (n, n) of one pattern: L^-1 of S in the order of its slabs, columns in
+    that of S.
+
+    With parts D_i, what is between them C and what joins them B_i, L_i = chol(D_i) are factored at once, then
+    chol(C - sum B_i D_i^-1 B_i^T).
+    """
+
+    def __init__(self, slabs: Slabs, stream: GraphStream) -> None:
+        order, device = slabs.order, stream.device
+        count = len(order)
+        place = np.empty(count, dtype=np.int64)
+        place[order] = np.arange(count)
+        self._place_here, self._stream = place, stream
+        self._place, self.order = (torch.from_numpy(each).to(device) for each in (place, order.astype(np.int64)))
+        self.matrix, self.inverse, self._made = torch.zeros((3, count, count), dtype=torch.float64, device=device)
+        """Of these the lower triangle of S in the order of the slabs, R, and R whose columns are in that order, too."""
+        ends = np.cumsum([0, *(len(part) for part in slabs.parts)]).tolist()
+        self._parts = [slice(first, last) for first, last in pairwise(ends)]
+        self._between = slice(ends[-1], count)
+        self._triangles = [_Triangle(part.stop - part.start, device) for part in self._parts]
+        # What joins a part to those between them, by its factor, and that by its factor once more.
+        self._across, self._far = self._made.new_zeros((2, len(slabs.between), ends[-1]))
+        self._definite = torch.zeros(len(self._parts) + 1, dtype=torch.bool, device=device)
+        self._definite[-1] = True
+
+    @cached_property
+    def _last(self) -> _Triangle:
+        """Of what lies between."""
+        return _Triangle(self._between.stop - self._between.start, self._stream.device)
+
+    @cached_property
+    def _whole(self) -> _Triangle:
+        return _Triangle(len(self.order), self._stream.device)
+
+    def places_of(self, rows: np.ndarray, columns: np.ndarray) -> torch.Tensor:
+        """Where the entries at ``rows`` and ``columns`` of one triangle lie in the flat ``matrix``."""
+        one, other = self._place_here[rows], self._place_here[columns]
+        places = np.maximum(one, other) * len(self.order) + np.minimum(one, other)
+        return torch.from_numpy(places).to(self._stream.device)
+
+    def make(self) -> torch.Tensor:
+        """R of what lies in the ``matrix``; () bool, whether that is definite."""
+        self._stream.at_once([partial(self._factor_part, number) for number in range(len(self._parts))])
+        last = self._between
+        if last.stop > last.start:
+            left = torch.addmm(self.matrix[last, last], self._across, self._across.T, alpha=-1.0)
+            self._definite[-1] = self._last.factor(left)
+            self._made[last, last] = self._last.inverse
+            torch.mm(self._last.inverse, self._far, out=self._across)
+            torch.neg(self._across, out=self._made[last, : last.start])
+        self._give(self._made)
+        return self._definite.all()
+
+    def _factor_part(self, number: int) -> None:
+        part, last, triangle = self._parts[number], self._between, self._triangles[number]
+        self._definite[number] = triangle.factor(self.matrix[part, part])
+        self._made[part, part] = triangle.inverse
+        if last.stop > last.start:
+            torch.mm(self.matrix[last, part], triangle.inverse.T, out=self._across[:, part])
+            torch.mm(self._across[:, part], triangle.inverse, out=self._far[:, part])
+
+    def make_with(self, across: torch.Tensor, rates: torch.Tensor) -> bool:
+        """R of the ``matrix`` and ``across`` (n, m) diag(``rates``) across^T, if that is definite; else it stays."""
+        directions = across[self.order]
+        if not bool(self._whole.factor(torch.addmm(self.matrix, directions * rates, directions.T))):
+            return False
+        self._give(self._whole.inverse)
+        return True
+
+    def _give(self, made: torch.Tensor) -> None:
+        torch.index_select(made, 1, self._place, out=self.inverse)
+
+
 class _Triangle:
-    """Inverses of lower triangles of one size: of small blocks on the diagonal at once, then of pairs of them."""
+    """Inverses of Cholesky factors of one size: of small blocks on the diagonal at once, then of pairs of them."""
 
     def __init__(self, count: int, device: torch.device) -> None:
         pairs = max(0, math.ceil(math.log2(count / _LARGEST)))
@@ -180,8 +253,13 @@ class _Triangle:
 
         self.inverse = self._made[:count, :count]
 
-    def invert(self, lower: torch.Tensor) -> None:
-        """``lower`` (n, n) into ``inverse``."""
+    def factor(self, matrix: torch.Tensor) -> torch.Tensor:
+        """``inverse`` of the factor of the lower triangle of a ``matrix`` (n, n); () bool, whether it has one."""
+        factor, info = torch.linalg.cholesky_ex(matrix)
+        self._invert(factor)
+        return info == 0
+
+    def _invert(self, lower: torch.Tensor) -> None:
         self._given[: self._count, : self._count] = lower
         side = self._side
         small = _blocks(self._given, side, side, 0)

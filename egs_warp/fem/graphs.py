@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
@@ -25,6 +25,7 @@ class GraphStream:
         if device.type == "cuda":
             self._stream = wp.stream_to_torch(wp.get_device(str(device)).stream)
         self._entered: list[AbstractContextManager[Any]] = []
+        self._others: list[Any] = []
         self._pool: Any = None
         self._first: Any = None
 
@@ -48,6 +49,26 @@ class GraphStream:
         event = event or torch.cuda.Event()
         event.record(self._stream)
         return event
+
+    def at_once(self, works: Sequence[Callable[[], None]]) -> None:
+        """``works`` of torch, each of which leaves alone what the others touch; what is asked for next comes after all
+        of them."""
+        if self._stream is None:
+            for work in works:
+                work()
+            return
+        while len(self._others) < len(works) - 1:
+            self._others.append(torch.cuda.Stream(self.device))
+        begun, *ended = (torch.cuda.Event() for _ in works)
+        begun.record(self._stream)
+        for work, other, end in zip(works[1:], self._others, ended, strict=False):
+            other.wait_event(begun)
+            with torch.cuda.stream(other):
+                work()
+            end.record(other)
+        works[0]()
+        for end in ended:
+            self._stream.wait_event(end)
 
     def recorded(self, work: Callable[[], None]) -> Callable[[], None]:
         """``work``, which is run as it is the first time: nothing may be compiled or made while it is recorded, the

@@ -8,6 +8,7 @@ import scipy.sparse as sparse
 import warp as wp
 
 from egs_warp.fem.factors import factors_on
+from egs_warp.fem.slabs import Slabs
 from egs_warp.fem.sparse_factors import SparseFactors
 
 pytest.importorskip("torch")
@@ -32,6 +33,11 @@ def pattern(count: int) -> sparse.csc_matrix:
     return upper
 
 
+def band(count: int) -> sparse.csc_matrix:
+    """Upper triangle of a long body: all that is at most four places away."""
+    return sparse.csc_matrix(np.triu(np.tri(count, k=4).T.astype(float)) * (np.tri(count, k=4) > 0))
+
+
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("count", [1, 7, 64, 65, 130, 259])
 def test_matrices_of_every_size_are_inverted_by_halves(count: int, device: str) -> None:
@@ -49,6 +55,35 @@ def test_matrices_of_every_size_are_inverted_by_halves(count: int, device: str) 
             assert np.abs(matrix @ factors.solve(right) - right).max() < 1e-11
     entries[-1] = np.nan
     assert not dense.update(entries, diagonal) and not dense.ready and not thin.update(entries, diagonal)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_slabs_of_a_long_body_are_factored_at_once(device: str) -> None:
+    """As recorded work, too, and with a sum between two matrices; what is indefinite in a slab, or between them alone,
+    has no factors."""
+    count = 150
+    upper = band(count)
+    slabs = Slabs.of(upper)
+    assert len(slabs.parts) > 2
+    factors = DenseFactors(upper, device=device)
+    random = np.random.default_rng(0)
+    right, across, rates = random.normal(size=(count, 5)), random.normal(size=(count, 3)), np.array([2.0, -0.01, 1.0])
+    for seed in range(4):
+        entries = entries_of(upper, seed, 12.0)
+        half = sparse.csc_matrix((entries, upper.indices, upper.indptr), upper.shape).toarray()
+        matrix = half + np.triu(half, 1).T
+        assert factors.update(entries)
+        assert np.abs(matrix @ factors.solve(right) - right).max() < 1e-12
+        root = factors.inverse.cpu().numpy()
+        np.testing.assert_allclose(root.T @ root, np.linalg.inv(matrix), rtol=0, atol=1e-13)
+        assert factors.add(across, rates)
+        both = matrix + across * rates @ across.T
+        assert np.abs(both @ factors.solve(right) - right).max() < 1e-11
+    for wrong in (slabs.parts[0][0], slabs.parts[-1][-1], slabs.between[0]):
+        lower = np.zeros(count)
+        lower[wrong] = -40.0
+        assert not factors.update(entries, lower) and factors.update(entries)
+        assert np.abs(matrix @ factors.solve(right) - right).max() < 1e-12
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from functools import partial
 
 import numpy as np
 import pytest
@@ -69,3 +70,27 @@ def test_nobody_looks_for_garbage_while_work_is_recorded(device: str) -> None:
         with stream:
             again()
     assert gc.isenabled() and looks == ([True] * 3 if device == "cpu" else [True, False])
+
+
+def test_works_at_once_are_over_before_what_comes_next(device: str) -> None:
+    """And begin after what came before, run as they are and recorded: sums of long rows that the one before has
+    filled."""
+    stream, count = GraphStream(torch.device(device)), 1 << 20
+    told, rows = Upload(stream, 1), torch.zeros((4, count), dtype=torch.float64, device=device)
+    sums, here = torch.zeros(4, dtype=torch.float64, device=device), stream.pinned(1)
+
+    def add_up(place: int) -> None:
+        sums[place] = (place + 1) * rows[place].sum()
+
+    def work() -> None:
+        rows.copy_(told.there.expand_as(rows))
+        stream.at_once([partial(add_up, place) for place in range(4)])
+        here.copy_(sums.sum()[None], non_blocking=True)
+
+    again = stream.recorded(work)
+    for value in range(1, 6):
+        with stream:
+            told.take(np.array([float(value)]))
+            again()
+            stream.wait()
+        assert float(here[0]) == 10.0 * count * value
