@@ -11,6 +11,7 @@ import numpy as np
 
 from egs_warp.fem.body import SoftBody
 from egs_warp.fem.factors import Factors
+from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.contact_pieces import ContactPieces
 from egs_warp.locomotion.linear_step import LinearStep, LinearSteps, Prospect
 from egs_warp.locomotion.objectives import AnyObjective
@@ -19,10 +20,15 @@ from egs_warp.locomotion.step_cost import Horizon, QuadraticCost, effort_cost, o
 from egs_warp.locomotion.strategies import Foreseen, search_program
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.muscles.muscle_set import MuscleSet
+from egs_warp.muscles.tension import shortenings
 
 STEPS_A_UNIT = 19.0
 """Least number of steps in sqrt(H / g) within which a body can be steered."""
 _ORDINARY_STRENGTH = 4.0
+WORK = 10.0
+"""Cost of the square of what a muscle gives or takes in a step, in m g H: muscles that shorten are else set against
+others that they stretch (jumps of pawn, robot and monkey work 1.64, 1.78 and 1.54 m g H in place of 1.49, 1.34, 1.40).
+"""
 _FASTEST = 7.0
 """Bounds of activations, in their bounds a sqrt(H / g): how fast a muscle is switched on and off."""
 _REGULAR = 1e-7
@@ -114,7 +120,7 @@ class StepPlanner:
         cost = (
             objectives_cost(problem, linear, contacts, objectives, speed)
             + effort_cost(problem, linear, foreseen.ravel(), horizon)
-            + self._activation_cost(problem.dt, previous, linear.count)
+            + self._activation_cost(problem, foreseen, previous, linear.count)
         )
         speeds = linear.speeds(contacts)
         rows, offset = speeds[:, :-1] / speed, speeds[:, -1] / speed
@@ -128,13 +134,17 @@ class StepPlanner:
         start = self.synergies.mean(prospect.activations / self.muscles.bounds)
         return StepProgram(pieces, Foreseen(start, prospect.forces / weight, slip), linear, speeds)
 
-    def _activation_cost(self, dt: float, previous: np.ndarray, count: int) -> QuadraticCost:
-        """Of ``count`` unknowns that begin with the activations, how large they are and how they change from
-        ``previous`` (m,)."""
-        settings = self.settings
-        share = dt * STEPS_A_UNIT / self.body.time_unit
+    def _activation_cost(
+        self, problem: StepProblem, foreseen: np.ndarray, previous: np.ndarray, count: int
+    ) -> QuadraticCost:
+        """Of ``count`` unknowns that begin with the activations, how large they are, what their muscles give or take
+        on the way to the end of ``foreseen`` (N, 3) m/s, and how they change from ``previous`` (m,)."""
+        settings, body = self.settings, self.body
+        share = problem.dt * STEPS_A_UNIT / body.time_unit
         strengths, squares = self._strengths
-        size = settings.activation_weight * share**2 * strengths
+        shorter = shortenings(self.muscles, problem.state.positions, problem.end_positions(foreseen))
+        works = self.muscles.max_forces * shorter / (body.weight * body.height)
+        size = settings.activation_weight * share**2 * strengths + WORK * (self.synergies.members.T @ works**2)
         change = settings.activation_change_weight * share * squares
         diagonal, q = np.zeros(count), np.zeros(count)
         diagonal[: len(previous)] = 2.0 * (size + change) + _REGULAR

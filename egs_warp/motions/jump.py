@@ -157,6 +157,7 @@ class Jump:
             gravity=self.gravity,
             step=self._step,
             lean=min(LEAN * target.distance, self._furthest_lean),
+            friction=self.pose.friction,
             landing_time=self._landing_time,
             style=self._style,
         )

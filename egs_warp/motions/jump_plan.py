@@ -18,9 +18,14 @@ FURTHEST_LEAN = 0.35
 """Of the way from under the centre of mass to the front of the feet."""
 DEEPEST_CROUCH = 0.26
 """Of the height of the centre of mass, deeper ones crush elements to a fifth; a higher jump thrusts harder instead."""
-PUSH = 2.4
+PUSH = 2.8
 """Of gravity: mean acceleration of a thrust. A harder one takes a shallower crouch, which strains a stiff body less.
 """
+GRIPPING = 0.9
+"""Of what friction gives while a thrust lasts: what its speed ahead may take. A thrust to which it would give less
+lasts longer, in a crouch that is deeper by ``DEEPER`` body heights at most."""
+SHALLOWEST, DEEPER = 0.02, 0.02
+"""Body heights that a crouch is deep at least, without the way of half a step; and more for the sake of friction."""
 ONSET, RAMP = 0.3, 0.4
 """Share of its full strength with which a thrust begins, where the crouch has left it, and share of its time until it
 is reached.
@@ -196,6 +201,7 @@ def plan_jump(
     gravity: float,
     step: float,
     lean: float,
+    friction: float = np.inf,
     landing_time: float = 0.0,
     style: Style | None = None,
 ) -> JumpPlan:
@@ -203,31 +209,37 @@ def plan_jump(
     (docs/concepts/motions.md).
 
     Its centre of mass is ``com_height`` over the ground and the front of its feet ``support_ahead`` of it, gravity is
-    in m/s^2, a solver step takes ``step`` seconds, ``lean`` is that of the plan, and the fall is stopped within
-    ``landing_time`` seconds; metres.
+    in m/s^2, a solver step takes ``step`` seconds, ``lean`` is that of the plan, ``friction`` the ground's, and the
+    fall is stopped within ``landing_time`` seconds; metres.
     """
     style = style or Style()
     time_unit = np.sqrt(height / gravity)
     extension = min(_EXTENSION * height, _EXTENDED * target.height)
     rise = target.height - extension
     speed_up = np.sqrt(2.0 * gravity * rise) + 0.5 * gravity * step
-    acceleration = PUSH * gravity / style.timing
-    stroke = max(speed_up**2 / (2.0 * acceleration), extension + 0.02 * height)
-    # Every step goes its whole way at the speed of its end: half a step's way more than the thrust itself.
-    stroke += 0.5 * speed_up * step
-    crouch_depth = min(style.anticipation * (stroke - extension), DEEPEST_CROUCH * com_height)
-    way = crouch_depth + extension - 0.5 * speed_up * step
-    thrust_time = max(way / (ramped(1.0)[1] * speed_up), 2.0 * step)
     flight_time = np.sqrt(2.0 * rise / gravity) + np.sqrt(2.0 * max(rise - target.rise, 0.0) / gravity)
     # The front of the footprint helps a body that comes in to stop over its base.
     fall_speed = np.sqrt(2.0 * gravity * max(rise - target.rise, 0.0))
     capture_time = stopping_time(com_height, fall_speed, gravity, landing_time)
     footprint_help = min(0.3 * support_ahead, 0.5 * target.distance * capture_time / flight_time)
+    crouch_time = np.ceil(style.anticipation * style.timing * 1.1 * time_unit / step) * step
+    acceleration = PUSH * gravity / style.timing
+    shortest = extension + SHALLOWEST * height
+    stroke = max(speed_up**2 / (2.0 * acceleration), shortest)
+    # A low jump far ahead is long on the ground: what friction gives ahead goes with what presses, speed up and weight.
+    ahead = (target.distance - lean + footprint_help) / (flight_time + capture_time) - CARRIED * lean / crouch_time
+    needed = (ahead / (GRIPPING * friction) - speed_up) / gravity
+    stroke = max(stroke, min(ramped(1.0)[1] * speed_up * needed, shortest + DEEPER * height))
+    # Every step goes its whole way at the speed of its end: half a step's way more than the thrust itself.
+    stroke += 0.5 * speed_up * step
+    crouch_depth = min(style.anticipation * (stroke - extension), DEEPEST_CROUCH * com_height)
+    way = crouch_depth + extension - 0.5 * speed_up * step
+    thrust_time = max(way / (ramped(1.0)[1] * speed_up), 2.0 * step)
     speed_forward = (target.distance - lean + footprint_help) / (flight_time + capture_time + 0.5 * thrust_time)
     return JumpPlan(
         crouch_depth=float(crouch_depth),
         extension=float(extension),
-        crouch_time=float(np.ceil(style.anticipation * style.timing * 1.1 * time_unit / step) * step),
+        crouch_time=float(crouch_time),
         thrust_time=float(thrust_time),
         flight_time=float(flight_time),
         speed_up=float(speed_up),

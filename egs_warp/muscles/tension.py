@@ -26,6 +26,12 @@ def lines(rows: sparse.csr_matrix, positions: np.ndarray) -> tuple[np.ndarray, n
     return vectors, np.maximum(np.linalg.norm(vectors, axis=1), 1e-300)
 
 
+def shortenings(muscles: MuscleSet, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """(M,) metres by which segments are shorter at node positions ``end`` (N, 3) than at ``start`` (N, 3)."""
+    rows = muscles.difference_rows
+    return lines(rows, start)[1] - lines(rows, end)[1]
+
+
 def shares_of_tension(shortened: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """phi, its integral from 0 and its derivative, each (M,), at lengths over rest lengths ``shortened`` (M,).
 

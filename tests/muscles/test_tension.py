@@ -16,7 +16,7 @@ from egs_warp.geometry.plane import Plane
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.muscles.fibres import Fibre, FibreKind
 from egs_warp.muscles.muscle_set import MuscleSet, attach_fibres
-from egs_warp.muscles.tension import GroupImpulses, MuscleTension, muscle_columns
+from egs_warp.muscles.tension import GroupImpulses, MuscleTension, muscle_columns, shortenings
 from tests.support.creatures import coarse_pawn
 from tests.support.meshes import box_mesh
 from tests.support.passive import passive_body
@@ -46,6 +46,14 @@ def dense(tension: MuscleTension, x: np.ndarray) -> np.ndarray:
     """(3N, 3N) stiffness of all segments."""
     across, rates = tension.hessian(x).factors(least=0.0)
     return (across * rates) @ across.T
+
+
+def test_segments_of_a_rod_that_is_pressed_are_shorter() -> None:
+    """By a tenth of their rest length each, at whatever place and turn it ends."""
+    muscles, turned = tendon(3), np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    pressed = (ROD.nodes * [1.0, 1.0, 0.9]) @ turned.T + [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(shortenings(muscles, ROD.nodes, pressed), 0.1 * muscles.rest_lengths, rtol=1e-9)
+    np.testing.assert_allclose(shortenings(muscles, pressed, ROD.nodes), -0.1 * muscles.rest_lengths, rtol=1e-9)
 
 
 @pytest.mark.parametrize("shortened", [1.0, 0.55, 0.2], ids=["long", "short", "slack"])

@@ -1,0 +1,90 @@
+"""What a step's activations cost, against the work of their muscles by hand, and what that is worth (Eq. 13)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egs_warp.fem.body import BodyState
+from egs_warp.fem.step_problem import StepProblem
+from egs_warp.locomotion import planner
+from egs_warp.locomotion.contact_pieces import ContactPieces
+from egs_warp.locomotion.objectives import AnyObjective, SpinObjective, centre_of_mass_velocity
+from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory, StepReport
+from tests.support.creatures import coarse_creature
+from tests.support.meshes import block_mesh
+from tests.support.places import DT
+
+
+def asked(stepper: LocomotionStepper, step: int) -> list[AnyObjective]:
+    """Down for five steps, then up ever faster, upright."""
+    up = -0.3 if step < 5 else min(0.3 * (step - 4), 0.9)
+    return [
+        centre_of_mass_velocity(stepper.body, np.array([0.0, 0.0, up]), 600.0),
+        SpinObjective(np.zeros(3), 600.0),
+    ]
+
+
+def thrust(steps: int) -> tuple[LocomotionStepper, list[BodyState], list[StepReport]]:
+    """A block that is ``asked`` for so many steps."""
+    creature = coarse_creature(block_mesh(), forward=np.array([1.0, 0.0, 0.0]))
+    stepper, states, memory = creature.stepper, [creature.start], creature.stepper.initial_memory()
+    reports: list[StepReport] = []
+    for step in range(steps):
+        end, memory, fresh = stepper.advance(states[-1], memory, asked(stepper, step), DT)
+        states.append(end)
+        reports += fresh
+    assert len(reports) == steps
+    return stepper, states, reports
+
+
+def works(stepper: LocomotionStepper, start: np.ndarray, end: np.ndarray, tensions: np.ndarray) -> np.ndarray:
+    """(M,) m g H that segments with ``tensions`` (M,) newtons give from node positions ``start`` to ``end`` (N, 3)."""
+    ends = [stepper.muscles.difference_rows @ positions for positions in (start, end)]
+    before, after = (np.linalg.norm(each, axis=1) for each in ends)
+    return tensions * (before - after) / (stepper.body.weight * stepper.body.height)
+
+
+def test_activations_cost_the_squares_of_what_their_muscles_give_or_take(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside it nothing changes: not the slope, not the cost of no activation, not that of contact forces."""
+    stepper, states, reports = thrust(7)
+    muscles, start = stepper.muscles, states[-1]
+    memory = StepMemory.after(reports[-1])
+    problem = StepProblem(stepper.body, start, DT, stepper.settings.drag)
+    prospect = stepper.foresee(problem, reports[-1].contacts, memory, memory.activations)
+
+    def pieces() -> ContactPieces:
+        return stepper.planner.program(prospect, memory.activations, asked(stepper, 7)).pieces
+
+    with_work = pieces()
+    P, q, constant = with_work.P.copy(), with_work.q.copy(), with_work.constant
+    monkeypatch.setattr(planner, "WORK", 0.0)
+    without = pieces()
+    np.testing.assert_allclose(q, without.q, rtol=1e-12)
+    assert constant == pytest.approx(without.constant, rel=1e-12)
+    ends = problem.end_positions(prospect.velocities)
+    given = works(stepper, start.positions, ends, muscles.stiffness * muscles.bounds)
+    assert given.max() > 1e-3 and given.min() < -1e-4
+    added = np.zeros(len(P))
+    for group, segments in enumerate(stepper.planner.synergies.members.T.toarray()):
+        added[group] = 2.0 * 10.0 * np.sum(given[segments > 0.0] ** 2)
+    np.testing.assert_allclose(P - without.P, np.diag(added), rtol=1e-9, atol=1e-9 * np.abs(P).max())
+
+
+def test_a_thrust_works_less(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And goes as fast: fewer muscles are stretched while they pull."""
+
+    def worked(steps: int = 8) -> tuple[float, float]:
+        stepper, states, reports = thrust(steps)
+        given = [
+            works(stepper, before.positions, report.state.positions, stepper.muscles.stiffness * report.activations)
+            for before, report in zip(states, reports, strict=False)
+        ]
+        up = stepper.body.centre_of_mass(states[-1].velocities)[2]
+        return float(np.sum(np.maximum(given, 0.0))), float(up)
+
+    work, speed = worked()
+    monkeypatch.setattr(planner, "WORK", 0.0)
+    more, same = worked()
+    assert work < 0.95 * more
+    assert speed == pytest.approx(same, rel=0.02)
