@@ -255,12 +255,12 @@ def summary(rows: list[Row]) -> dict[str, Any]:
             {key: row[key] for key in (*Case.__dataclass_fields__, "reason")} for row in rows if not row["success"]
         ],
         "aims": {
-            "ninety_percent_succeed": rate >= 0.9 if enough else None,
+            "ninety_five_percent_succeed": rate >= 0.95 if enough else None,
             "every_success_meets_the_audit": all(
                 row["audit"][name] <= bound for row in good if "audit" in row for name, bound in BOUNDS.items()
             ),
         },
-        "why_null": {} if enough else {"ninety_percent_succeed": f"{len(rows)} runs, not 100"},
+        "why_null": {} if enough else {"ninety_five_percent_succeed": f"{len(rows)} runs, not 100"},
     }
 
 
