@@ -15,7 +15,7 @@ from egs_warp.io import read_capture
 from egs_warp.locomotion.contact_pieces import ContactPieces
 from egs_warp.locomotion.objectives import SpinObjective, centre_of_mass_velocity, node_velocities
 from egs_warp.locomotion.rollout import FRAME_RATE, settle
-from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory
+from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory, linear_steps_by
 from egs_warp.locomotion.strategies import Foreseen
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.meshing.cage import build_cage
@@ -128,7 +128,8 @@ def animation_frames(
     body, muscles = bench.stepper.body, bench.stepper.muscles
     stepper = LocomotionStepper(body, muscles, bench.stepper.geometry, device=bench.device)
     synergies = grouped_segments(muscles, body.mesh.nodes, activations, seed)
-    stepper.planner = replace(stepper.planner, synergies=synergies)
+    steps = linear_steps_by(stepper.solver.respond, muscles, synergies)
+    stepper.planner = replace(stepper.planner, synergies=synergies, linear_steps=steps)
     # No point joins those that were chosen, however deep.
     stepper.solver = replace(stepper.solver, penetration_tolerance=np.inf)
     points = spread_points(bench, contacts)

@@ -117,7 +117,7 @@ class LocomotionStepper:
             geometry.friction,
             self.settings,
             factors_on(body.assembly.device, body.assembly.upper_pattern),
-            _linear_steps_by(self.solver.respond, muscles, synergies),
+            linear_steps_by(self.solver.respond, muscles, synergies),
         )
 
     def with_friction(self, friction: float) -> LocomotionStepper:
@@ -327,7 +327,7 @@ def _responder_by(factors: Factors, body: SoftBody, muscles: MuscleSet) -> Respo
     return DeviceResponder(factors, body, muscles)
 
 
-def _linear_steps_by(respond: Responder, muscles: MuscleSet, synergies: Synergies) -> LinearSteps:
+def linear_steps_by(respond: Responder, muscles: MuscleSet, synergies: Synergies) -> LinearSteps:
     """Where the responses of contact are."""
     if isinstance(respond, HostResponder):
         return HostLinearSteps(muscles, synergies)

@@ -56,3 +56,27 @@ def test_what_contact_answers_obeys_coulomb(table2: ModuleType) -> None:
         answered = table2.answered(frame, x)
         assert np.array_equal(answered[: pieces.activations], x[: pieces.activations])
         assert_coulomb(pieces, answered)
+
+
+def test_every_strategy_solves_frames_of_an_animation(table2: ModuleType) -> None:
+    """Their programs have the activations of its muscle groups alone, within whose bounds those that made it are."""
+    frames = table2.animation_frames(table2.body_named("pawn", "cpu", nodes=60), frames=6, activations=4, contacts=3)
+    assert len(frames) == 6
+    for frame in frames:
+        pieces = frame.pieces
+        assert (pieces.activations, pieces.contacts, len(frame.foreseen.activations)) == (4, 3, 4)
+        assert pieces.rows.shape == (9, 13) and pieces.P.shape == (13, 13)
+        assert (pieces.lower <= frame.known).all() and (frame.known <= pieces.upper).all()
+    figures = table2.solve_all(frames, QpSolver.DAQP, 4)
+    for strategy in Strategy:
+        qps, objective, true, _ = figures[strategy].T
+        assert qps.min() >= 1 and np.isfinite(objective).all() and np.isfinite(true).all(), strategy
+    made = np.array(
+        [
+            frame.pieces.objective(table2.answered(frame, np.append(frame.known, frame.foreseen.forces)))
+            for frame in frames
+        ]
+    )
+    # Those that see every contact state, or the cone, do as well as the activations that made the frames.
+    for strategy in (Strategy.PIECES, Strategy.EXACT):
+        assert (figures[strategy][:, 2] <= made + 1e-6).all(), strategy
