@@ -24,6 +24,7 @@ PUSH = 2.8
 GRIPPING = 0.9
 """Of what friction gives while a thrust lasts: what its speed ahead may take. A thrust to which it would give less
 lasts longer, in a crouch that is deeper by ``DEEPER`` body heights at most."""
+_LEAST_FRICTION = 1e-6
 SHALLOWEST, DEEPER = 0.02, 0.02
 """Body heights that a crouch is deep at least, without the way of half a step; and more for the sake of friction."""
 ONSET, RAMP = 0.3, 0.4
@@ -228,7 +229,7 @@ def plan_jump(
     stroke = max(speed_up**2 / (2.0 * acceleration), shortest)
     # A low jump far ahead is long on the ground: what friction gives ahead goes with what presses, speed up and weight.
     ahead = (target.distance - lean + footprint_help) / (flight_time + capture_time) - CARRIED * lean / crouch_time
-    needed = (ahead / (GRIPPING * friction) - speed_up) / gravity
+    needed = (ahead / (GRIPPING * max(friction, _LEAST_FRICTION)) - speed_up) / gravity
     stroke = max(stroke, min(ramped(1.0)[1] * speed_up * needed, shortest + DEEPER * height))
     # Every step goes its whole way at the speed of its end: half a step's way more than the thrust itself.
     stroke += 0.5 * speed_up * step

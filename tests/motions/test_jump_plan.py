@@ -149,6 +149,25 @@ def test_a_thrust_lasts_until_friction_has_given_the_speed_ahead(distance: float
         assert deeper == pytest.approx(0.02) and spare(easy) < 0.0 < spare(plan)
     else:
         assert deeper == pytest.approx(0.02) and spare(plan) < 0.0
+    # Without friction nothing is given: as deep as where it gives too little.
+    assert planned(0.0).crouch_depth - easy.crouch_depth == pytest.approx(0.02)
+
+
+def test_a_jump_on_the_spot_needs_no_friction() -> None:
+    plans = [
+        plan_jump(
+            JumpTarget(0.0, 0.2),
+            height=1.0,
+            com_height=0.45,
+            support_ahead=0.1,
+            gravity=GRAVITY,
+            step=STEP,
+            lean=0.0,
+            friction=friction,
+        )
+        for friction in (0.0, 0.8, np.inf)
+    ]
+    assert plans[0] == plans[1] == plans[2]
 
 
 def test_a_given_lean_is_kept() -> None:
