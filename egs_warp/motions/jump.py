@@ -31,7 +31,7 @@ from egs_warp.motions.jump_plan import (
 from egs_warp.motions.sequence import Place
 from egs_warp.motions.stance import Calm, Ground, Measurement, PoseFamily, Weights, sole_shares
 
-RISE = 0.92
+RISE = 0.94
 """A thrust ends when the centre of mass would reach this share of the asked height in free flight: one step more is too
 much."""
 FULL_RISE = 0.99
