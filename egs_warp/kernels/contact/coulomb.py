@@ -6,7 +6,7 @@ Each problem has a block of threads to itself on a GPU, one thread on a CPU; wha
 
 import warp as wp
 
-from egs_warp.kernels.block import wait_for_block
+from egs_warp.kernels.block import largest_of_block, sum_of_block, wait_for_block
 from egs_warp.kernels.contact.coulomb_equations import Contacts, Newton, rate_of, solve_equations, write_equations
 from egs_warp.kernels.vectors import on_cpu
 from egs_warp.precision import Vec3, Vec4, real
@@ -137,13 +137,15 @@ def missed(contacts: Contacts, forces: wp.array[real], scale: real, length: real
     wait_for_block()
     most = real(0.0)
     square = real(0.0)
-    for i in range(contacts.count):
+    for i in range(newton.lane, contacts.count, wp.block_dim()):
         rate = rate_of(contacts, i, scale)
         for t in range(3):
             speed = newton.values[3 * i + t] / rate
             most = wp.max(most, wp.abs(speed))
             square += speed * speed
-    # The next values are written once all lanes have read these.
+    most = largest_of_block(most)
+    square = sum_of_block(square)
+    # The next values are written once all lanes are here.
     wait_for_block()
     # A maximum passes over what is no number, a sum does not.
     if not square < real(wp.inf):
@@ -178,6 +180,46 @@ def find_velocities(contacts: Contacts, forces: wp.array[real], newton: Newton):
 
 
 @wp.func
+def sweep_together(contacts: Contacts, sweeps: int, forces: wp.array[real], newton: Newton):
+    """``sweep`` by a block of threads: each contact is every lane's to work out, and each lane keeps the velocities of
+    some rows up with it."""
+    if wp.block_dim() == 1:
+        sweep(contacts, sweeps, forces)
+        return
+    find_velocities(contacts, forces, newton)
+    size = 3 * contacts.count
+    for _ in range(sweeps):
+        for i in range(contacts.count):
+            n = 3 * i
+            normal = wp.max(forces[n] - newton.velocities[n] / contacts.delassus[n, n], real(0.0))
+            change = normal - forces[n]
+            stiffest = wp.max(contacts.delassus[n + 1, n + 1], contacts.delassus[n + 2, n + 2])
+            first = forces[n + 1] - (newton.velocities[n + 1] + contacts.delassus[n + 1, n] * change) / stiffest
+            second = forces[n + 2] - (newton.velocities[n + 2] + contacts.delassus[n + 2, n] * change) / stiffest
+            length = wp.sqrt(first * first + second * second)
+            share = real(1.0)
+            if length > contacts.friction * normal:
+                share = contacts.friction * normal / length
+            first *= share
+            second *= share
+            first_change = first - forces[n + 1]
+            second_change = second - forces[n + 2]
+            # All lanes have read what they change now.
+            wait_for_block()
+            for row in range(newton.lane, size, wp.block_dim()):
+                newton.velocities[row] = newton.velocities[row] + (
+                    contacts.delassus[row, n] * change
+                    + contacts.delassus[row, n + 1] * first_change
+                    + contacts.delassus[row, n + 2] * second_change
+                )
+            if newton.lane == 0:
+                forces[n] = normal
+                forces[n + 1] = first
+                forces[n + 2] = second
+            wait_for_block()
+
+
+@wp.func
 def move(contacts: Contacts, forces: wp.array[real], length: real, newton: Newton):
     """Go ``length`` of the step; no step is left."""
     for k in range(newton.lane, 3 * contacts.count, wp.block_dim()):
@@ -208,9 +250,7 @@ def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp
         if attempt == 0:
             sweeps = _FEW_SWEEPS
             steps = iterations
-        if newton.lane == 0:
-            sweep(contacts, sweeps, forces)
-        wait_for_block()
+        sweep_together(contacts, sweeps, forces, newton)
         find_velocities(contacts, forces, newton)
         for number in range(steps):
             short = _SHORT

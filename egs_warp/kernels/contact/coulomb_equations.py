@@ -78,6 +78,22 @@ def rate_of(contacts: Contacts, i: int, scale: real):
     const double* const g = (const double*)delassus.data + n * stride;
     double* const out = (double*)((char*)matrix.data + a * matrix.strides[0]);
     const double w0 = weights[0], w1 = weights[1], w2 = weights[2];
+#if defined(__CUDA_ARCH__)
+    double right = 0.0;
+    for (int c = place; c < size; c += places)
+        right -= (w0 * g[c] + w1 * g[stride + c] + w2 * g[2 * stride + c]) * step.data[c];
+    for (int other = 16; other > 0; other >>= 1) right += __shfl_xor_sync(0xffffffffu, right, other);
+    right -= values.data[row];
+    for (int t = 0; t < 3; ++t) right -= own[t] * step.data[n + t];
+    for (int b = place; b < unknowns; b += places) {
+        const int c = columns.data[b];
+        double entry = w0 * g[c] + w1 * g[stride + c] + w2 * g[2 * stride + c];
+        for (int t = 0; t < 3; ++t)
+            if (c == n + t) entry += own[t];
+        out[b] = entry;
+    }
+    if (place != 0) return;
+#else
     double right = -values.data[row];
     for (int c = 0; c < size; ++c) {
         const double moved = step.data[c];
@@ -94,6 +110,7 @@ def rate_of(contacts: Contacts, i: int, scale: real):
             if (c >= n && c < n + 3) out[b] += own[c - n];
         }
     }
+#endif
     out[unknowns] = right;
     for (int b = unknowns + 1; b & 3; ++b) out[b] = 0.0;
 """)
@@ -108,11 +125,13 @@ def write_row(
     row: int,
     weights: Vec3,
     own: Vec3,
+    place: int,
+    places: int,
     matrix: wp.array2d[Vec4],
 ):
     """Row ``a`` of the equations, that of ``row`` of the derivative: ``weights`` of its contact's three rows of the
     Delassus operator and its ``own`` three entries, in the ``columns`` that are unknown; its right side, less what the
-    others' steps move."""
+    others' steps move. On a GPU the threads of a warp write it, each at its ``place`` of 32 ``places``."""
     ...
 
 
@@ -143,7 +162,8 @@ def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, sho
             newton.unknowns[unknowns + 1] = n + 2
             unknowns += 2
     wait_for_block()
-    for a in range(newton.lane, unknowns, wp.block_dim()):
+    across = wp.min(wp.block_dim(), _ACROSS)
+    for a in range(newton.lane / across, unknowns, wp.block_dim() / across):
         row = newton.unknowns[a]
         i = row / 3
         n = 3 * i
@@ -169,16 +189,45 @@ def write_equations(contacts: Contacts, forces: wp.array[real], scale: real, sho
                 own[row - n] = own[row - n] + real(1.0)
         write_row(
             contacts.delassus, newton.step, newton.values, newton.unknowns, 3 * contacts.count, unknowns, a, row,
-            weights, own, newton.matrix,
+            weights, own, newton.lane % across, across, newton.matrix,
         )  # fmt: skip
     wait_for_block()
     return unknowns
 
 
-@wp.func
-def entry(matrix: wp.array2d[Vec4], row: int, column: int):
-    """Of a matrix by fours."""
-    return matrix[row, column / 4][column % 4]
+@wp.func_native("""
+    int best = rank;
+#if defined(__CUDA_ARCH__)
+    // To single precision: what is so near the largest serves as well. Bits of what is positive are in its order.
+    __shared__ unsigned int sizes[32];
+    __shared__ int rows[32];
+    const double* const M = (const double*)matrix.data;
+    const int stride = matrix.strides[0] / 8;
+    unsigned int size = 0;
+    for (int a = rank + lane; a < unknowns; a += blockDim.x) {
+        const float candidate = (float)fabs(M[a * stride + column]);
+        const unsigned int bits = candidate > 0.0f ? __float_as_uint(candidate) : 0;
+        if (bits > size) { size = bits; best = a; }
+    }
+    for (int other = 16; other > 0; other >>= 1) {
+        const unsigned int theirs = __shfl_xor_sync(0xffffffffu, size, other);
+        const int row = __shfl_xor_sync(0xffffffffu, best, other);
+        if (theirs > size || (theirs == size && row < best)) { size = theirs; best = row; }
+    }
+    if ((lane & 31) == 0) { sizes[lane >> 5] = size; rows[lane >> 5] = best; }
+    __syncthreads();
+    size = sizes[0];
+    best = rows[0];
+    for (int i = 1; i < blockDim.x >> 5; ++i)
+        if (sizes[i] > size || (sizes[i] == size && rows[i] < best)) { size = sizes[i]; best = rows[i]; }
+#endif
+    return best;
+""")
+def pivot_row(
+    matrix: wp.array2d[Vec4], column: wp.int32, rank: wp.int32, unknowns: wp.int32, lane: wp.int32
+) -> wp.int32:
+    """Of the rows from ``rank`` on the one whose entry in the ``column`` is largest, found by a block of threads."""
+    ...
 
 
 @wp.func
@@ -189,13 +238,8 @@ def eliminate_panel(panel: int, unknowns: int, pivots: Pivots, newton: Newton):
     pivots.found = 0
     for part in range(4):
         if 4 * panel + part < unknowns:
-            pivot = int(pivots.rank)
-            size = real(0.0)
-            for a in range(pivots.rank, unknowns):
-                candidate = wp.abs(newton.matrix[a, panel][part])
-                if candidate > size:
-                    size = candidate
-                    pivot = a
+            pivot = pivot_row(newton.matrix, 4 * panel + part, pivots.rank, unknowns, newton.lane)
+            size = wp.abs(newton.matrix[pivot, panel][part])
             wait_for_block()
             if size > _SINGULAR * pivots.largest:
                 pivots.largest = wp.max(pivots.largest, size)
@@ -287,6 +331,41 @@ def eliminate(unknowns: int, newton: Newton):
     return pivots
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    // By turns in two places, so that none is written that others have not read.
+    __shared__ double found[2];
+    double* const M = (double*)matrix.data;
+    const int stride = matrix.strides[0] / 8;
+    for (int a = lane; a < rank; a += blockDim.x) M[a * stride + pivots.data[a]] = 1.0 / M[a * stride + pivots.data[a]];
+    for (int back = rank - 1; back >= 0; back -= 1) {
+        const int j = pivots.data[back];
+        if (lane == back % blockDim.x) {
+            const double own = M[back * stride + unknowns] * M[back * stride + j];
+            found[back & 1] = own;
+            step.data[places.data[j]] = own;
+        }
+        __syncthreads();
+        const double value = found[back & 1];
+        for (int a = lane; a < back; a += blockDim.x) M[a * stride + unknowns] -= M[a * stride + j] * value;
+    }
+    __syncthreads();
+#endif
+""")
+def substitute(
+    matrix: wp.array2d[Vec4],
+    unknowns: wp.int32,
+    rank: wp.int32,
+    pivots: wp.array[wp.int32],
+    places: wp.array[wp.int32],
+    lane: wp.int32,
+    step: wp.array[real],
+):
+    """The unknowns of a triangular matrix, last first, by a block of threads: each has rows whose right sides it keeps
+    up with what is found."""
+    ...
+
+
 @wp.func
 def solve_equations(unknowns: int, newton: Newton):
     """Gaussian elimination, rows exchanged; unknowns that the others make redundant stay zero,
@@ -295,12 +374,4 @@ def solve_equations(unknowns: int, newton: Newton):
         solve_alone(unknowns, _SINGULAR, newton.pivots, newton.unknowns, newton.matrix, newton.step)
         return
     pivots = eliminate(unknowns, newton)
-    # Each lane writes the same here.
-    for back in range(pivots.rank):
-        row = pivots.rank - 1 - back
-        j = newton.pivots[row]
-        value = entry(newton.matrix, row, unknowns)
-        for b in range(j + 1, unknowns):
-            value -= entry(newton.matrix, row, b) * newton.step[newton.unknowns[b]]
-        newton.step[newton.unknowns[j]] = value / entry(newton.matrix, row, j)
-    wait_for_block()
+    substitute(newton.matrix, unknowns, pivots.rank, newton.pivots, newton.unknowns, newton.lane, newton.step)
