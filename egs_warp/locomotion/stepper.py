@@ -156,11 +156,31 @@ class LocomotionStepper:
         objectives: Sequence[AnyObjective],
         dt: float,
     ) -> tuple[BodyState, StepMemory, list[StepReport]]:
-        """One step of ``dt``; one that does not converge is done again in halves under the same activations, since what
-        is asked is asked for the whole of it.
+        """One step of ``dt``; one that does not converge is done again in halves, since what is asked is asked for the
+        whole of it: under the same activations, and under those of the step before. Of the two ends the one that costs
+        the objectives less: where muscles go so far that no end is found, nobody has seen what they do.
         """
         with one_blas_thread():
-            return self._whole(state, memory, dt, self.step(state, memory, objectives, dt))
+            done = self.step(state, memory, objectives, dt)
+            report = done[2]
+            if report.converged:
+                return self._whole(state, memory, dt, done)
+            ends = [
+                self._in_halves(state, memory, activations, dt, MOST_HALVINGS)
+                for activations in (report.activations, memory.activations)
+            ]
+            return min(ends, key=lambda end: self._cost_of_halves(state, end[2], objectives))
+
+    def _cost_of_halves(
+        self, state: BodyState, reports: Sequence[StepReport], objectives: Sequence[AnyObjective]
+    ) -> tuple[bool, float]:
+        """Whether any of the ``reports`` from ``state`` on has not converged, and what their end costs."""
+        before, last = (reports[-2].state if len(reports) > 1 else state), reports[-1]
+        problem = StepProblem(self.body, before, last.dt, self.settings.drag)
+        missed = objectives_missed(
+            problem, last.contacts, objectives, last.state.velocities, last.forces, self.body.speed_unit
+        )
+        return not all(report.converged for report in reports), missed
 
     def advance_held(
         self, state: BodyState, memory: StepMemory, activations: np.ndarray, dt: float

@@ -279,6 +279,32 @@ def test_a_step_that_does_not_converge_is_subdivided(longest: float, parts: int)
     assert np.abs(planned).max() > 0.0 and all((report.activations == planned).all() for report in reports)
 
 
+@pytest.mark.parametrize("planned_well", [True, False])
+def test_halves_are_made_under_the_activations_that_serve_better(planned_well: bool) -> None:
+    """Those planned for the whole of a step that does not converge, or, where these push the wrong way, the last."""
+    made = muscular_block()
+    start = BodyState(made.body.mesh.nodes, np.zeros_like(made.body.mesh.nodes))
+    with one_blas_thread():
+        good = made.step(start, made.initial_memory(), hop(made.body, 0), DT)[2].activations
+    assert np.abs(good).max() > 0.0
+    planned, last = (good, -good) if planned_well else (-good, good)
+
+    class PlannedStepper(LateStepper):
+        longest = 0.6 * DT
+
+        def step(
+            self, state: BodyState, memory: StepMemory, objectives: Sequence[AnyObjective], dt: float
+        ) -> tuple[BodyState, StepMemory, StepReport]:
+            end, after, report = super().step(state, memory, objectives, dt)
+            return end, after, replace(report, activations=planned)
+
+    stepper = PlannedStepper(made.body, made.muscles, made.geometry, device="cpu")
+    memory = replace(stepper.initial_memory(), activations=last)
+    end, after, reports = stepper.advance(start, memory, hop(made.body, 0), DT)
+    assert len(reports) == 2 and all((report.activations == good).all() for report in reports)
+    assert (after.activations == good).all() and end is reports[-1].state
+
+
 def test_flight_needs_no_qp_contacts_and_keeps_the_parabola() -> None:
     """Eq. (4): in the air there is no contact and muscles move the centre of mass by nothing."""
     stepper = muscular_block()
