@@ -374,22 +374,33 @@ class Mirror:
         if not self._device.is_cpu:
             self._here = wp.zeros(array.shape, array.dtype, "cpu", pinned=True)
         self._values = self._here.numpy()
+        self._sent: wp.Event | None = None
 
     def put(self, values: np.ndarray) -> None:
-        """Into the array, of the same shape."""
-        if not self._device.is_cpu:
+        """Into the array, of the same shape, which nobody else writes to."""
+        if self._sent is not None:
+            if np.array_equal(values, self._values):
+                return
             # What was told before may still be on its way.
-            wp.synchronize_stream(self._device)
+            wp.synchronize_event(self._sent)
         np.copyto(self._values, values)
         if not self._device.is_cpu:
             wp.copy(self._array, self._here)
+            self._sent = wp.get_stream(self._device).record_event(self._sent)
 
     def get(self) -> np.ndarray:
         """From the array, a copy."""
-        if not self._device.is_cpu:
-            wp.copy(self._here, self._array)
-            wp.synchronize_stream(self._device)
-        return self._values.copy()
+        return self.get_all(self)[0]
+
+    @staticmethod
+    def get_all(*mirrors: Mirror) -> list[np.ndarray]:
+        """From the arrays of ``mirrors`` on one device, copies."""
+        device = mirrors[0]._device
+        if not device.is_cpu:
+            for mirror in mirrors:
+                wp.copy(mirror._here, mirror._array)
+            wp.synchronize_stream(device)
+        return [mirror._values.copy() for mirror in mirrors]
 
 
 def zeros(shape: Shape, dtype: Any, device: Device) -> wp.array:

@@ -329,10 +329,12 @@ class ContactDetector:
                 outputs=[self._gaps, self._nearest],
                 device=self._device,
             )
-        gaps, nearest = self._gaps_here.get(), self._only_face
+        nearest = self._only_face
         if nearest is None:
-            nearest = self._nearest_here.get()
+            gaps, nearest = Mirror.get_all(self._gaps_here, self._nearest_here)
             nearest.flags.writeable = False
+        else:
+            gaps = self._gaps_here.get()
         gaps.flags.writeable = False
         return gaps, nearest
 

@@ -20,6 +20,7 @@ from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.fem.worlds import shared
 from egs_warp.kernels.contact import batch_contacts as of_worlds
 from egs_warp.kernels.contact import iterate as kernels
+from egs_warp.launching import Mirror
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleTension
 from egs_warp.precision import Mat33, Vec3, Vec4, real
@@ -65,12 +66,8 @@ class DeviceResponder:
     def __call__(self, tangent: Tangent, contacts: ContactSet) -> DeviceResponse:
         """The response at hand from now on."""
         assert tangent.factors is self.factors
-        count = contacts.count
-        places = -(-max(count, 1) // _PLACES) * _PLACES
-        if places not in self._rooms:
-            self._rooms[places] = ContactRoom(self, places)
-        room = self._rooms[places]
-        with torch.no_grad(), self.stream:
+        count, room = contacts.count, self._room_for(contacts)
+        with self.stream:
             self._take(tangent.problem)
             delassus = room.respond(tangent.problem, contacts)
             if not tangent.settle():
@@ -87,9 +84,22 @@ class DeviceResponder:
         velocities: np.ndarray,
         forces: np.ndarray,
     ) -> np.ndarray | None:
-        """See ``Responder``."""
-        ahead = self(tangent, contacts).at(tension, velocities, forces).toward(forces)
-        return ahead.velocities if ahead.feasible else None
+        """See ``Responder``. No response is at hand then."""
+        assert tangent.factors is self.factors
+        room = self._room_for(contacts)
+        self.at_hand = room.at_base = room.at_trial = None
+        with self.stream:
+            self._take(tangent.problem)
+        size, ahead = room.ahead(tangent.problem, contacts, tension, velocities, forces)
+        if not tangent.settle():
+            size, ahead = room.ahead(tangent.problem, contacts, tension, velocities, forces)
+        return ahead.reshape(velocities.shape).copy() if np.isfinite(size) else None
+
+    def _room_for(self, contacts: ContactSet) -> ContactRoom:
+        places = -(-max(contacts.count, 1) // _PLACES) * _PLACES
+        if places not in self._rooms:
+            self._rooms[places] = ContactRoom(self, places)
+        return self._rooms[places]
 
     def _take(self, problem: StepProblem) -> None:
         if self._problem is problem:
@@ -112,6 +122,7 @@ class ContactRoom:
         self._node_count = len(owner.body.mesh.nodes)
         size, width = 3 * self._node_count, 3 * places
         self._contact_nodes = wp.zeros(places, dtype=wp.vec4i, device=self._device)
+        self._contact_nodes_here = Mirror(self._contact_nodes)
         self._contact_frames = Upload(owner.stream, 13 * places)
         weights, axes = self._contact_frames.there.split([4 * places, 9 * places])
         self._contacts = [
@@ -170,12 +181,32 @@ class ContactRoom:
 
     def respond(self, problem: StepProblem, contacts: ContactSet) -> np.ndarray:
         """(3K, 3K) m/(N s) of ``contacts``, which are those of this room from now on, by the factors at hand."""
-        more = self.places - contacts.count
-        self._contact_nodes.assign(np.vstack([contacts.nodes, np.zeros((more, 4), np.int32)]).astype(np.int32))
-        self._contact_frames.take(contacts.weights, np.zeros(4 * more), contacts.axes)
+        self._take(contacts)
         self._do(self._enqueue_response, problem.dt, 1.0 + problem.dt * problem.drag)
         self.owner.stream.wait()
         return self._delassus_here.numpy().reshape(3 * self.places, -1).copy()
+
+    def _take(self, contacts: ContactSet) -> None:
+        more = self.places - contacts.count
+        self._contact_nodes_here.put(np.vstack([contacts.nodes, np.zeros((more, 4), np.int32)]))
+        self._contact_frames.take(contacts.weights, np.zeros(4 * more), contacts.axes)
+
+    def ahead(
+        self,
+        problem: StepProblem,
+        contacts: ContactSet,
+        tension: MuscleTension | None,
+        velocities: np.ndarray,
+        forces: np.ndarray,
+    ) -> tuple[float, np.ndarray]:
+        """Velocities (3N,) after a Newton step under those ``forces`` by the factors at hand, and a number, which is
+        none if they invert an element."""
+        with self.owner.stream:
+            self._take(contacts)
+            self._begin(tension, velocities, forces)
+        self._tell(0.0, False, forces, _BEGUN)
+        size, _, ahead = self._ask(self._enqueue_ahead, problem.dt, 1.0 + problem.dt * problem.drag)
+        return float(size), ahead
 
     def _do(self, work: Callable[..., None], *given: Any) -> None:
         self._works.run((work.__name__, *given), lambda: work(*given))
@@ -188,13 +219,18 @@ class ContactRoom:
         self._launch(of_worlds.contact_rows_kernel, (1, self.places), self._world, [shared(impulses[None], real)])
         impulses.mul_(dt)
         solved = inverse.T @ (inverse @ self._right)
-        owner.turned.copy_(solved[:, :3])
-        torch.mm(momenta.T, owner.turned, out=self._held[0])
-        self._launch(kernels.holding_kernel, 1, [ratio, shared(self._held[:1], Mat33)], [shared(self._held[1:], Mat33)])
-        torch.mm(self._held[1], owner.turns.T - ratio * owner.turned.T, out=owner.keeping)
+        self._enqueue_keeping(momenta, solved[:, :3], ratio)
         torch.addmm(solved[:, 3:], owner.turned, owner.keeping @ impulses, out=self.columns)
         self._enqueue_speeds(self.columns, self._delassus)
         self._delassus_here.copy_(self._delassus.view(-1), non_blocking=True)
+
+    def _enqueue_keeping(self, momenta: torch.Tensor, turned: torch.Tensor, ratio: float) -> None:
+        """What keeps the momentum, of the ``momenta`` (3N, 3) of turns and what these bring about."""
+        owner = self.owner
+        owner.turned.copy_(turned)
+        torch.mm(momenta.T, owner.turned, out=self._held[0])
+        self._launch(kernels.holding_kernel, 1, [ratio, shared(self._held[:1], Mat33)], [shared(self._held[1:], Mat33)])
+        torch.mm(self._held[1], owner.turns.T - ratio * owner.turned.T, out=owner.keeping)
 
     def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self._device)
@@ -208,21 +244,27 @@ class ContactRoom:
         self, problem: StepProblem, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray
     ) -> tuple[np.ndarray, ...]:
         """As ``go``, at the very ``velocities`` (N, 3) and ``forces`` (n, 3), under ``tension``."""
+        with self.owner.stream:
+            self._begin(tension, velocities, forces)
+        return self.go(problem, length=0.0, push=False, wanted=forces, base=_BEGUN)
+
+    def _begin(self, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray) -> None:
         more = np.zeros(3 * self.places - forces.size)
         told = [] if tension is None else [tension.tensions]
-        with self.owner.stream:
-            self._begun.take(velocities, velocities, np.zeros(velocities.size), forces, more, *told)
-        return self.go(problem, length=0.0, push=False, wanted=forces, base=_BEGUN)
+        self._begun.take(velocities, velocities, np.zeros(velocities.size), forces, more, *told)
 
     def go(
         self, problem: StepProblem, *, length: float, push: bool, wanted: np.ndarray, base: float
     ) -> tuple[np.ndarray, ...]:
         """A trial from the ``base`` (``_KEPT``, ``_TRIED`` or ``_BEGUN``): its size, the contacts' speeds after its
         Newton step, its velocities."""
+        self._tell(length, push, wanted, base)
+        return self._ask(self._enqueue_trial, problem.dt, 1.0 + problem.dt * problem.drag)
+
+    def _tell(self, length: float, push: bool, wanted: np.ndarray, base: float) -> None:
         told = self._told.here.numpy()
         told[:3], told[3:] = (length, float(push), base), 0.0
         told[3 : 3 + wanted.size] = wanted.ravel()
-        return self._ask(self._enqueue_trial, problem.dt, 1.0 + problem.dt * problem.drag)
 
     def again(self, *, base: float) -> tuple[np.ndarray, ...]:
         """The ``base`` by the response at hand: no number, the contacts' speeds, no numbers."""
@@ -230,7 +272,7 @@ class ContactRoom:
         return self._ask(self._enqueue_again)
 
     def _ask(self, work: Callable[..., None], *given: float) -> tuple[np.ndarray, ...]:
-        with torch.no_grad(), self.owner.stream:
+        with self.owner.stream:
             self._do(work, *given)
             self.owner.stream.wait()
         asked = self._asked_here.numpy()
@@ -251,21 +293,46 @@ class ContactRoom:
 
     def _enqueue_newton(self, state: torch.Tensor) -> None:
         """A Newton step without contact forces from ``state``, and the contacts' speeds after it."""
-        owner, inverse = self.owner, self.owner.factors.inverse
         velocities, loose, free, _ = self._parts(state)
-        torch.mv(inverse, free, out=self._half)
+        self._enqueue_step(velocities, free, loose)
+        self._enqueue_speeds(loose[:, None], self._asked[1 : 1 + 3 * self.places, None])
+        self._asked_here.copy_(self._asked, non_blocking=True)
+
+    def _enqueue_step(self, velocities: torch.Tensor, missing: torch.Tensor, after: torch.Tensor) -> None:
+        """``after`` a Newton step from ``velocities``, where so much is ``missing`` (3N,)."""
+        owner, inverse = self.owner, self.owner.factors.inverse
+        torch.mv(inverse, missing, out=self._half)
         torch.mv(inverse.T, self._half, out=self._solved)
-        torch.mv(owner.keeping, free, out=self._turn)
+        torch.mv(owner.keeping, missing, out=self._turn)
         self._launch(
             kernels.loose_kernel,
             self._node_count,
             [shared(owner.turned, real), _vectors(velocities), _vectors(self._solved), shared(self._turn, real)],
-            [_vectors(loose)],
+            [_vectors(after)],
         )
-        self._enqueue_speeds(loose[:, None], self._asked[1 : 1 + 3 * self.places, None])
+
+    def _enqueue_ahead(self, dt: float, ratio: float) -> None:
+        owner, inverse = self.owner, self.owner.factors.inverse
+        momenta = self._right[:, :3]
+        torch.mul(owner.turns, owner.masses.repeat_interleave(3)[:, None], out=momenta)
+        self._enqueue_keeping(momenta, inverse.T @ (inverse @ momenta), ratio)
+        self._enqueue_residual(dt, ratio)
+        velocities, loose, _, _ = self._parts(self._trial)
+        self._enqueue_step(velocities, self._rest, loose)
+        torch.add(owner.positions, loose, alpha=dt, out=self._ends)
+        owner.enqueue_gradient(_vectors(self._ends), dt, self._tensions, _vectors(self._gradient))
+        torch.linalg.vector_norm(self._gradient, out=self._asked[0])
+        self._asked[1 + 3 * self.places :].copy_(loose)
         self._asked_here.copy_(self._asked, non_blocking=True)
 
     def _enqueue_trial(self, dt: float, ratio: float) -> None:
+        self._enqueue_residual(dt, ratio)
+        torch.linalg.vector_norm(self._rest, out=self._asked[0])
+        self._asked[1 + 3 * self.places :].copy_(self._parts(self._trial)[0])
+        self._enqueue_newton(self._trial)
+
+    def _enqueue_residual(self, dt: float, ratio: float) -> None:
+        """Where a trial ends, and what is missing there."""
         owner, nodes = self.owner, self._node_count
         self._enqueue_base()
         velocities, _, free, forces = self._parts(self._trial)
@@ -298,9 +365,6 @@ class ContactRoom:
             ],
             [_vectors(free), _vectors(self._rest)],
         )
-        torch.linalg.vector_norm(self._rest, out=self._asked[0])
-        self._asked[1 + 3 * self.places :].copy_(velocities)
-        self._enqueue_newton(self._trial)
 
 
 def _vectors(flat: torch.Tensor) -> wp.array:

@@ -40,6 +40,7 @@ class DenseFactors:
         self._places = self._root.places_of(rows, columns)
         self._other = torch.zeros((count, count), dtype=torch.float64, device=self.device)
         self._entries, self._diagonal = self._other.new_zeros(len(rows)), self._other.new_zeros(count)
+        self._diagonal_here = np.zeros(count)
         self._told = self.stream.pinned(2)
         self._factored = self.stream.recorded(self._factor)
         self._strain_told, self._strain_entries = Upload(self.stream, 3 * count), torch.zeros_like(self._entries)
@@ -55,9 +56,10 @@ class DenseFactors:
         """See ``Factors``."""
         with self.stream:
             self._entries.copy_(self._take(entries))
-            if diagonal is None:
-                self._diagonal.zero_()
-            else:
+            diagonal = np.zeros(len(self._diagonal)) if diagonal is None else diagonal
+            # From step to step it is the same.
+            if not np.array_equal(diagonal, self._diagonal_here):
+                self._diagonal_here = diagonal.copy()
                 self._diagonal.copy_(self._take(diagonal))
             self._factored()
         self._begun = True

@@ -55,6 +55,10 @@ class ElasticAssembly:
         ``tension``."""
         return self.elements.gradient(positions, damping, tension)
 
+    def energy_and_gradient(self, positions: np.ndarray, damping: Damping | None = None) -> tuple[float, np.ndarray]:
+        """Both of them."""
+        return self.elements.energy_and_gradient(positions, damping)
+
     def hessian_entries(
         self, positions: np.ndarray, damping: Damping | None = None, *, factor: float = 1.0, projected: bool = False
     ) -> np.ndarray:

@@ -99,17 +99,31 @@ class ElementKernels:
         )
         return gradients
 
-    def _damping_inputs(self, damping: Damping | None) -> list:
+    def _start_of(self, damping: Damping | None) -> tuple[wp.array, float]:
         # A kernel that is told no step does not read the gradients.
-        return (
-            [self._no_gradients, self._positions, 0.0]
-            if damping is None
-            else [damping.start, self._positions, damping.dt]
-        )
+        return (self._no_gradients, 0.0) if damping is None else (damping.start, damping.dt)
+
+    def _damping_inputs(self, damping: Damping | None) -> list:
+        start, dt = self._start_of(damping)
+        return [start, self._positions, dt]
 
     def energy(self, positions: np.ndarray, damping: Damping | None) -> tuple[float, np.ndarray]:
         """Joules, and det F (T,)."""
         self._positions_here.put(positions)
+        self._enqueue_energies(damping)
+        energies, determinants = self._energies_here.get()
+        return float(energies.sum()), determinants
+
+    def energy_and_gradient(self, positions: np.ndarray, damping: Damping | None) -> tuple[float, np.ndarray]:
+        """Joules, and (N, 3) newtons, of elasticity and damping."""
+        self._positions_here.put(positions)
+        self._enqueue_energies(damping)
+        start, dt = self._start_of(damping)
+        self.enqueue_gradient(self._positions, start, dt, None, self._no_shares, self._node_gradients)
+        (energies, _), gradients = Mirror.get_all(self._energies_here, self._gradients_here)
+        return float(energies.sum()), gradients
+
+    def _enqueue_energies(self, damping: Damping | None) -> None:
         launch_again(
             kernels.element_energies_kernel,
             len(self._tets),
@@ -117,15 +131,13 @@ class ElementKernels:
             outputs=[self._energies, self._determinants],
             device=self._device,
         )
-        energies, determinants = self._energies_here.get()
-        return float(energies.sum()), determinants
 
     def gradient(self, positions: np.ndarray, damping: Damping | None, tension: MuscleTension | None) -> np.ndarray:
         """(N, 3) newtons."""
         self._positions_here.put(positions)
         lines = None if tension is None else self.muscle_lines(tension)
         tensions = self._no_shares if lines is None or tension is None else lines.told(tension)
-        start, dt = (self._no_gradients, 0.0) if damping is None else (damping.start, damping.dt)
+        start, dt = self._start_of(damping)
         self.enqueue_gradient(self._positions, start, dt, lines, tensions, self._node_gradients)
         return self._gradients_here.get()
 

@@ -71,6 +71,10 @@ class ElementVectors:
         )
         return float(self._energy[0]), self._determinants[: self._tet_count].copy()
 
+    def energy_and_gradient(self, positions: np.ndarray, damping: Damping | None) -> tuple[float, np.ndarray]:
+        """Joules, and (N, 3) newtons, of elasticity and damping."""
+        return self.energy(positions, damping)[0], self.gradient(positions, damping, None)
+
     def gradient(self, positions: np.ndarray, damping: Damping | None, tension: MuscleTension | None) -> np.ndarray:
         """(N, 3) newtons."""
         lines = self.lines_of(tension)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,6 +18,11 @@ class Factors(Protocol):
 
     host: bool
     """Where they work: entries come from the host's arrays, or as tensors of the device."""
+
+    @property
+    def stream(self) -> AbstractContextManager[None]:
+        """Within it what they do there takes least time."""
+        ...
 
     def update(self, entries: Any, diagonal: np.ndarray | None = None) -> bool:
         """Factor S with these upper ``entries`` (nnz,), and ``diagonal`` (n,) added; False if it is not positive

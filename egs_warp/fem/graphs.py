@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import gc
+import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,16 @@ _MOST = 64
 """Works of one kind that are kept: steps of other lengths and other numbers of contacts are others."""
 
 
+class _Entered(threading.local):
+    """Streams that this thread has entered, the last one last: which, and what is left with it."""
+
+    def __init__(self) -> None:
+        self.contexts: list[tuple[int | None, ExitStack]] = []
+
+
+_entered = _Entered()
+
+
 class GraphStream:
     """Where torch and Warp both work: on a GPU on Warp's stream, so that neither has to wait for the other."""
 
@@ -24,18 +35,23 @@ class GraphStream:
         self._stream: Any = None
         if device.type == "cuda":
             self._stream = wp.stream_to_torch(wp.get_device(str(device)).stream)
-        self._entered: list[AbstractContextManager[Any]] = []
         self._others: list[Any] = []
         self._pool: Any = None
         self._first: Any = None
 
     def __enter__(self) -> None:
-        context = nullcontext() if self._stream is None else torch.cuda.stream(self._stream)
-        context.__enter__()
-        self._entered.append(context)
+        """From now on torch works there, and keeps no track of gradients."""
+        key, entered = None if self._stream is None else self._stream.cuda_stream, _entered.contexts
+        context = ExitStack()
+        # Torch takes longer to turn to a stream than to begin some work there.
+        if not entered or entered[-1][0] != key:
+            context.enter_context(torch.no_grad())
+            if self._stream is not None:
+                context.enter_context(torch.cuda.stream(self._stream))
+        entered.append((key, context))
 
     def __exit__(self, *raised: Any) -> None:
-        self._entered.pop().__exit__(*raised)
+        _entered.contexts.pop()[1].__exit__(*raised)
 
     def wait(self) -> None:
         """Until all is done that was begun."""

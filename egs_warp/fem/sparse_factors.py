@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ class SparseFactors:
     """
 
     host = True
+    stream: AbstractContextManager[None] = nullcontext()
 
     def __init__(self, upper_pattern: sparse.csc_matrix | sparse.csc_array) -> None:
         """``upper_pattern``: upper triangle with the diagonal, entries in the order of ``update``."""

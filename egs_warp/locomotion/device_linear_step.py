@@ -12,7 +12,7 @@ import warp as wp
 
 from egs_warp.contact.detection import ContactSet
 from egs_warp.contact.device_response import DeviceResponder, DeviceResponse
-from egs_warp.fem.graphs import Recordings
+from egs_warp.fem.graphs import GraphStream, Recordings, Upload
 from egs_warp.fem.worlds import shared
 from egs_warp.locomotion.linear_step import LinearStep, Prospect, torques_of
 from egs_warp.locomotion.objectives import Objective
@@ -32,40 +32,84 @@ class DeviceLinearStep(LinearStep):
     response: DeviceResponse
     known: np.ndarray
     """(3n, k + 1) m/s of the contacts."""
+    room: _Room
 
     def end(self, x: np.ndarray) -> np.ndarray:
         """See ``LinearStep``."""
-        owner = self.response.owner
-        with torch.no_grad(), owner.stream:
-            return (self.velocities @ owner.tensor(np.append(x, 1.0))).cpu().numpy()
+        stream = self.response.owner.stream
+        with stream:
+            self.room.here(self.velocities @ self.room.there(x, np.ones(1)))
+            stream.wait()
+        return self.room.found(len(self.velocities)).copy()
 
     def speeds(self, contacts: ContactSet) -> np.ndarray:
         """See ``LinearStep``."""
         assert contacts is self.response.contacts
         return self.known
 
-    def squares(self, objectives: Sequence[Objective]) -> np.ndarray:
-        """See ``LinearStep``."""
-        owner = self.response.owner
-        with torch.no_grad(), owner.stream:
-            form = owner.zeros(self.count + 1, self.count + 1)
-            dense: list[tuple[np.ndarray, np.ndarray]] = []
-            for objective in objectives:
-                root, rows = np.sqrt(2.0 * objective.weight), objective.rows
-                if not isinstance(rows, np.ndarray) and (np.diff(rows.indptr) == 1).all():
-                    # One entry in each row, in as many rows as there are nodes.
-                    places = torch.as_tensor(rows.indices.astype(np.int64), device=owner.factors.device)
-                    missed = owner.tensor(root * rows.data)[:, None] * self.velocities[places]
-                    missed[:, -1] -= owner.tensor(root * objective.target)
-                    form.addmm_(missed.T, missed)
-                else:
-                    rows = rows if isinstance(rows, np.ndarray) else rows.toarray()
-                    dense.append((root * rows, root * objective.target))
-            if dense:
-                missed = owner.tensor(np.vstack([rows for rows, _ in dense])) @ self.velocities
-                missed[:, -1] -= owner.tensor(np.concatenate([target for _, target in dense]))
-                form.addmm_(missed.T, missed)
-            return form.cpu().numpy()
+    def squares(self, objectives: Sequence[Objective]) -> Callable[[], np.ndarray]:
+        """See ``LinearStep``: until what it gives is called, ``end`` is not."""
+        stream, width, size = self.response.owner.stream, self.count + 1, len(self.velocities)
+        one, several = _by_entries(objectives)
+        rows = np.concatenate([np.zeros((0, size)), *(root * dense for root, dense, _ in several)])
+        targets = np.concatenate([np.zeros(0), *(root * target for root, _, target in several)])
+        parts = [np.concatenate([np.zeros(0), *each]) for each in zip(*one, strict=True)] or [np.zeros(0)] * 3
+        with stream:
+            told = self.room.there(*parts, targets, rows)
+            places, shares, wanted, asked, dense = told.split([*(len(part) for part in parts), len(targets), rows.size])
+            missed = shares[:, None] * self.velocities[places.long()]
+            missed[:, -1] -= wanted
+            form = missed.T @ missed
+            missed = dense.view(-1, size) @ self.velocities
+            missed[:, -1] -= asked
+            self.room.here(form.addmm_(missed.T, missed).view(-1))
+
+        def form_here() -> np.ndarray:
+            stream.wait()
+            return self.room.found(width**2).reshape(width, width).copy()
+
+        return form_here
+
+
+def _by_entries(objectives: Sequence[Objective]) -> tuple[list[Any], list[Any]]:
+    """Of those with one entry in each row, in as many rows as there are nodes, where these are, what they are, and
+    the targets; of the others the root of their weight, the rows, and the targets. The first ones' roots are in
+    them."""
+    one, several = [], []
+    for objective in objectives:
+        root, rows = np.sqrt(2.0 * objective.weight), objective.rows
+        if isinstance(rows, np.ndarray):
+            several.append((root, rows, objective.target))
+        elif (np.diff(rows.indptr) == 1).all():
+            one.append((rows.indices, root * rows.data, root * objective.target))
+        else:
+            several.append((root, rows.toarray(), objective.target))
+    return one, several
+
+
+class _Room:
+    """Memory by which numbers go to the device in one piece and come back so, as long as they need it."""
+
+    def __init__(self, stream: GraphStream) -> None:
+        self._stream, self._told, self._here = stream, Upload(stream, 0), stream.pinned(0)
+
+    def there(self, *parts: np.ndarray) -> torch.Tensor:
+        """The ``parts`` one behind the other."""
+        count = sum(part.size for part in parts)
+        if len(self._told.here) < count:
+            self._told = Upload(self._stream, 2 * count)
+        self._told.take(*parts)
+        return self._told.there[:count]
+
+    def here(self, values: torch.Tensor) -> None:
+        """``values`` (n,) are on their way."""
+        if len(self._here) < len(values):
+            self._here = self._stream.pinned(2 * len(values))
+        self._here[: len(values)].copy_(values, non_blocking=True)
+
+    def found(self, count: int) -> np.ndarray:
+        """(count,) of what has come."""
+        return self._here.numpy()[:count]
 
 
 class DeviceLinearSteps:
@@ -79,6 +123,7 @@ class DeviceLinearSteps:
         self._works = Recordings(owner.stream)
         self._memory = owner.zeros(0)
         self._speeds_here = owner.stream.pinned(0)
+        self._room = _Room(owner.stream)
 
     def about(self, prospect: Prospect, other: Callable[[], Any]) -> tuple[LinearStep, Any]:
         """See ``LinearSteps``; it is overwritten by the next. ``other`` comes last: both work on one stream."""
@@ -88,7 +133,7 @@ class DeviceLinearSteps:
         width = 3 * response.contacts.count
         # Without muscles and contact.
         response.at(None, prospect.velocities, prospect.forces)
-        with torch.no_grad(), owner.stream:
+        with owner.stream:
             velocities, speeds = self._room_for(3 * len(prospect.velocities), 3 * room.places, m + width + 1)
 
             def work() -> None:
@@ -102,7 +147,7 @@ class DeviceLinearSteps:
             self._works.run((id(room), width, dt), work)
             owner.stream.wait()
         known = speeds.numpy()[:width].copy()
-        return DeviceLinearStep(velocities, torques_of(response, m), response, known), other()
+        return DeviceLinearStep(velocities, torques_of(response, m), response, known, self._room), other()
 
     def _room_for(self, unknowns: int, rows: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
         """(unknowns, width) on the device and (rows, width) on the host, always in the same memory while that will

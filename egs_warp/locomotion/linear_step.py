@@ -64,14 +64,15 @@ class LinearStep:
         """(3n, k + 1) m/s of ``contacts`` along their axes, as ``velocities``."""
         return contacts.speeds(self.velocities)
 
-    def squares(self, objectives: Sequence[Objective]) -> np.ndarray:
-        """(k + 1, k + 1) G with (x, 1) G (x, 1) / 2 the weighted squares of what ``objectives`` ask, (m/s)^2."""
+    def squares(self, objectives: Sequence[Objective]) -> Callable[[], np.ndarray]:
+        """Begins what gives (k + 1, k + 1) G with (x, 1) G (x, 1) / 2 the weighted squares of what ``objectives`` ask,
+        (m/s)^2."""
         form = np.zeros((self.count + 1, self.count + 1))
         for objective in objectives:
             missed = objective.rows @ self.velocities
             missed[:, -1] -= objective.target
             form += 2.0 * objective.weight * (missed.T @ missed)
-        return form
+        return lambda: form
 
 
 class LinearSteps(Protocol):

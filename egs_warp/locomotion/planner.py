@@ -117,11 +117,10 @@ class StepPlanner:
         # What the kernels of elasticity are needed for goes on in one thread alone.
         linear, horizon = self.linear_steps.about(prospect, lambda: Horizon.of(problem, foreseen, self.factors))
         previous = self.synergies.mean(last / self.muscles.bounds)
-        cost = (
-            objectives_cost(problem, linear, contacts, objectives, speed)
-            + effort_cost(problem, linear, foreseen.ravel(), horizon)
-            + self._activation_cost(problem, foreseen, previous, linear.count)
-        )
+        asked = objectives_cost(problem, linear, contacts, objectives, speed)
+        activation = self._activation_cost(problem, foreseen, previous, linear.count)
+        effort = effort_cost(problem, linear, foreseen.ravel(), horizon)
+        cost = asked() + effort + activation
         speeds = linear.speeds(contacts)
         rows, offset = speeds[:, :-1] / speed, speeds[:, -1] / speed
         offset[::3] += prospect.shift / speed

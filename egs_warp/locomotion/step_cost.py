@@ -5,7 +5,7 @@ See docs/concepts/locomotion.md.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,19 +44,24 @@ def objectives_cost(
     contacts: ContactSet,
     objectives: Sequence[AnyObjective],
     speed: float,
-) -> QuadraticCost:
-    """The weighted squares that a motion asks for, in units of ``speed`` m/s, sqrt(g H)."""
-    form = linear.squares([each for each in objectives if isinstance(each, Objective)]) / speed**2
-    P, q, constant = form[:-1, :-1], form[:-1, -1], 0.5 * float(form[-1, -1])
-    for objective in objectives:
-        if isinstance(objective, Objective):
-            continue
-        rows = objective.slopes(problem, contacts, linear.torques, speed)
-        gap = objective.gap(problem, contacts, np.zeros(0), np.zeros(3), speed)
-        P += 2.0 * objective.weight * rows.T @ rows
-        q += 2.0 * objective.weight * rows.T @ gap
-        constant += objective.weight * float(gap @ gap)
-    return QuadraticCost(P, q, constant)
+) -> Callable[[], QuadraticCost]:
+    """Begins what gives the weighted squares that a motion asks for, in units of ``speed`` m/s, sqrt(g H)."""
+    squares = linear.squares([each for each in objectives if isinstance(each, Objective)])
+
+    def cost() -> QuadraticCost:
+        form = squares() / speed**2
+        P, q, constant = form[:-1, :-1], form[:-1, -1], 0.5 * float(form[-1, -1])
+        for objective in objectives:
+            if isinstance(objective, Objective):
+                continue
+            rows = objective.slopes(problem, contacts, linear.torques, speed)
+            gap = objective.gap(problem, contacts, np.zeros(0), np.zeros(3), speed)
+            P += 2.0 * objective.weight * rows.T @ rows
+            q += 2.0 * objective.weight * rows.T @ gap
+            constant += objective.weight * float(gap @ gap)
+        return QuadraticCost(P, q, constant)
+
+    return cost
 
 
 def objectives_missed(
@@ -98,11 +103,11 @@ class Horizon:
         body = problem.body
         assembly, time = body.assembly, max(horizon * body.time_unit, problem.dt)
         end, damping = problem.end_positions(foreseen), assembly.damping(problem.state.positions, time)
-        energy, slope = assembly.energy(end, damping), assembly.gradient(end, damping).ravel()
+        energy, slope = assembly.energy_and_gradient(end, damping)
         entries = assembly.entries_for(factors, end, damping, projected=True)
         # Last: what a GPU has begun it goes on with while the host does other things.
         factors.begin(time**2 * entries, np.repeat(body.node_mass, 3))
-        return cls(end, time, energy, slope, entries, factors)
+        return cls(end, time, energy, slope.ravel(), entries, factors)
 
 
 def effort_cost(

@@ -160,7 +160,7 @@ class LocomotionStepper:
         whole of it: under the same activations, and under those of the step before. Of the two ends the one that costs
         the objectives less: where muscles go so far that no end is found, nobody has seen what they do.
         """
-        with one_blas_thread():
+        with one_blas_thread(), self._factors.stream:
             done = self.step(state, memory, objectives, dt)
             report = done[2]
             if report.converged:
@@ -186,7 +186,7 @@ class LocomotionStepper:
         self, state: BodyState, memory: StepMemory, activations: np.ndarray, dt: float
     ) -> tuple[BodyState, StepMemory, list[StepReport]]:
         """As ``advance``, under given ``activations`` (M,) metres."""
-        with one_blas_thread():
+        with one_blas_thread(), self._factors.stream:
             return self._whole(state, memory, dt, self.held_step(state, memory, activations, dt))
 
     def _whole(

@@ -74,8 +74,8 @@ def test_squares_are_what_is_missed(creature: Creature) -> None:
     asked = objectives_of(creature.start.positions.size)
     x = np.append(np.random.default_rng(4).standard_normal(linear.count), 1.0)
     missed = [each.weight * np.sum((each.rows @ linear.end(x[:-1]) - each.target) ** 2) for each in asked]
-    assert 0.5 * x @ linear.squares(asked) @ x == pytest.approx(sum(missed), rel=1e-11)
-    assert np.array_equal(linear.squares([]), np.zeros((len(x), len(x))))
+    assert 0.5 * x @ linear.squares(asked)() @ x == pytest.approx(sum(missed), rel=1e-11)
+    assert np.array_equal(linear.squares([])(), np.zeros((len(x), len(x))))
 
 
 def test_a_device_has_the_host_s_step(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,7 +92,7 @@ def test_a_device_has_the_host_s_step(creature: Creature, device: str, monkeypat
         for got, wanted in (
             (linear.end(x), host.end(x)),
             (linear.speeds(contacts), host.speeds(contacts)),
-            (linear.squares(asked), host.squares(asked)),
+            (linear.squares(asked)(), host.squares(asked)()),
             (linear.velocities.cpu().numpy(), host.velocities),
         ):
             np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-11 * np.abs(wanted).max())

@@ -55,7 +55,8 @@ def test_objectives_are_weighted_squares_of_what_is_missed() -> None:
     gyration = np.sqrt(0.5 * np.trace(BODY.inertia(problem.state.positions)) / BODY.mass)
     turned = (after - momentum) / (BODY.mass * gyration * speed)
     expected = 2.0 * missed @ missed + 5.0 * turned @ turned + 7.0 * x[4] ** 2  # x is an activation and two forces
-    assert value(objectives_cost(problem, linear, contacts, objectives, speed), x) == pytest.approx(expected, rel=1e-10)
+    asked = objectives_cost(problem, linear, contacts, objectives, speed)()
+    assert value(asked, x) == pytest.approx(expected, rel=1e-10)
 
 
 def moved_on(problem: StepProblem, linear: LinearStep, foreseen: np.ndarray, time: float, x: np.ndarray) -> np.ndarray:
