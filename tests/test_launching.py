@@ -12,6 +12,7 @@ import warp as wp
 
 from egs_warp.launching import (
     THREADS,
+    Mirror,
     a_core_left,
     available_threads,
     beside,
@@ -202,3 +203,17 @@ def test_each_thread_keeps_its_own() -> None:
     thread.start()
     thread.join()
     assert others == [own] and others[0] is not own and make(1, 2) is own
+
+
+def test_mirrors_bring_and_fetch_what_lies_there_now(device: str) -> None:
+    """What is brought twice, or is no number, and what has changed there since it was fetched."""
+    arrays = [wp.zeros(3, dtype=wp.float64, device=device) for _ in range(2)]
+    one, other = mirrors = [Mirror(array) for array in arrays]
+    for values in ([1.0, 2.0, 3.0], [1.0, 2.0, 3.0], [0.0, np.nan, 3.0], [0.0, np.nan, 3.0], [0.0, 0.0, 0.0]):
+        one.put(np.array(values))
+        np.testing.assert_array_equal(arrays[0].numpy(), values)
+        arrays[1].fill_(values[0] + 7.0)
+        got = Mirror.get_all(*mirrors)
+        np.testing.assert_array_equal(got[0], values)
+        np.testing.assert_array_equal(got[1], 3 * [values[0] + 7.0])
+        np.testing.assert_array_equal(other.get(), got[1])

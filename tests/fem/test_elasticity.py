@@ -52,6 +52,8 @@ def test_gradient_is_derivative_of_energy(bent: Bent, damped: bool) -> None:
         h = 1e-6
         slope = (assembly.energy(x + h * direction, damping) - assembly.energy(x - h * direction, damping)) / (2 * h)
         assert slope == pytest.approx(np.sum(assembly.gradient(x, damping) * direction), rel=1e-6)
+    energy, gradient = assembly.energy_and_gradient(x, damping)
+    assert energy == assembly.energy(x, damping) and np.array_equal(gradient, assembly.gradient(x, damping))
 
 
 @pytest.mark.parametrize("damped", [False, True])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
@@ -70,6 +71,23 @@ def test_nobody_looks_for_garbage_while_work_is_recorded(device: str) -> None:
         with stream:
             again()
     assert gc.isenabled() and looks == ([True] * 3 if device == "cpu" else [True, False])
+
+
+def test_a_stream_that_is_entered_again_is_left_with_the_first(device: str) -> None:
+    """By another who works there too, and in a thread of its own; gradients are kept track of before and after."""
+    one, other = GraphStream(torch.device(device)), GraphStream(torch.device(device))
+    outside = torch.cuda.current_stream() if device != "cpu" else None
+    with one:
+        within = torch.cuda.current_stream() if device != "cpu" else None
+        with pytest.raises(ValueError, match="within"), other, one:
+            assert not torch.is_grad_enabled()
+            raise ValueError("within")
+        with ThreadPoolExecutor(1) as threads:
+            assert threads.submit(torch.is_grad_enabled).result()
+        assert not torch.is_grad_enabled()
+        assert device == "cpu" or torch.cuda.current_stream() == within
+    assert torch.is_grad_enabled()
+    assert device == "cpu" or torch.cuda.current_stream() == outside
 
 
 def test_works_at_once_are_over_before_what_comes_next(device: str) -> None:
