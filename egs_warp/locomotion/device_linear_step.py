@@ -32,15 +32,16 @@ class DeviceLinearStep(LinearStep):
     response: DeviceResponse
     known: np.ndarray
     """(3n, k + 1) m/s of the contacts."""
-    room: _Room
+    of_ends: _Room
+    of_squares: _Room
 
     def end(self, x: np.ndarray) -> np.ndarray:
         """See ``LinearStep``."""
         stream = self.response.owner.stream
         with stream:
-            self.room.here(self.velocities @ self.room.there(x, np.ones(1)))
+            self.of_ends.here(self.velocities @ self.of_ends.there(x, np.ones(1)))
             stream.wait()
-        return self.room.found(len(self.velocities)).copy()
+        return self.of_ends.found(len(self.velocities)).copy()
 
     def speeds(self, contacts: ContactSet) -> np.ndarray:
         """See ``LinearStep``."""
@@ -48,25 +49,25 @@ class DeviceLinearStep(LinearStep):
         return self.known
 
     def squares(self, objectives: Sequence[Objective]) -> Callable[[], np.ndarray]:
-        """See ``LinearStep``: until what it gives is called, ``end`` is not."""
+        """See ``LinearStep``; those begun before are lost."""
         stream, width, size = self.response.owner.stream, self.count + 1, len(self.velocities)
         one, several = _by_entries(objectives)
         rows = np.concatenate([np.zeros((0, size)), *(root * dense for root, dense, _ in several)])
         targets = np.concatenate([np.zeros(0), *(root * target for root, _, target in several)])
         parts = [np.concatenate([np.zeros(0), *each]) for each in zip(*one, strict=True)] or [np.zeros(0)] * 3
         with stream:
-            told = self.room.there(*parts, targets, rows)
+            told = self.of_squares.there(*parts, targets, rows)
             places, shares, wanted, asked, dense = told.split([*(len(part) for part in parts), len(targets), rows.size])
             missed = shares[:, None] * self.velocities[places.long()]
             missed[:, -1] -= wanted
             form = missed.T @ missed
             missed = dense.view(-1, size) @ self.velocities
             missed[:, -1] -= asked
-            self.room.here(form.addmm_(missed.T, missed).view(-1))
+            self.of_squares.here(form.addmm_(missed.T, missed).view(-1))
 
         def form_here() -> np.ndarray:
             stream.wait()
-            return self.room.found(width**2).reshape(width, width).copy()
+            return self.of_squares.found(width**2).reshape(width, width).copy()
 
         return form_here
 
@@ -123,7 +124,7 @@ class DeviceLinearSteps:
         self._works = Recordings(owner.stream)
         self._memory = owner.zeros(0)
         self._speeds_here = owner.stream.pinned(0)
-        self._room = _Room(owner.stream)
+        self._rooms = _Room(owner.stream), _Room(owner.stream)
 
     def about(self, prospect: Prospect, other: Callable[[], Any]) -> tuple[LinearStep, Any]:
         """See ``LinearSteps``; it is overwritten by the next. ``other`` comes last: both work on one stream."""
@@ -147,7 +148,7 @@ class DeviceLinearSteps:
             self._works.run((id(room), width, dt), work)
             owner.stream.wait()
         known = speeds.numpy()[:width].copy()
-        return DeviceLinearStep(velocities, torques_of(response, m), response, known, self._room), other()
+        return DeviceLinearStep(velocities, torques_of(response, m), response, known, *self._rooms), other()
 
     def _room_for(self, unknowns: int, rows: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
         """(unknowns, width) on the device and (rows, width) on the host, always in the same memory while that will

@@ -161,10 +161,9 @@ class LocomotionStepper:
         the objectives less: where muscles go so far that no end is found, nobody has seen what they do.
         """
         with one_blas_thread(), self._factors.stream:
-            done = self.step(state, memory, objectives, dt)
-            report = done[2]
+            end, after, report = self.step(state, memory, objectives, dt)
             if report.converged:
-                return self._whole(state, memory, dt, done)
+                return end, after, [report]
             ends = [
                 self._in_halves(state, memory, activations, dt, MOST_HALVINGS)
                 for activations in (report.activations, memory.activations)
@@ -187,15 +186,10 @@ class LocomotionStepper:
     ) -> tuple[BodyState, StepMemory, list[StepReport]]:
         """As ``advance``, under given ``activations`` (M,) metres."""
         with one_blas_thread(), self._factors.stream:
-            return self._whole(state, memory, dt, self.held_step(state, memory, activations, dt))
-
-    def _whole(
-        self, state: BodyState, memory: StepMemory, dt: float, done: tuple[BodyState, StepMemory, StepReport]
-    ) -> tuple[BodyState, StepMemory, list[StepReport]]:
-        end, after, report = done
-        if report.converged:
-            return end, after, [report]
-        return self._in_halves(state, memory, report.activations, dt, MOST_HALVINGS)
+            end, after, report = self.held_step(state, memory, activations, dt)
+            if report.converged:
+                return end, after, [report]
+            return self._in_halves(state, memory, activations, dt, MOST_HALVINGS)
 
     def _in_halves(
         self, state: BodyState, memory: StepMemory, activations: np.ndarray, dt: float, left: int

@@ -88,29 +88,35 @@ def speeds_of(contacts: Contacts, i: int, forces: wp.array[real]):
 
 
 @wp.func
+def asked_of(contacts: Contacts, i: int, forces: wp.array[real], velocity: Vec3):
+    """The force that contact ``i``'s own normal and tangents ask for at its ``velocity``, m/s, shifted (Eq. 8, 9)."""
+    n = 3 * i
+    normal = wp.max(forces[n] - velocity[0] / contacts.delassus[n, n], real(0.0))
+    change = normal - forces[n]
+    stiffest = wp.max(contacts.delassus[n + 1, n + 1], contacts.delassus[n + 2, n + 2])
+    first = forces[n + 1] - (velocity[1] + contacts.delassus[n + 1, n] * change) / stiffest
+    second = forces[n + 2] - (velocity[2] + contacts.delassus[n + 2, n] * change) / stiffest
+    length = wp.sqrt(first * first + second * second)
+    share = real(1.0)
+    if length > contacts.friction * normal:
+        share = contacts.friction * normal / length
+    return Vec3(normal, share * first, share * second)
+
+
+@wp.func
 def sweep(contacts: Contacts, sweeps: int, forces: wp.array[real]):
-    """``sweeps`` rounds over all contacts: each takes the force that its own normal and tangents ask for (Eq. 8, 9)."""
-    count = contacts.count
+    """``sweeps`` rounds over all contacts, each of which takes the force that it asks for."""
     for _ in range(sweeps):
-        for i in range(count):
+        for i in range(contacts.count):
             n = 3 * i
             speeds = speeds_of(contacts, i, forces)
             normal_speed = speeds[0] + contacts.free[n]
-            first_speed = speeds[1] + contacts.free[n + 1]
-            second_speed = speeds[2] + contacts.free[n + 2]
-            own = contacts.delassus[n, n]
-            normal = wp.max(forces[n] - (normal_speed + contacts.shifts[i]) / own, real(0.0))
-            change = normal - forces[n]
-            stiffest = wp.max(contacts.delassus[n + 1, n + 1], contacts.delassus[n + 2, n + 2])
-            first = forces[n + 1] - (first_speed + contacts.delassus[n + 1, n] * change) / stiffest
-            second = forces[n + 2] - (second_speed + contacts.delassus[n + 2, n] * change) / stiffest
-            length = wp.sqrt(first * first + second * second)
-            share = real(1.0)
-            if length > contacts.friction * normal:
-                share = contacts.friction * normal / length
-            forces[n] = normal
-            forces[n + 1] = share * first
-            forces[n + 2] = share * second
+            velocity = Vec3(
+                normal_speed + contacts.shifts[i], speeds[1] + contacts.free[n + 1], speeds[2] + contacts.free[n + 2]
+            )
+            asked = asked_of(contacts, i, forces, velocity)
+            for t in range(3):
+                forces[n + t] = asked[t]
 
 
 @wp.func
@@ -191,31 +197,20 @@ def sweep_together(contacts: Contacts, sweeps: int, forces: wp.array[real], newt
     for _ in range(sweeps):
         for i in range(contacts.count):
             n = 3 * i
-            normal = wp.max(forces[n] - newton.velocities[n] / contacts.delassus[n, n], real(0.0))
-            change = normal - forces[n]
-            stiffest = wp.max(contacts.delassus[n + 1, n + 1], contacts.delassus[n + 2, n + 2])
-            first = forces[n + 1] - (newton.velocities[n + 1] + contacts.delassus[n + 1, n] * change) / stiffest
-            second = forces[n + 2] - (newton.velocities[n + 2] + contacts.delassus[n + 2, n] * change) / stiffest
-            length = wp.sqrt(first * first + second * second)
-            share = real(1.0)
-            if length > contacts.friction * normal:
-                share = contacts.friction * normal / length
-            first *= share
-            second *= share
-            first_change = first - forces[n + 1]
-            second_change = second - forces[n + 2]
+            velocity = Vec3(newton.velocities[n], newton.velocities[n + 1], newton.velocities[n + 2])
+            asked = asked_of(contacts, i, forces, velocity)
+            change = asked - Vec3(forces[n], forces[n + 1], forces[n + 2])
             # All lanes have read what they change now.
             wait_for_block()
             for row in range(newton.lane, size, wp.block_dim()):
                 newton.velocities[row] = newton.velocities[row] + (
-                    contacts.delassus[row, n] * change
-                    + contacts.delassus[row, n + 1] * first_change
-                    + contacts.delassus[row, n + 2] * second_change
+                    contacts.delassus[row, n] * change[0]
+                    + contacts.delassus[row, n + 1] * change[1]
+                    + contacts.delassus[row, n + 2] * change[2]
                 )
             if newton.lane == 0:
-                forces[n] = normal
-                forces[n + 1] = first
-                forces[n + 2] = second
+                for t in range(3):
+                    forces[n + t] = asked[t]
             wait_for_block()
 
 
