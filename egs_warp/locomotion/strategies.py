@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
+import warp as wp
 
 from egs_warp.errors import UserError
 from egs_warp.launching import Device
@@ -24,6 +25,7 @@ from egs_warp.locomotion.complementarity import (
     states_of_pairs,
 )
 from egs_warp.locomotion.contact_pieces import ContactModes, ContactPieces, PieceSearch, search_pieces, solve_relaxed
+from egs_warp.locomotion.device_search import search_at_once
 from egs_warp.locomotion.lemke import lemke
 from egs_warp.locomotion.program import ContactProgram
 from egs_warp.locomotion.solvers import QpSolution, QpSolver, QpStatus, QuadraticProgram, quadratic_program
@@ -193,24 +195,40 @@ def search_program(
     (``PATIENCE`` times as many in doubt); all but ``PIECES`` have a friction pyramid of ``directions`` edges.
     ``solver`` and ``device``: see ``quadratic_program``.
     """
-    strategy, friction = Strategy(strategy), program.friction
+    strategy = Strategy(strategy)
     if strategy is Strategy.PIECES:
         start = np.concatenate([foreseen.activations, foreseen.forces.ravel()])
-        found = search_pieces(
-            program, start, ContactModes.of(foreseen.forces, friction), qp_limit=qp_limit, solver=solver, device=device
-        )
+        found = _searched_from(program, start, foreseen.forces, qp_limit=qp_limit, solver=solver, device=device)
         if found.objective < COSTLY or program.contacts == 0:
             return found
         return _searched_elsewhere(program, found, foreseen.forces, qp_limit=qp_limit, solver=solver, device=device)
     paired = ContactProgram.of(program, directions)
     predicted = states_from_prediction(
-        foreseen.forces[:, 0], foreseen.forces[:, 1:], foreseen.velocities[:, 1:], friction, directions
+        foreseen.forces[:, 0], foreseen.forces[:, 1:], foreseen.velocities[:, 1:], program.friction, directions
     )
     found = find_states(
         paired, strategy, predicted, foreseen.activations, qp_limit=qp_limit, solver=solver, device=device
     )
     x = None if found.y is None else paired.forces_of(found.y)
     return PieceSearch(x, found.objective, found.qp_count, found.infeasible)
+
+
+def _searched_from(
+    program: ContactPieces,
+    start: np.ndarray,
+    forces: np.ndarray,
+    *,
+    qp_limit: int,
+    solver: QpSolver | str,
+    device: Device,
+) -> PieceSearch:
+    """From ``start`` (m + 3n,), in the piece of ``forces`` (n, 3), which are those of it or near them."""
+    modes = ContactModes.of(forces, program.friction)
+    if QpSolver(solver) is QpSolver.ADMM:
+        found = search_at_once(program, start, modes, qp_limit=qp_limit, device=wp.get_device(device))
+        if found is not None:
+            return found
+    return search_pieces(program, start, modes, qp_limit=qp_limit, solver=solver, device=device)
 
 
 def _searched_elsewhere(
@@ -229,8 +247,8 @@ def _searched_elsewhere(
     if relaxed is None or found.objective <= DOUBTFUL * relaxed[1]:
         return found
     start = program.under(relaxed[0], forces)
-    modes = ContactModes.of(start[program.activations :].reshape(-1, 3), program.friction)
-    other = search_pieces(program, start, modes, qp_limit=qp_limit, solver=solver, device=device)
+    answered = start[program.activations :].reshape(-1, 3)
+    other = _searched_from(program, start, answered, qp_limit=qp_limit, solver=solver, device=device)
     best = min(found, other, key=lambda search: search.objective)
     return replace(best, qp_count=found.qp_count + other.qp_count, infeasible=found.infeasible + other.infeasible)
 

@@ -2,7 +2,12 @@
 
 import warp as wp
 
+from egs_warp.kernels.block import wait_for_block
 from egs_warp.kernels.deformation.decomposition import column, matched_order, rotation_part, signed_as
+from egs_warp.kernels.locomotion import block_algebra as algebra
+from egs_warp.kernels.locomotion.block_elimination import eliminate, invert_root
+from egs_warp.kernels.locomotion.piece_search import BLOCK
+from egs_warp.precision import real
 
 
 @wp.kernel
@@ -22,3 +27,32 @@ def signed_kernel(
 ):
     i = wp.tid()
     out[i] = signed_as(frames[i], orders[i], carried[i])
+
+
+@wp.kernel(launch_bounds=BLOCK)
+def algebra_kernel(
+    unknowns: int,
+    columns: int,
+    matrix: wp.array2d[real],
+    symmetric: wp.array2d[real],
+    root: wp.array2d[real],
+    product: wp.array2d[real],
+    turned: wp.array2d[real],
+    marks: wp.array[int],
+    found: wp.array[int],
+    told: wp.array[int],
+    lengths: wp.array[real],
+):
+    """Each of the block's functions once."""
+    for e in range(algebra.lane_of_block(), unknowns * unknowns, wp.block_dim()):
+        product[e / unknowns, e % unknowns] = real(0.0)
+        turned[e / unknowns, e % unknowns] = real(0.0)
+    wait_for_block()
+    algebra.add_product(product, matrix, symmetric, unknowns, unknowns, unknowns, 0)
+    algebra.add_product(turned, matrix, symmetric, unknowns, unknowns, unknowns, 1)
+    told[0] = invert_root(symmetric, unknowns, root)
+    told[1] = eliminate(matrix, unknowns, columns, real(1e-12))
+    told[2] = algebra.list_marked(marks, columns, unknowns, found)
+    mine = real(algebra.lane_of_block() % 7)
+    told[3] = int(algebra.largest_and_place(mine, algebra.lane_of_block())[1])
+    algebra.normalise(matrix, unknowns, columns, lengths)

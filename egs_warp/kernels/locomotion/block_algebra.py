@@ -1,0 +1,297 @@
+"""Dense algebra by all threads of a block on a GPU, and by one thread on a CPU: what they have written is seen by all
+of them after each of these. All threads call.
+"""
+
+import warp as wp
+
+from egs_warp.precision import real
+
+wp.set_module_options({"enable_backward": False})
+
+_THREADS = """
+#if defined(__CUDA_ARCH__)
+    const int lane = threadIdx.x, lanes = blockDim.x, own = lane & 31, warp = lane >> 5, warps = lanes >> 5;
+    constexpr int WIDE = 32;
+    #define WAIT __syncthreads()
+#else
+    const int lane = 0, lanes = 1, own = 0, warp = 0, warps = 1;
+    constexpr int WIDE = 1;
+    #define WAIT
+#endif
+    (void)lane, (void)lanes, (void)own, (void)warp, (void)warps;
+"""
+
+
+def by_block(body: str) -> str:
+    """``body``, which may use ``WAIT``, and that this is thread ``lane`` of ``lanes``, ``own`` of the ``WIDE`` in its
+    ``warp`` of ``warps``."""
+    return f"{_THREADS}{body}\n#undef WAIT\n"
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return threadIdx.x;
+#else
+    return 0;
+#endif
+""")
+def lane_of_block() -> int:
+    """Which of the block's threads this is."""
+    ...
+
+
+@wp.func_native(
+    by_block("""
+    double* const C = to.data;
+    const double *const A = one.data, *const B = other.data;
+    const int cs = to.strides[0] / 8, bs = other.strides[0] / 8;
+    const int as = turned ? 1 : one.strides[0] / 8, ak = turned ? one.strides[0] / 8 : 1;
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+    // A warp makes 16 x 32 entries at once, eight by eight, of four products each.
+    constexpr int DOWN = 2, ACROSS = 4;
+    const int across = (columns + 8 * ACROSS - 1) / (8 * ACROSS), down = (rows + 8 * DOWN - 1) / (8 * DOWN);
+    const int quad = own >> 2, place = own & 3;
+    for (int tile = warp; tile < across * down; tile += warps) {
+        const int first = tile / across * 8 * DOWN + quad, begin = tile % across * 8 * ACROSS;
+        const double *a[DOWN], *b[ACROSS];
+        double sum[DOWN][ACROSS][2];
+        #pragma unroll
+        for (int i = 0; i < DOWN; ++i) a[i] = A + (first + 8 * i < rows ? first + 8 * i : rows - 1) * as;
+        #pragma unroll
+        for (int k = 0; k < ACROSS; ++k) {
+            const int c = begin + 8 * k + quad;
+            b[k] = B + (c < columns ? c : columns - 1);
+        }
+        #pragma unroll
+        for (int i = 0; i < DOWN; ++i)
+            #pragma unroll
+            for (int k = 0; k < ACROSS; ++k) sum[i][k][0] = sum[i][k][1] = 0.0;
+        #pragma unroll 3
+        for (int s = 0; s < inner; s += 4) {
+            const bool there = s + place < inner;
+            const int at = there ? s + place : 0;
+            double left[DOWN], right[ACROSS];
+            #pragma unroll
+            for (int i = 0; i < DOWN; ++i) left[i] = there ? a[i][at * ak] : 0.0;
+            #pragma unroll
+            for (int k = 0; k < ACROSS; ++k) right[k] = there ? b[k][at * bs] : 0.0;
+            #pragma unroll
+            for (int i = 0; i < DOWN; ++i)
+                #pragma unroll
+                for (int k = 0; k < ACROSS; ++k)
+                    asm volatile("mma.sync.aligned.m8n8k4.row.col.f64.f64.f64.f64 {%0,%1},{%2},{%3},{%0,%1};"
+                                 : "+d"(sum[i][k][0]), "+d"(sum[i][k][1]) : "d"(left[i]), "d"(right[k]));
+        }
+        #pragma unroll
+        for (int i = 0; i < DOWN; ++i)
+            #pragma unroll
+            for (int k = 0; k < ACROSS; ++k) {
+                const int r = first + 8 * i, c = begin + 8 * k + 2 * place;
+                if (r < rows && c < columns) C[r * cs + c] += sum[i][k][0];
+                if (r < rows && c + 1 < columns) C[r * cs + c + 1] += sum[i][k][1];
+            }
+    }
+#else
+    const int across = (columns + 3) / 4, down = (rows + 3) / 4;
+    for (int tile = lane; tile < across * down; tile += lanes) {
+        const int first = tile / across * 4, begin = tile % across;
+        double sum[4][4];
+        const double *a[4], *b[4];
+        for (int t = 0; t < 4; ++t) {
+            for (int s = 0; s < 4; ++s) sum[t][s] = 0.0;
+            a[t] = A + (first + t < rows ? first + t : rows - 1) * as;
+            b[t] = B + (begin + t * across < columns ? begin + t * across : columns - 1);
+        }
+        for (int k = 0; k < inner; ++k) {
+            double left[4], right[4];
+            for (int t = 0; t < 4; ++t) left[t] = a[t][k * ak];
+            for (int t = 0; t < 4; ++t) right[t] = b[t][k * bs];
+            for (int t = 0; t < 4; ++t)
+                for (int s = 0; s < 4; ++s) sum[t][s] += left[t] * right[s];
+        }
+        for (int t = 0; t < 4 && first + t < rows; ++t)
+            for (int s = 0; s < 4 && begin + s * across < columns; ++s)
+                C[(first + t) * cs + begin + s * across] += sum[t][s];
+    }
+#endif
+    WAIT;
+""")
+)
+def add_product(
+    to: wp.array2d[real],
+    one: wp.array2d[real],
+    other: wp.array2d[real],
+    rows: int,
+    columns: int,
+    inner: int,
+    turned: int,
+) -> None:
+    """``to`` (rows, columns) += ``one`` (rows, inner), or the transpose of that (inner, rows) if ``turned``, times
+    ``other`` (inner, columns)."""
+    ...
+
+
+@wp.func_native(
+    by_block("""
+    int total = 0;
+#if defined(__CUDA_ARCH__)
+    __shared__ int sums[32];
+    for (int base = 0; base < count; base += lanes) {
+        const bool marked = base + lane < count && marks.data[base + lane] != 0;
+        const unsigned all = __ballot_sync(0xffffffffu, marked);
+        if (own == 0) sums[warp] = __popc(all);
+        WAIT;
+        int place = total + __popc(all & ((1u << own) - 1u));
+        for (int i = 0; i < warps; ++i) {
+            place += i < warp ? sums[i] : 0;
+            total += sums[i];
+        }
+        if (marked && place < room) found.data[place] = base + lane;
+        WAIT;
+    }
+#else
+    for (int i = 0; i < count; ++i)
+        if (marks.data[i] != 0) {
+            if (total < room) found.data[total] = i;
+            ++total;
+        }
+#endif
+    return total;
+""")
+)
+def list_marked(marks: wp.array[int], count: int, room: int, found: wp.array[int]) -> int:
+    """How many of ``count`` marks are not zero; where they are, in their order, as many as there is ``room`` for."""
+    ...
+
+
+@wp.func_native(
+    by_block("""
+#if defined(__CUDA_ARCH__)
+    __shared__ double sizes[32];
+    __shared__ int places[32];
+    for (int away = 16; away > 0; away >>= 1) {
+        const double theirs = __shfl_xor_sync(0xffffffffu, value, away);
+        const int other = __shfl_xor_sync(0xffffffffu, place, away);
+        if (theirs > value || (theirs == value && other < place)) { value = theirs; place = other; }
+    }
+    WAIT;
+    if (own == 0) { sizes[warp] = value; places[warp] = place; }
+    WAIT;
+    value = sizes[0];
+    place = places[0];
+    for (int i = 1; i < warps; ++i)
+        if (sizes[i] > value || (sizes[i] == value && places[i] < place)) { value = sizes[i]; place = places[i]; }
+#endif
+    return wp::vec_t<2, double>(value, double(place));
+""")
+)
+def largest_and_place(value: real, place: int) -> wp.vec2d:
+    """The largest of the threads' values, and its place, the first of those where several are as large."""
+    ...
+
+
+_ROWS_BY_VECTOR = """
+    for (int i = 4 * warp; i < rows; i += 4 * warps) {
+        const double* row[4];
+        double value[4];
+        for (int t = 0; t < 4; ++t) {
+            row[t] = first + (long long)(i + t < rows ? i + t : rows - 1) * stride;
+            value[t] = 0.0;
+        }
+        #pragma unroll 4
+        for (int k = own; k < columns; k += WIDE) {
+            const double by = given.data[k];
+            #pragma unroll
+            for (int t = 0; t < 4; ++t) value[t] += row[t][k] * by;
+        }
+#if defined(__CUDA_ARCH__)
+        for (int away = 16; away > 0; away >>= 1)
+            for (int t = 0; t < 4; ++t) value[t] += __shfl_xor_sync(0xffffffffu, value[t], away);
+#endif
+        for (int t = 0; t < 4 && i + t < rows; ++t)
+            if (own == 0) made.data[i + t] = value[t];
+    }
+    WAIT;
+"""
+
+
+@wp.func_native(
+    by_block(f"""
+    const double* const first = matrix.data;
+    const int stride = matrix.strides[0] / 8;
+{_ROWS_BY_VECTOR}""")
+)
+def multiply(matrix: wp.array2d[real], rows: int, columns: int, given: wp.array[real], made: wp.array[real]) -> None:
+    """``made`` (rows,) = ``matrix`` (rows, columns) times ``given`` (columns,)."""
+    ...
+
+
+@wp.func_native(
+    by_block(f"""
+    const double* const first = numbers.data + begin;
+{_ROWS_BY_VECTOR}""")
+)
+def multiply_at(
+    numbers: wp.array[real],
+    begin: int,
+    stride: int,
+    rows: int,
+    columns: int,
+    given: wp.array[real],
+    made: wp.array[real],
+) -> None:
+    """The same of a matrix that begins there among ``numbers``, its rows so far apart."""
+    ...
+
+
+@wp.func_native(
+    by_block("""
+    const int stride = matrix.strides[0] / 8;
+    for (int c = lane; c < columns; c += lanes) {
+        double some[4] = {0.0, 0.0, 0.0, 0.0};
+        const double* at = matrix.data + c;
+        int k = 0;
+        for (; k + 4 <= rows; k += 4, at += 4 * stride)
+            for (int t = 0; t < 4; ++t) some[t] += at[t * stride] * given.data[k + t];
+        for (; k < rows; ++k, at += stride) some[0] += *at * given.data[k];
+        made.data[c] = (some[0] + some[1]) + (some[2] + some[3]);
+    }
+    WAIT;
+""")
+)
+def multiply_across(
+    matrix: wp.array2d[real], rows: int, columns: int, given: wp.array[real], made: wp.array[real]
+) -> None:
+    """``made`` (columns,) = the transpose of ``matrix`` (rows, columns) times ``given`` (rows,)."""
+    ...
+
+
+@wp.func_native(
+    by_block("""
+    const int stride = matrix.strides[0] / 8;
+    for (int i = warp; i < rows; i += warps) {
+        double* const row = matrix.data + i * stride;
+        double square = 0.0;
+        for (int k = own; k < columns; k += WIDE) square += row[k] * row[k];
+#if defined(__CUDA_ARCH__)
+        for (int away = 16; away > 0; away >>= 1) square += __shfl_xor_sync(0xffffffffu, square, away);
+#endif
+        const double length = square > 0.0 ? wp::sqrt(square) : 1.0, by = 1.0 / length;
+        for (int k = own; k < columns; k += WIDE) row[k] *= by;
+        if (own == 0) lengths.data[i] = length;
+    }
+    WAIT;
+""")
+)
+def normalise(matrix: wp.array2d[real], rows: int, columns: int, lengths: wp.array[real]) -> None:
+    """Rows of a ``matrix`` (rows, columns) over their ``lengths`` (rows,), which are 1 for those of zeros."""
+    ...
+
+
+@wp.func
+def apply_root(
+    root: wp.array2d[real], count: int, given: wp.array[real], between: wp.array[real], made: wp.array[real]
+):
+    """``made`` (count,) = U U^T ``given`` (count,), U^T of it ``between``."""
+    multiply_across(root, count, count, given, between)
+    multiply(root, count, count, between, made)

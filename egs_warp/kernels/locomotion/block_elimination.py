@@ -1,0 +1,220 @@
+"""Elimination and roots of inverses by all threads of a block on a GPU, by one thread on a CPU.
+
+Eight unknowns at a time: their block on the diagonal is one warp's, in registers, what comes of it everybody's.
+"""
+
+import warp as wp
+
+from egs_warp.kernels.locomotion.block_algebra import by_block
+from egs_warp.precision import real
+
+wp.set_module_options({"enable_backward": False})
+
+_TAKE_OFF = """
+    // to[rows][columns] -= left[rows][some] top[some][columns], a tile of four by four at a time; of the rows below
+    // this one only what lies right of the diagonal.
+    auto take_off = [&](double* to, int stride, int rows, int columns, const double* left, int by_row, int by_part,
+                        const double* top, int top_stride, int some, bool half) {
+        const int across = (columns + 3) / 4, down = (rows + 3) / 4;
+        for (int tile = lane; tile < across * down; tile += lanes) {
+            const int first = tile / across * 4, begin = tile % across;
+            if (half && begin + 3 * across < first) continue;
+            double sum[4][4];
+            int r[4], c[4];
+            #pragma unroll
+            for (int t = 0; t < 4; ++t) {
+                r[t] = first + t < rows ? first + t : rows - 1;
+                c[t] = begin + t * across < columns ? begin + t * across : columns - 1;
+                #pragma unroll
+                for (int s = 0; s < 4; ++s) sum[t][s] = 0.0;
+            }
+            #pragma unroll 4
+            for (int p = 0; p < some; ++p) {
+                double one[4], other[4];
+                #pragma unroll
+                for (int t = 0; t < 4; ++t) one[t] = left[r[t] * by_row + p * by_part];
+                #pragma unroll
+                for (int t = 0; t < 4; ++t) other[t] = top[p * top_stride + c[t]];
+                #pragma unroll
+                for (int t = 0; t < 4; ++t)
+                    #pragma unroll
+                    for (int s = 0; s < 4; ++s) sum[t][s] += one[t] * other[s];
+            }
+            #pragma unroll
+            for (int t = 0; t < 4; ++t)
+                #pragma unroll
+                for (int s = 0; s < 4; ++s)
+                    if (first + t < rows && begin + s * across < columns) to[r[t] * stride + c[s]] -= sum[t][s];
+        }
+    };
+"""
+
+
+@wp.func_native(
+    by_block(
+        _TAKE_OFF
+        + """
+    constexpr int B = 8;
+    double* const M = matrix.data;
+    const int stride = matrix.strides[0] / 8;
+    double least = 0.0;
+    for (int a = 0; a < unknowns; ++a) least += M[a * stride + a];
+    least *= singular / unknowns;
+#if defined(__CUDA_ARCH__)
+    __shared__ double inverse[B][B];
+    __shared__ int good;
+#else
+    double inverse[B][B];
+    int good = 1;
+#endif
+    for (int begin = 0; begin < unknowns; begin += B) {
+        const int end = begin + B < unknowns ? begin + B : unknowns, some = end - begin;
+        if (warp == 0) {
+            // All of a warp do the same, in registers.
+            double D[B][B];
+            #pragma unroll
+            for (int p = 0; p < B; ++p)
+                #pragma unroll
+                for (int q = 0; q < B; ++q) {
+                    const bool there = begin + p < end && begin + q < end;
+                    D[p][q] = there ? M[(begin + p) * stride + begin + q] : (p == q ? 1.0 : 0.0);
+                }
+            bool there = true;
+            #pragma unroll
+            for (int p = 0; p < B; ++p) {
+                there = there && (D[p][p] > least || begin + p >= end);
+                const double by = 1.0 / D[p][p];
+                D[p][p] = 1.0;
+                #pragma unroll
+                for (int q = 0; q < B; ++q) D[p][q] *= by;
+                #pragma unroll
+                for (int o = 0; o < B; ++o)
+                    if (o != p) {
+                        const double factor = D[o][p];
+                        D[o][p] = 0.0;
+                        #pragma unroll
+                        for (int q = 0; q < B; ++q) D[o][q] -= factor * D[p][q];
+                    }
+            }
+            if (own == 0) {
+                good = there;
+                #pragma unroll
+                for (int p = 0; p < B; ++p)
+                    #pragma unroll
+                    for (int q = 0; q < B; ++q) inverse[p][q] = D[p][q];
+            }
+        }
+        WAIT;
+        if (!good) return 0;
+        for (int c = end + lane; c < columns; c += lanes) {
+            double given[B];
+            #pragma unroll
+            for (int p = 0; p < B; ++p) given[p] = begin + p < end ? M[(begin + p) * stride + c] : 0.0;
+            #pragma unroll
+            for (int p = 0; p < B; ++p) {
+                double value = 0.0;
+                #pragma unroll
+                for (int q = 0; q < B; ++q) value += inverse[p][q] * given[q];
+                if (begin + p < end) M[(begin + p) * stride + c] = value;
+            }
+        }
+        WAIT;
+        const double* const top = M + begin * stride + end;
+        take_off(M + end, stride, begin, columns - end, M + begin, stride, 1, top, stride, some, false);
+        double* const below = M + end * stride;
+        const int down = unknowns - end, right = columns - end;
+        take_off(below + end, stride, down, right, below + begin, stride, 1, top, stride, some, false);
+        WAIT;
+    }
+    return 1;
+"""
+    )
+)
+def eliminate(matrix: wp.array2d[real], unknowns: int, columns: int, singular: real) -> int:
+    """Of a ``matrix`` (unknowns, columns) the right sides, behind the unknowns, become the solution, and what is before
+    them is lost; 0 where a pivot on the diagonal is less than a ``singular`` share of the diagonal's mean."""
+    ...
+
+
+@wp.func_native(
+    by_block(
+        _TAKE_OFF
+        + """
+    constexpr int B = 8;
+    double *const A = matrix.data, *const U = root.data;
+    const int as = matrix.strides[0] / 8, us = root.strides[0] / 8;
+#if defined(__CUDA_ARCH__)
+    __shared__ double R[B][B], by[B];
+    __shared__ int good;
+#else
+    double R[B][B], by[B];
+    int good = 1;
+#endif
+    for (int r = warp; r < count; r += warps)
+        for (int c = own; c < count; c += WIDE) U[r * us + c] = r == c ? 1.0 : 0.0;
+    for (int begin = 0; begin < count; begin += B) {
+        const int end = begin + B < count ? begin + B : count, left = count - end;
+        if (warp == 0) {
+            // R^T R of the block on the diagonal; all of a warp do the same, in registers.
+            double S[B][B];
+            #pragma unroll
+            for (int p = 0; p < B; ++p)
+                #pragma unroll
+                for (int q = p; q < B; ++q)
+                    S[p][q] = begin + q < end ? A[(begin + p) * as + begin + q] : (p == q ? 1.0 : 0.0);
+            bool definite = true;
+            #pragma unroll
+            for (int p = 0; p < B; ++p) {
+                definite = definite && S[p][p] > 0.0;
+#if defined(__CUDA_ARCH__)
+                const double over = rsqrt(S[p][p]);
+#else
+                const double over = 1.0 / wp::sqrt(S[p][p]);
+#endif
+                #pragma unroll
+                for (int q = p; q < B; ++q) S[p][q] *= over;
+                #pragma unroll
+                for (int q = p + 1; q < B; ++q)
+                    #pragma unroll
+                    for (int o = q; o < B; ++o) S[q][o] -= S[p][q] * S[p][o];
+                if (own == 0) {
+                    by[p] = over;
+                    #pragma unroll
+                    for (int q = p; q < B; ++q) R[p][q] = S[p][q];
+                }
+            }
+            if (own == 0) good = definite;
+        }
+        WAIT;
+        if (!good) return 0;
+        for (int item = lane; item < count; item += lanes) {
+            double* const from = item < end ? U + item * us + begin : A + begin * as + item;
+            const int step = item < end ? 1 : as;
+            double value[B];
+            #pragma unroll
+            for (int p = 0; p < B; ++p) value[p] = begin + p < end ? from[p * step] : 0.0;
+            #pragma unroll
+            for (int p = 0; p < B; ++p) {
+                #pragma unroll
+                for (int q = 0; q < p; ++q) value[p] -= R[q][p] * value[q];
+                value[p] *= by[p];
+            }
+            #pragma unroll
+            for (int p = 0; p < B; ++p)
+                if (begin + p < end) from[p * step] = value[p];
+        }
+        WAIT;
+        if (left == 0) break;
+        const double* const top = A + begin * as + end;
+        take_off(U + end, us, end, left, U + begin, us, 1, top, as, end - begin, false);
+        take_off(A + end * as + end, as, left, left, top, 1, as, top, as, end - begin, true);
+        WAIT;
+    }
+    return 1;
+"""
+    )
+)
+def invert_root(matrix: wp.array2d[real], count: int, root: wp.array2d[real]) -> int:
+    """``root`` U, an upper triangle (count, count), of A^-1 = U U^T for a symmetric ``matrix`` A (count, count), whose
+    upper triangle is read and lost; 0 where that is not definite."""
+    ...

@@ -1,0 +1,116 @@
+"""The search over pieces of contact where the body lies: one launch, and one look at what it found."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from egs_warp.kernels.locomotion import piece_search as kernels
+from egs_warp.kernels.locomotion.active_set import ASTRAY
+from egs_warp.kernels.locomotion.block_active_set import Holding, UnitRows
+from egs_warp.kernels.locomotion.block_splitting import Splitting
+from egs_warp.launching import Mirror, kept_by_thread
+from egs_warp.locomotion.contact_pieces import ContactModes, ContactPieces, PieceSearch
+from egs_warp.precision import real
+
+_PLACES = 8
+"""Contacts are so many at a time."""
+
+
+def search_at_once(
+    program: ContactPieces, start: np.ndarray, modes: ContactModes, *, qp_limit: int, device: wp.Device
+) -> PieceSearch | None:
+    """``search_pieces`` on the ``device``; None where rounding leads astray."""
+    places = -(-max(program.contacts, 1) // _PLACES) * _PLACES
+    return _room(program.activations, places, device.alias).search(program, start, modes, qp_limit)
+
+
+class _Room:
+    """Memory for programs of m activations and n contacts at most."""
+
+    def __init__(self, m: int, n: int, alias: str) -> None:
+        self._device, size = wp.get_device(alias), m + 3 * n
+        zeros = partial(wp.zeros, device=self._device)
+        self._told = zeros(kernels.HEADER + size * size + size + 3 * n * (size + 1) + 3 * m + 3 * n, dtype=real)
+        self._answer = zeros(kernels.HEADER + size, dtype=real)
+        self._answer_here = Mirror(self._answer)
+        # What is read is what was told for this search: the launch before has ended, since its answer was looked at.
+        self._told_here = self._told
+        if not self._device.is_cpu:
+            self._told_here = wp.zeros(self._told.shape, dtype=real, device="cpu", pinned=True)
+        self._given = self._told_here.numpy()
+        further, forces, answers = 9 * n, 3 * n, 5 * n
+        total = m + further
+        room, rows, holding, splitting = kernels.Room(), UnitRows(), Holding(), Splitting()
+        for name, shape in {
+            **dict.fromkeys(("place", "held_place", "order", "first"), n),
+            **dict.fromkeys(("touching", "held", "speeds"), forces),
+            **{"parts": (further, 3), "contact": further, "onward": further, "next": further, "kinds": (4, n)},
+        }.items():
+            setattr(room, name, zeros(shape, dtype=int))
+        for name, shape in {
+            "shares": (further, 3),
+            "equations": (forces, forces + m + 1),
+            "answers": (answers, m + 1),
+            "gathered": (size, forces),
+            "moved": (size, m + 1),
+            **dict.fromkeys(("cost", "root"), (m, m)),
+            "turned": (answers, m),
+            **dict.fromkeys(("slope", "minimum", "found", "start"), m),
+            **dict.fromkeys(("at_minimum", "at_start", "at_found"), answers),
+            **{"lengths": total, "bounds": (2, total), "pushes": further, "slips": (4, n, 2)},
+            **dict.fromkeys(("values", "trial"), size),
+        }.items():
+            setattr(room, name, zeros(shape, dtype=real))
+        rows.units = zeros((total, m), dtype=real)
+        for name in ("free", "lower", "upper", "slack"):
+            setattr(rows, name, zeros(total, dtype=real))
+        holding.side, holding.active = zeros(total, dtype=int), zeros(m, dtype=int)
+        for name in ("held", "held_across", "products", "root", "inverse"):
+            setattr(holding, name, zeros((m, m), dtype=real))
+        holding.at = zeros(total, dtype=real)
+        for name in ("pulls", "place", "ways", "beside", "between", "outside"):
+            setattr(holding, name, zeros(m, dtype=real))
+        splitting.begun, splitting.held_by = zeros(total, dtype=real), zeros(total, dtype=real)
+        for name in ("rows", "near", "pushes", "sums", "right", "between", "step"):
+            setattr(splitting, name, zeros(m, dtype=real))
+        # The launch has where these lie.
+        self._held = room, rows, holding, splitting
+        self._launch: Any = wp.launch(
+            kernels.search_kernel,
+            dim=1 if self._device.is_cpu else kernels.BLOCK,
+            inputs=[self._told, room, rows, holding, splitting],
+            outputs=[self._answer],
+            device=self._device,
+            block_dim=kernels.BLOCK,
+            record_cmd=True,
+        )
+
+    def search(
+        self, program: ContactPieces, start: np.ndarray, modes: ContactModes, qp_limit: int
+    ) -> PieceSearch | None:
+        """See ``search_at_once``."""
+        m, n, at = program.activations, program.contacts, kernels.HEADER
+        given = self._given
+        given[:at] = m, n, program.friction, program.constant, qp_limit, 0, 0, 0
+        for part in (
+            *(program.P, program.q, program.rows, program.offset, program.lower, program.upper),
+            *(start[:m], modes.kind, modes.slip),
+        ):
+            given[at : at + part.size] = part.ravel()
+            at += part.size
+        if self._told_here is not self._told:
+            wp.copy(self._told, self._told_here, count=at)
+        self._launch.launch()
+        answer = self._answer_here.get()
+        ended, count, infeasible, objective, there = answer[:5].tolist()
+        if ended == ASTRAY:
+            return None
+        x = answer[kernels.HEADER : kernels.HEADER + m + 3 * n] if there else None
+        return PieceSearch(x, objective, int(count), int(infeasible))
+
+
+_room = kept_by_thread(16)(_Room)

@@ -1,0 +1,176 @@
+"""The search over pieces as one launch: what the host's does, on every device."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+from egs_warp.contact.coulomb import coulomb_forces
+from egs_warp.kernels.locomotion import piece_search
+from egs_warp.locomotion import strategies
+from egs_warp.locomotion.contact_pieces import SLIDE, STICK, ContactModes, ContactPieces, PieceSearch, search_pieces
+from egs_warp.locomotion.device_search import search_at_once
+from egs_warp.locomotion.solvers import QpSolver
+from egs_warp.locomotion.strategies import Foreseen, Strategy, search_program
+from egs_warp.precision import real
+from tests.support.kernels import algebra_kernel
+
+DEVICES = [str(device) for device in wp.get_devices()]
+FRICTION = 0.6
+
+
+def body_program(seed: int, activations: int, contacts: int, *, bias: float = 0.0) -> ContactPieces:
+    """Activations and contacts of a random body, which ask for some of its velocities; ``bias`` presses it down."""
+    rng = np.random.default_rng(seed)
+    freedoms = activations + 2 * contacts + 6
+    half = rng.standard_normal((freedoms, freedoms)) / np.sqrt(freedoms)
+    inverse = half @ half.T + 0.3 * np.eye(freedoms)
+    frame = rng.standard_normal((3 * contacts, freedoms))
+    columns = np.hstack([rng.standard_normal((freedoms, activations)), inverse @ frame.T])
+    base = 0.3 * rng.standard_normal(freedoms)
+    base -= bias * np.linalg.pinv(frame)[:, ::3].sum(axis=1) if contacts else 0.0
+    goals = rng.standard_normal((max(3, activations // 2), freedoms))
+    rows, gap = goals @ columns, goals @ base - rng.standard_normal(len(goals))
+    weights = np.concatenate([np.full(activations, 0.05), np.zeros(3 * contacts)])
+    return ContactPieces(
+        *(2.0 * rows.T @ rows + np.diag(weights), 2.0 * rows.T @ gap, float(gap @ gap)),
+        *(frame @ columns, frame @ base, FRICTION, -np.ones(activations), np.ones(activations)),
+    )
+
+
+def entered(program: ContactPieces) -> tuple[np.ndarray, ContactModes]:
+    """Without activations: a point, and how each contact moves there."""
+    m, n = program.activations, program.contacts
+    forces, _ = coulomb_forces(program.rows[:, m:], program.offset, np.zeros(n), FRICTION, np.zeros((n, 3)))
+    return np.concatenate([np.zeros(m), forces.ravel()]), ContactModes.of(forces, FRICTION)
+
+
+def both(program: ContactPieces, device: str, limit: int = 12) -> tuple[PieceSearch | None, PieceSearch]:
+    start, modes = entered(program)
+    given: dict[str, Any] = {"qp_limit": limit}
+    here = search_pieces(program, start, modes, solver=QpSolver.OSQP, **given)
+    return search_at_once(program, start, modes, device=wp.get_device(device), **given), here
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("activations", "contacts"), [(1, 0), (2, 1), (5, 3), (9, 8), (23, 11)])
+def test_one_launch_finds_what_the_host_finds(activations: int, contacts: int, device: str) -> None:
+    """Through the same pieces to the same point, whatever moves at the start and on the way."""
+    alike = several = slid = 0
+    for seed in range(12):
+        program = body_program(seed, activations, contacts, bias=0.5 * (seed % 3))
+        slid += (entered(program)[1].kind == SLIDE).any()
+        there, here = both(program, device)
+        if there is None:
+            continue
+        assert here.x is not None and there.x is not None
+        assert there.objective == pytest.approx(program.objective(there.x), rel=1e-9, abs=1e-9)
+        same = there.qp_count == here.qp_count and np.allclose(there.x, here.x, rtol=1e-6, atol=1e-6)
+        alike += same
+        # Where two ways lead on, as rounding has it.
+        assert same or there.objective <= here.objective + 0.1 * abs(here.objective)
+        several += here.qp_count > 1
+    assert alike >= 10
+    if contacts > 2:
+        assert several >= 6 and slid >= 4
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_limit_is_kept_and_what_was_best_by_then_is_told(device: str) -> None:
+    program = body_program(3, 9, 8, bias=0.5)
+    whole = both(program, device)[1]
+    assert whole.qp_count > 2
+    last = np.inf
+    for limit in range(1, whole.qp_count + 1):
+        there, here = both(program, device, limit)
+        assert there is not None and there.qp_count == here.qp_count == limit
+        assert there.objective == pytest.approx(here.objective, rel=1e-7) and there.objective <= last
+        last = there.objective
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_what_slides_is_let_go_where_it_cannot_be_held(device: str) -> None:
+    """Two points of one place that are to hold at different speeds have no forces that hold both within their bounds;
+    sliding they have."""
+    counts = set()
+    for seed in range(30):
+        program = body_program(seed, 3, 4, bias=1.0)
+        program.lower[:], program.upper[:] = -1e-3, 1e-3
+        there, here = both(program, device)
+        if there is not None:
+            assert there.infeasible == here.infeasible and (there.x is None) == (here.x is None)
+            counts.add(there.infeasible)
+    assert {0, 1} <= counts
+
+
+def test_the_default_strategy_goes_by_it_and_by_the_host_where_it_is_led_astray(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    program = body_program(1, 5, 3, bias=0.5)
+    start, modes = entered(program)
+    forces = start[5:].reshape(-1, 3)
+    asked: list[int] = []
+
+    def counted(*given: Any, **named: Any) -> PieceSearch | None:
+        asked.append(named["qp_limit"])
+        return search_at_once(*given, **named) if len(asked) == 1 else None
+
+    monkeypatch.setattr(strategies, "search_at_once", counted)
+    given: dict[str, Any] = {"directions": 4, "qp_limit": 9, "device": "cpu"}
+    foreseen = Foreseen(np.zeros(5), forces, np.zeros((3, 3)))
+    found = [search_program(program, Strategy.PIECES, foreseen, solver="admm", **given) for _ in range(2)]
+    assert asked[:2] == [9, 9]
+    assert found[0].x is not None and found[1].x is not None
+    np.testing.assert_allclose(found[0].x, found[1].x, atol=1e-6)
+    search_program(program, Strategy.PIECES, foreseen, solver="osqp", **given)
+    assert len(asked) == 2 and modes.kind.max() >= STICK
+
+
+@pytest.mark.parametrize("device", DEVICES)
+def test_contacts_without_a_pivot_are_left_to_the_host(device: str) -> None:
+    """No row is exchanged for another: a contact whose own force does nothing against its speed ends the launch."""
+    program = body_program(2, 3, 2, bias=1.0)
+    program.rows[3, :] = 0.0
+    start = np.concatenate([np.zeros(3), [1.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
+    modes = ContactModes(np.full(2, STICK), np.tile([1.0, 0.0], (2, 1)))
+    program.rows[3, 3 + 3] = -1.0
+    assert search_at_once(program, start, modes, qp_limit=3, device=wp.get_device(device)) is None
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("count", [1, 7, 8, 9, 16, 31, 50, 130])
+def test_a_block_does_the_algebra(count: int, device: str) -> None:
+    """Products, roots of inverses, elimination, lists, lengths: as NumPy has them, for sizes around those of blocks."""
+    rng, right = np.random.default_rng(count), 5
+    matrix = rng.standard_normal((count, count + right)) + 3.0 * np.eye(count, count + right) * np.sqrt(count)
+    half = rng.standard_normal((count, count))
+    symmetric = half @ half.T + np.eye(count)
+    marks = rng.integers(0, 2, count + right) * rng.integers(-3, 4, count + right)
+    given = [wp.array(each, dtype=real, device=device) for each in (matrix, symmetric)]
+    made = [wp.zeros((count, count), dtype=real, device=device) for _ in range(3)]
+    numbers = [wp.array(marks.astype(np.int32), dtype=int, device=device)]
+    numbers += [wp.zeros(size, dtype=int, device=device) for size in (count, 4)]
+    lengths = wp.zeros(count, dtype=real, device=device)
+    wp.launch(
+        algebra_kernel,
+        1 if device == "cpu" else piece_search.BLOCK,
+        inputs=[count, count + right, *given, *made, *numbers, lengths],
+        device=device,
+        block_dim=piece_search.BLOCK,
+    )
+    root, product, turned = (each.numpy() for each in made)
+    np.testing.assert_allclose(product, matrix[:, :count] @ symmetric, atol=1e-10 * count)
+    np.testing.assert_allclose(turned, matrix[:, :count].T @ symmetric, atol=1e-10 * count)
+    np.testing.assert_allclose(root @ root.T @ symmetric, np.eye(count), atol=1e-9)
+    assert np.array_equal(root, np.triu(root))
+    told = numbers[2].numpy().tolist()
+    listed = np.flatnonzero(marks)
+    assert told == [1, 1, len(listed), 0 if device == "cpu" else 6]
+    kept = min(len(listed), count)
+    np.testing.assert_array_equal(numbers[1].numpy()[:kept], listed[:kept])
+    solved, long = given[0].numpy()[:, count:], lengths.numpy()[:, None]
+    expected = np.linalg.solve(matrix[:, :count], matrix[:, count:])
+    np.testing.assert_allclose(long * solved, expected, rtol=1e-9, atol=1e-9)
