@@ -87,7 +87,9 @@ def test_a_limit_is_kept_and_what_was_best_by_then_is_told(device: str) -> None:
     for limit in range(1, whole.qp_count + 1):
         there, here = both(program, device, limit)
         assert there is not None and there.qp_count == here.qp_count == limit
-        assert there.objective == pytest.approx(here.objective, rel=1e-7) and there.objective <= last
+        # Rows may be broken by so little.
+        assert there.objective == pytest.approx(here.objective, abs=1e-7 * program.constant)
+        assert there.objective <= last
         last = there.objective
 
 

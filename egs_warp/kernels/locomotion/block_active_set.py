@@ -24,7 +24,6 @@ from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
 
-_ROUNDS = wp.constant(3)
 _REVISIONS = wp.constant(4)
 _PIVOTS = wp.constant(600)
 _LOOKS = wp.constant(8)
@@ -362,51 +361,66 @@ def cost_of(rows: UnitRows, holding: Holding):
 
 @wp.func
 def descend(rows: UnitRows, holding: Holding, active: int):
-    """From rows that all pull the right way; how the search ends. What is broken most joins first."""
+    """From rows that all pull the right way: how many hold the optimum, -1 where there is no point, -2 where rounding
+    leads astray. What is broken most joins first."""
     count = int(active)
     write_inverse(holding, count)
     for number in range(_PIVOTS):
         row = most_broken(rows, holding)
         if row < 0:
-            return FOUND
+            return count
         count = join(rows, holding, count, row)
-        if count == -2:
-            return ASTRAY
         if count < 0:
-            return INFEASIBLE
+            return count
         if number % _LOOKS == 0 and cost_of(rows, holding) > rows.most:
-            return INFEASIBLE
-    return ASTRAY
+            return -1
+    return -2
+
+
+@wp.func
+def refine(rows: UnitRows, holding: Holding, count: int):
+    """Multipliers once more by what the rows miss of their bounds, and the place by these alone."""
+    lane = lane_of_block()
+    for i in range(lane, count, wp.block_dim()):
+        row = holding.active[i]
+        holding.beside[i] = bound_of(rows, holding, row) - holding.at[row]
+    wait_for_block()
+    multiply(holding.inverse, count, count, holding.beside, holding.ways)
+    for i in range(lane, count, wp.block_dim()):
+        side = real(holding.side[holding.active[i]])
+        pull = holding.pulls[i] + side * holding.ways[i]
+        holding.pulls[i] = pull
+        holding.beside[i] = side * pull
+    wait_for_block()
+    multiply_across(holding.held, count, rows.unknowns, holding.beside, holding.place)
+    see(rows, holding)
 
 
 @wp.func
 def find_optimum(rows: UnitRows, holding: Holding):
     """From the sides, a guess: how it ended. See ``active_set.optimum_kernel``.
 
-    Rows are held and looked at in rounds: first those that pull the wrong way go and those that are broken are held,
-    all at once; then, until all pull the right way, some only go; then broken ones join one at a time, and that is
-    looked at once more without what rounding has carried along.
+    Of the guess those rows stay that pull the right way; then broken ones join one at a time. A round in which all that
+    is wrong changes at once, as there, costs more here than the joins that it saves: 2.3 rows join less without any.
     """
-    rounds = int(0)
+    # Not a range, which would be written out.
     revisions = int(0)
-    joined = int(0)
     while revisions < _REVISIONS:
-        count = hold(rows, holding)
+        revisions += 1
+        count = int(0)
+        wrong = int(1)
+        while wrong > 0:
+            count = hold(rows, holding)
+            if count < 0:
+                let_go_of_all(rows, holding)
+            else:
+                wrong = let_go_of_wrong(rows, holding, count)
+        count = descend(rows, holding, count)
+        if count == -1:
+            return INFEASIBLE
         if count < 0:
-            let_go_of_all(rows, holding)
-            rounds = _ROUNDS
-            joined = 0
-        else:
-            wrong = let_go_of_wrong(rows, holding, count)
-            if joined == 1 or rounds < _ROUNDS:
-                if wrong + hold_broken(rows, holding) == 0:
-                    return FOUND
-                rounds += 1
-                revisions += joined
-                joined = 0
-            elif wrong == 0:
-                ended = descend(rows, holding, count)
-                if ended != FOUND:
-                    return ended
-                joined = 1
+            return ASTRAY
+        refine(rows, holding, count)
+        if let_go_of_wrong(rows, holding, count) + hold_broken(rows, holding) == 0:
+            return FOUND
     return ASTRAY

@@ -66,7 +66,7 @@ def lane_of_block() -> int:
         for (int i = 0; i < DOWN; ++i)
             #pragma unroll
             for (int k = 0; k < ACROSS; ++k) sum[i][k][0] = sum[i][k][1] = 0.0;
-        #pragma unroll 3
+        #pragma unroll 4
         for (int s = 0; s < inner; s += 4) {
             const bool there = s + place < inner;
             const int at = there ? s + place : 0;

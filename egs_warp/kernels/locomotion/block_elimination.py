@@ -150,6 +150,36 @@ def eliminate(matrix: wp.array2d[real], unknowns: int, columns: int, singular: r
     double R[B][B], by[B];
     int good = 1;
 #endif
+#if defined(__CUDA_ARCH__)
+    if (count <= 32) {
+        // A row is a warp's, a column each of its threads': one unknown after the other takes no longer than waiting.
+        __shared__ double rows[32][33], made[32][33];
+        const int side = own < count ? own : count - 1;
+        for (int r = warp; r < count; r += warps) {
+            rows[r][own] = A[r * as + side];
+            made[r][own] = 0.0;
+        }
+        WAIT;
+        for (int j = 0; j < count; ++j) {
+            const double pivot = rows[j][j];
+            if (!(pivot > 0.0)) {
+                WAIT;
+                return 0;
+            }
+            const double ahead = own > j ? rows[j][own] / pivot : 0.0;
+            for (int r = warp; r < count; r += warps) {
+                if (r < j) made[r][own] -= made[r][j] * ahead;
+                else if (r == j) made[r][own] = own == j ? 1.0 : -ahead;
+                else rows[r][own] -= rows[j][r] * ahead;
+            }
+            WAIT;
+        }
+        for (int r = warp; r < count; r += warps)
+            if (own < count) U[r * us + own] = made[r][own] * rsqrt(rows[own][own]);
+        WAIT;
+        return 1;
+    }
+#endif
     for (int r = warp; r < count; r += warps)
         for (int c = own; c < count; c += WIDE) U[r * us + c] = r == c ? 1.0 : 0.0;
     for (int begin = 0; begin < count; begin += B) {

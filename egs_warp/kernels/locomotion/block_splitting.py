@@ -68,7 +68,10 @@ def iterate(rows: UnitRows, holding: Holding, splitting: Splitting):
         splitting.pushes[i] = real(0.0)
         splitting.sums[i] = real(0.0)
     share = real(1.0)
-    for _ in range(_ITERATIONS):
+    # Not a range, which would be written out.
+    done = int(0)
+    while done < _ITERATIONS:
+        done += 1
         for i in range(lane, count, wp.block_dim()):
             splitting.right[i] = _SIGMA * splitting.rows[i] + (one + _SIGMA) * (
                 splitting.pushes[i] / _RHO - splitting.near[i]

@@ -12,7 +12,6 @@ from egs_warp.kernels.locomotion.block_algebra import (
     apply_root,
     lane_of_block,
     largest_and_place,
-    list_marked,
     multiply,
     multiply_at,
 )
@@ -257,7 +256,11 @@ def solve_piece(program: Program, room: Room, rows: UnitRows, holding: Holding, 
         if solved.ended != FOUND:
             return solved
         multiply(room.root, m, m, holding.place, room.found)
-        holds = list_marked(holding.side, rows.count, m, holding.active)
+        held = real(0.0)
+        for row in range(lane, rows.count, wp.block_dim()):
+            if holding.side[row] != 0:
+                held += real(1.0)
+        holds = int(sum_of_block(held))
     else:
         for c in range(lane, m, wp.block_dim()):
             room.found[c] = real(0.0)
