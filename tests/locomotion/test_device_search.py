@@ -10,13 +10,18 @@ import warp as wp
 
 from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.kernels.locomotion import piece_search
+from egs_warp.kernels.locomotion.active_set import FOUND, INFEASIBLE
+from egs_warp.kernels.locomotion.block_active_set import Holding, UnitRows
+from egs_warp.kernels.locomotion.block_splitting import Splitting
 from egs_warp.locomotion import strategies
+from egs_warp.locomotion.active_set import ReducedRows, optimum_near
 from egs_warp.locomotion.contact_pieces import SLIDE, STICK, ContactModes, ContactPieces, PieceSearch, search_pieces
 from egs_warp.locomotion.device_search import search_at_once
 from egs_warp.locomotion.solvers import QpSolver
+from egs_warp.locomotion.splitting import OsqpSplitting
 from egs_warp.locomotion.strategies import Foreseen, Strategy, search_program
 from egs_warp.precision import real
-from tests.support.kernels import algebra_kernel
+from tests.support.kernels import algebra_kernel, iterate_kernel
 
 DEVICES = [str(device) for device in wp.get_devices()]
 FRICTION = 0.6
@@ -176,3 +181,68 @@ def test_a_block_does_the_algebra(count: int, device: str) -> None:
     solved, long = given[0].numpy()[:, count:], lengths.numpy()[:, None]
     expected = np.linalg.solve(matrix[:, :count], matrix[:, count:])
     np.testing.assert_allclose(long * solved, expected, rtol=1e-9, atol=1e-9)
+
+
+def filled(made: Any, device: str, **shapes: Any) -> Any:
+    """The struct ``made`` with zeros of these shapes, or with the numbers of arrays."""
+    for name, given in shapes.items():
+        kind = int if name in ("side", "active") else real
+        array = given if isinstance(given, np.ndarray) else np.zeros(given)
+        setattr(made, name, wp.array(np.ascontiguousarray(array), dtype=kind, device=device))
+    return made
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("seed", range(6))
+def test_a_block_iterates_as_osqp_does_and_ends_at_the_optimum(seed: int, device: str) -> None:
+    """min 1/2 z^T z over rows of length 1: the same rows are guessed, from wherever it begins."""
+    rng, n, m = np.random.default_rng(seed), 12, 60
+    units = rng.standard_normal((m, n))
+    units /= np.linalg.norm(units, axis=1, keepdims=True)
+    free, start = rng.standard_normal(m), 0.3 * seed * rng.standard_normal(n)
+    lower = np.where(rng.uniform(size=m) < 0.8, -0.8, -np.inf)
+    upper = np.where(rng.uniform(size=m) < 0.5, 0.9, np.inf)
+    broken = (free < lower) | (free > upper)
+    assert 5 < broken.sum() <= n + 30
+    chosen = np.flatnonzero(broken)[:n]
+    side = np.zeros(m, np.int32)
+    side[chosen] = np.where(free[chosen] < lower[chosen], 1, -1)
+    near = OsqpSplitting(np.eye(n), np.zeros(n), accuracy=3e-5).near(
+        units[chosen], (lower - free)[chosen], (upper - free)[chosen], start
+    )
+    pushes = np.zeros(m)
+    pushes[chosen] = near.multipliers
+    at = free + units @ near.x
+    expected = np.where(at - lower < -pushes, 1, np.where(upper - at < pushes, -1, 0))
+    rows = filled(UnitRows(), device, units=units, free=free, lower=lower, upper=upper, slack=np.full(m, 1e-8))
+    rows.unknowns, rows.count, rows.most = n, m, 1e6
+    holding = filled(
+        Holding(), device, side=side, active=n, at=m, **dict.fromkeys(("pulls", "place", "ways", "beside"), n),
+        **dict.fromkeys(("between", "outside"), n),
+        **dict.fromkeys(("held", "held_across", "products", "root", "inverse"), (n, n)),
+    )  # fmt: skip
+    splitting = filled(
+        Splitting(), device, begun=units @ start, held_by=m,
+        **dict.fromkeys(("rows", "near", "pushes", "sums", "right", "between", "step"), n),
+    )  # fmt: skip
+    guessed, ended = (wp.zeros(count, dtype=int, device=device) for count in (m, 1))
+    wp.launch(
+        iterate_kernel,
+        1 if device == "cpu" else piece_search.BLOCK,
+        inputs=[rows, holding, splitting, guessed, ended],
+        device=device,
+        block_dim=piece_search.BLOCK,
+    )
+    # A row that is at its bound to rounding is on either side of it.
+    sure = np.minimum(np.abs(at - lower + pushes), np.abs(upper - at - pushes)) > 1e-9
+    np.testing.assert_array_equal(guessed.numpy()[sure], expected[sure])
+    assert sure.sum() > m - 3 and np.count_nonzero(expected) > 2
+    np.testing.assert_allclose(splitting.pushes.numpy()[: len(chosen)], near.multipliers, atol=1e-8)
+    np.testing.assert_allclose(splitting.rows.numpy()[: len(chosen)], units[chosen] @ near.x, atol=1e-8)
+    exact = optimum_near(
+        ReducedRows.of(np.eye(n), np.zeros(n), units), lower - free, upper - free, free < lower, free > upper
+    )
+    assert exact is not None
+    assert ended.numpy()[0] == (FOUND if exact.feasible else INFEASIBLE)
+    if exact.feasible:
+        np.testing.assert_allclose(holding.place.numpy(), exact.x, atol=1e-6)

@@ -5,7 +5,9 @@ import warp as wp
 from egs_warp.kernels.block import wait_for_block
 from egs_warp.kernels.deformation.decomposition import column, matched_order, rotation_part, signed_as
 from egs_warp.kernels.locomotion import block_algebra as algebra
+from egs_warp.kernels.locomotion.block_active_set import Holding, UnitRows, find_optimum
 from egs_warp.kernels.locomotion.block_elimination import eliminate, invert_root
+from egs_warp.kernels.locomotion.block_splitting import Splitting, iterate
 from egs_warp.kernels.locomotion.piece_search import BLOCK
 from egs_warp.precision import real
 
@@ -56,3 +58,15 @@ def algebra_kernel(
     mine = real(algebra.lane_of_block() % 7)
     told[3] = int(algebra.largest_and_place(mine, algebra.lane_of_block())[1])
     algebra.normalise(matrix, unknowns, columns, lengths)
+
+
+@wp.kernel(launch_bounds=BLOCK)
+def iterate_kernel(
+    rows: UnitRows, holding: Holding, splitting: Splitting, guessed: wp.array[int], ended: wp.array[int]
+):
+    """OSQP's iterations from the sides, which are ``guessed`` then, and the optimum from there."""
+    iterate(rows, holding, splitting)
+    for row in range(algebra.lane_of_block(), rows.count, wp.block_dim()):
+        guessed[row] = holding.side[row]
+    wait_for_block()
+    ended[0] = find_optimum(rows, holding)

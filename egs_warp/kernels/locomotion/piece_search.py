@@ -57,7 +57,7 @@ _ACTIVE, _GAIN, _SLOWEST = wp.constant(real(1e-3)), wp.constant(real(5e-3)), wp.
 
 
 @wp.func
-def guess(room: Room, rows: UnitRows, holding: Holding):
+def guess(rows: UnitRows, holding: Holding):
     """How many rows the minimum without bounds breaks: they get a side."""
     broken = real(0.0)
     for row in range(lane_of_block(), rows.count, wp.block_dim()):
@@ -249,7 +249,7 @@ def solve_piece(program: Program, room: Room, rows: UnitRows, holding: Holding, 
     rows.most = _HOPELESS * worth
     holds = int(0)
     solved.ended = FOUND
-    if guess(room, rows, holding) > 0:
+    if guess(rows, holding) > 0:
         if first == 1:
             iterate(rows, holding, splitting)
         solved.ended = find_optimum(rows, holding)
