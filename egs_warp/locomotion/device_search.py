@@ -46,7 +46,7 @@ class _Room:
         total = m + further
         room, rows, holding, splitting = kernels.Room(), UnitRows(), Holding(), Splitting()
         for name, shape in {
-            **dict.fromkeys(("place", "held_place", "order", "first"), n),
+            **dict.fromkeys(("held_place", "first"), n),
             **dict.fromkeys(("touching", "held", "speeds"), forces),
             **{"parts": (further, 3), "contact": further, "onward": further, "next": further, "kinds": (4, n)},
         }.items():

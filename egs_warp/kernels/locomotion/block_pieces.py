@@ -47,12 +47,8 @@ class Room:
     """Scratch memory for m activations and n contacts at most. T forces are of contacts that touch, h of them are held,
     v speeds say where a piece ends; its rows are m of the activations and k more."""
 
-    place: wp.array[int]
-    """(n,) of each contact that touches its first force among those that do, of each other one its speed."""
     held_place: wp.array[int]
-    """(n,) its first row among those that are held."""
-    order: wp.array[int]
-    """(n,) its number among those that move as it does."""
+    """(n,) of each contact that touches its first row among those that are held."""
     touching: wp.array[int]
     """(T,) forces."""
     held: wp.array[int]
@@ -171,14 +167,11 @@ def list_contacts(program: Program, room: Room, sticks: int, slides: int):
             other = room.kinds[_HERE, j]
             before[other] = before[other] + 1
         order = before[kind]
-        room.order[i] = order
         place = 3 * (before[1] + before[2])
         held = 3 * before[1] + before[2]
         speed = 2 * before[2] + before[0]
         room.held_place[i] = held
-        room.place[i] = place
         if kind == _FREE:
-            room.place[i] = touches + speed
             room.speeds[speed] = 3 * i
             row = 9 * sticks + 3 * slides + order
             p = touches + speed
