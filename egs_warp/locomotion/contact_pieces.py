@@ -18,23 +18,8 @@ from egs_warp.launching import Device, kept_by_thread, launch_again, zeros
 from egs_warp.locomotion.solvers import QpSolver, quadratic_program
 from egs_warp.precision import real
 
-_SINGULAR = 1e-7
-"""Of the mean of the operator's diagonal: more points than the cage can resolve leave it singular."""
-_SLOWEST = 1e-9
-"""Of sqrt(g H): tangential velocity without a direction."""
-_ACTIVE = 1e-3
-"""Multiplier, of the objective's value for a unit of the row, from which a bound is worth leaving."""
-_GAIN = 5e-3
-"""Share of the objective by which a further piece has to lower it."""
-_BROKEN = 0.02
-"""By which a start may break a row that its piece does not quite hold."""
-_ROUNDING = 1e-6
-"""Of a start that is the only point of its piece, as where contacts repeat each other."""
-
 _NOTHING = 1e-9
 """Body weights: what rounding leaves of the force of a contact that is open."""
-
-_LEAVES, _SLIPS, _TURNS, _LANDS = 0, 1, 2, 3
 
 FREE, STICK, SLIDE = kernels.FREE, kernels.STICK, kernels.SLIDE
 
@@ -80,7 +65,7 @@ class ContactPieces:
         """(m + 3n,) ``activations`` (m,) and what contact answers to them; its forces are near ``guess`` (n, 3)."""
         m, n = self.activations, self.contacts
         operator = self.rows[:, m:].copy()
-        operator[np.diag_indices_from(operator)] += _SINGULAR * operator.diagonal().mean()
+        operator[np.diag_indices_from(operator)] += kernels.SINGULAR * operator.diagonal().mean()
         free = self.offset + self.rows[:, :m] @ activations
         forces, _ = coulomb_forces(operator, free, np.zeros(n), self.friction, guess)
         return np.concatenate([activations, forces.ravel()])
@@ -162,7 +147,7 @@ def search_pieces(
                 break
             modes = best.nearest
             continue
-        enough = best is not None and best.objective - solution.objective < _GAIN * abs(best.objective)
+        enough = best is not None and best.objective - solution.objective < kernels.GAIN * abs(best.objective)
         best, start = solution, solution.x
         if solution.onward is None or enough:
             break
@@ -185,7 +170,7 @@ def solve_relaxed(
     A = np.vstack([np.eye(m, m + 3 * n), *cone, program.rows[::3]])
     lower = np.concatenate([program.lower, np.zeros(n * (1 + kernels.FACES)), -program.offset[::3]])
     upper = np.concatenate([program.upper, np.full(len(lower) - m, np.inf)])
-    P = program.P + _SINGULAR * program.P.diagonal().mean() * np.eye(len(program.P))
+    P = program.P + kernels.SINGULAR * program.P.diagonal().mean() * np.eye(len(program.P))
     found = quadratic_program(P, program.q, A, solver=solver, device=device).solve(lower, upper)
     if not found.usable:
         return None
@@ -221,7 +206,7 @@ class Piece:
         stick, slide, free = (np.flatnonzero(modes.kind == kind) for kind in (STICK, SLIDE, FREE))
         contact = np.concatenate([stick, slide, np.tile(stick, kernels.FACES), slide, slide, free])
         onward = np.repeat(
-            [_LEAVES, _SLIPS, _TURNS, _LANDS],
+            [kernels.LEAVES, kernels.SLIPS, kernels.TURNS, kernels.LANDS],
             [len(stick) + len(slide), kernels.FACES * len(stick), 2 * len(slide), len(free)],
         )
         given = [np.ascontiguousarray(each) for each in (program.P, program.q, program.rows, program.offset)]
@@ -280,14 +265,14 @@ def solve_piece(
     device: Device = None,
     beside: bool = False,
 ) -> PieceSolution | None:
-    """Optimum of the activations in the piece of ``modes``; what ``start`` breaks of its bounds, up to ``_BROKEN``, may
+    """Optimum of the activations in the piece of ``modes``; what ``start`` breaks of its bounds, up to ``BROKEN``, may
     stay broken as much. None without a solution. ``beside`` where another piece of the step is solved already.
     """
     m, piece = program.activations, Piece.of(program, modes)
     if piece is None:
         return None
     b = piece.rows_offset[m:]
-    lower = np.minimum(-b, np.maximum(piece.rows[m:] @ start[:m], -b - _BROKEN)) - _ROUNDING
+    lower = np.minimum(-b, np.maximum(piece.rows[m:] @ start[:m], -b - kernels.BROKEN)) - kernels.ROUNDING
     found = quadratic_program(piece.P, piece.q, piece.rows, solver=solver, device=device).solve(
         np.concatenate([program.lower, lower]),
         np.concatenate([program.upper, np.full(len(lower), np.inf)]),
@@ -300,7 +285,7 @@ def solve_piece(
     x = np.concatenate([a, piece.offset + piece.slope @ a])
     objective = program.objective(x)
     pushes = -found.multipliers[m:]
-    active = np.flatnonzero(pushes > _ACTIVE * max(abs(objective), 1e-9))
+    active = np.flatnonzero(pushes > kernels.ACTIVE * max(abs(objective), 1e-9))
     further = nearest = None
     if len(active):
         contact, onward, pushes = piece.contact[active], piece.onward[active], pushes[active]
@@ -319,16 +304,16 @@ class _Beyond:
         self._modes = modes
         tangents = (program.rows @ x + program.offset).reshape(-1, 3)[:, 1:]
         self._against, self._along = _unit(-x[program.activations :].reshape(-1, 3)[:, 1:]), _unit(tangents)
-        self._moving = np.linalg.norm(tangents, axis=1) > _SLOWEST
+        self._moving = np.linalg.norm(tangents, axis=1) > kernels.SLOWEST
 
     def where(self, contacts: np.ndarray, onward: np.ndarray, pushes: np.ndarray) -> ContactModes:
         """Modes where ``contacts`` go ``onward``, the most pushed one's word last."""
         kind, slip = self._modes.kind.copy(), self._modes.slip.copy()
         for index in np.argsort(pushes, kind="stable"):
             i = contacts[index]
-            if onward[index] == _LEAVES:
+            if onward[index] == kernels.LEAVES:
                 kind[i] = FREE
-            elif onward[index] == _SLIPS:
+            elif onward[index] == kernels.SLIPS:
                 kind[i], slip[i] = SLIDE, self._against[i]
             elif self._moving[i]:
                 kind[i], slip[i] = SLIDE, self._along[i]

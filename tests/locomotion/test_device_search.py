@@ -9,11 +9,11 @@ import pytest
 import warp as wp
 
 from egs_warp.contact.coulomb import coulomb_forces
-from egs_warp.kernels.locomotion import piece_search
+from egs_warp.kernels.locomotion import block_active_set, block_pieces, piece_search
 from egs_warp.kernels.locomotion.active_set import FOUND, INFEASIBLE
 from egs_warp.kernels.locomotion.block_active_set import Holding, UnitRows
 from egs_warp.kernels.locomotion.block_splitting import Splitting
-from egs_warp.locomotion import strategies
+from egs_warp.locomotion import active_set, solvers, strategies
 from egs_warp.locomotion.active_set import ReducedRows, optimum_near
 from egs_warp.locomotion.contact_pieces import SLIDE, STICK, ContactModes, ContactPieces, PieceSearch, search_pieces
 from egs_warp.locomotion.device_search import search_at_once
@@ -181,6 +181,13 @@ def test_a_block_does_the_algebra(count: int, device: str) -> None:
     solved, long = given[0].numpy()[:, count:], lengths.numpy()[:, None]
     expected = np.linalg.solve(matrix[:, :count], matrix[:, count:])
     np.testing.assert_allclose(long * solved, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_bounds_give_way_by_as_much_as_on_the_host() -> None:
+    """These numbers stand in the kernels, which know nothing of the host's modules."""
+    there = block_pieces.LEFT, block_pieces.ROOM, piece_search.HOPELESS, block_active_set.PIVOTS
+    here = active_set._BROKEN, solvers._ROOM * 3e-5, active_set._HOPELESS, active_set._PIVOTS
+    assert [float(each) for each in there] == pytest.approx(here, rel=1e-12)
 
 
 def filled(made: Any, device: str, **shapes: Any) -> Any:

@@ -17,15 +17,15 @@ FOUND, INFEASIBLE, ASTRAY = wp.constant(0), wp.constant(1), wp.constant(2)
 
 _ROUNDS = wp.constant(3)
 """In which rows are let go and held by all that is wrong at once, before one at a time."""
-_REVISIONS = wp.constant(4)
+REVISIONS = wp.constant(4)
 """In which multipliers that were carried along are found anew."""
-_PULLS = wp.constant(real(1e-9))
+PULLS = wp.constant(real(1e-9))
 """Of the largest multiplier: sign of one that holds its row from the wrong side."""
-_REDUNDANT = wp.constant(real(1e-12))
+REDUNDANT = wp.constant(real(1e-12))
 """Rows that repeat each other leave the matrix of their products singular."""
-_MISSED = wp.constant(real(1e-7))
+MISSED = wp.constant(real(1e-7))
 """From its bound: a row that the others keep from there."""
-_DEPENDENT = wp.constant(real(1e-9))
+DEPENDENT = wp.constant(real(1e-9))
 """Of a row's square: what of it lies outside of the rows that hold, if it follows from them."""
 
 
@@ -280,7 +280,7 @@ def hold(program: Program, search: Search):
             search.active[count] = row
             count += 1
     know(program, search, count, -1)
-    if factored(program.reduced.products, search.active, search.side, count, _REDUNDANT, search.factor) == 0:
+    if factored(program.reduced.products, search.active, search.side, count, REDUNDANT, search.factor) == 0:
         return -1
     for i in range(count):
         row = search.active[i]
@@ -304,7 +304,7 @@ def let_go_of_wrong(program: Program, search: Search, count: int):
     for i in range(count):
         row = search.active[i]
         missed = wp.abs(place_of(search, row) - bound_of(program, search, row))
-        if search.pulls[i] < -_PULLS * most or missed > _MISSED + program.slack[row]:
+        if search.pulls[i] < -PULLS * most or missed > MISSED + program.slack[row]:
             search.side[row] = 0
             wrong += 1
     return wrong
@@ -408,7 +408,7 @@ def join(program: Program, search: Search, active: int, row: int):
                     first = i
         whole = real(wp.inf)
         # As many rows as unknowns leave nothing outside, whatever rounding says.
-        if apart > _DEPENDENT * square and count < search.active.shape[0]:
+        if apart > DEPENDENT * square and count < search.active.shape[0]:
             whole = towards * (bound - place_of(search, row)) / apart
         step = wp.min(whole, part)
         if not apart < real(wp.inf):
@@ -426,7 +426,7 @@ def join(program: Program, search: Search, active: int, row: int):
         if whole <= part:
             for i in range(count):
                 search.factor[count, i] = search.across[i]
-            search.factor[count, count] = wp.sqrt(apart + _REDUNDANT)
+            search.factor[count, count] = wp.sqrt(apart + REDUNDANT)
             search.active[count] = row
             search.pulls[count] = pull
             search.side[row] = sign
@@ -478,7 +478,7 @@ def find_optimum(program: Program, pivots: int, search: Search):
             break
         if let_go_of_wrong(program, search, count) + hold_broken(program, search) == 0:
             return FOUND
-    for _ in range(_REVISIONS):
+    for _ in range(REVISIONS):
         count = hold_those_that_pull(program, search)
         ended = descend(program, search, count, pivots)
         if ended != FOUND:

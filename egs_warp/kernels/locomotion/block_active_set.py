@@ -9,7 +9,16 @@ along of rounding goes whenever all rows that hold are looked at anew.
 import warp as wp
 
 from egs_warp.kernels.block import largest_of_block, sum_of_block, wait_for_block
-from egs_warp.kernels.locomotion.active_set import ASTRAY, FOUND, INFEASIBLE
+from egs_warp.kernels.locomotion.active_set import (
+    ASTRAY,
+    DEPENDENT,
+    FOUND,
+    INFEASIBLE,
+    MISSED,
+    PULLS,
+    REDUNDANT,
+    REVISIONS,
+)
 from egs_warp.kernels.locomotion.block_algebra import (
     add_product,
     apply_root,
@@ -24,15 +33,10 @@ from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
 
-_REVISIONS = wp.constant(4)
-_PIVOTS = wp.constant(600)
+PIVOTS = wp.constant(600)
+"""At most, as on the host."""
 _LOOKS = wp.constant(8)
 """Rows that join between two looks at what the point costs."""
-_PULLS = wp.constant(real(1e-9))
-_REDUNDANT = wp.constant(real(1e-12))
-_MISSED = wp.constant(real(1e-7))
-_DEPENDENT = wp.constant(real(1e-9))
-"""All as in ``active_set``."""
 
 
 @wp.struct
@@ -135,7 +139,7 @@ def hold(rows: UnitRows, holding: Holding):
     count = list_marked(holding.side, rows.count, rows.unknowns, holding.active)
     if count > rows.unknowns:
         return -1
-    gather(rows, holding, count, _REDUNDANT)
+    gather(rows, holding, count, REDUNDANT)
     for i in range(lane, count, wp.block_dim()):
         row = holding.active[i]
         holding.beside[i] = bound_of(rows, holding, row) - rows.free[row]
@@ -176,7 +180,7 @@ def let_go_of_wrong(rows: UnitRows, holding: Holding, count: int):
     for i in range(lane, count, wp.block_dim()):
         row = holding.active[i]
         missed = wp.abs(holding.at[row] - bound_of(rows, holding, row))
-        if holding.pulls[i] < -_PULLS * most or missed > _MISSED + rows.slack[row]:
+        if holding.pulls[i] < -PULLS * most or missed > MISSED + rows.slack[row]:
             holding.side[row] = 0
             wrong += real(1.0)
     wrong = sum_of_block(wrong)
@@ -284,7 +288,7 @@ def join(rows: UnitRows, holding: Holding, active: int, row: int):
         first = int(found[1])
         whole = real(wp.inf)
         # As many rows as unknowns leave nothing outside, whatever rounding says.
-        if apart > _DEPENDENT and count < rows.unknowns:
+        if apart > DEPENDENT and count < rows.unknowns:
             whole = towards * (bound - holding.at[row]) / apart
         step = wp.min(whole, part)
         if not apart < real(wp.inf):
@@ -305,7 +309,7 @@ def join(rows: UnitRows, holding: Holding, active: int, row: int):
         else:
             wait_for_block()
         if whole <= part:
-            grow(rows, holding, count, row, apart + _REDUNDANT)
+            grow(rows, holding, count, row, apart + REDUNDANT)
             if lane == 0:
                 holding.active[count] = row
                 holding.pulls[count] = pull
@@ -365,7 +369,7 @@ def descend(rows: UnitRows, holding: Holding, active: int):
     leads astray. What is broken most joins first."""
     count = int(active)
     write_inverse(holding, count)
-    for number in range(_PIVOTS):
+    for number in range(PIVOTS):
         row = most_broken(rows, holding)
         if row < 0:
             return count
@@ -405,7 +409,7 @@ def find_optimum(rows: UnitRows, holding: Holding):
     """
     # Not a range, which would be written out.
     revisions = int(0)
-    while revisions < _REVISIONS:
+    while revisions < REVISIONS:
         revisions += 1
         count = int(0)
         wrong = int(1)

@@ -11,13 +11,24 @@ from egs_warp.kernels.block import sum_of_block, wait_for_block
 from egs_warp.kernels.locomotion.block_active_set import UnitRows
 from egs_warp.kernels.locomotion.block_algebra import add_product, lane_of_block, multiply, normalise
 from egs_warp.kernels.locomotion.block_elimination import eliminate
-from egs_warp.kernels.locomotion.pieces import FACES, FREE, SLIDE, STICK
+from egs_warp.kernels.locomotion.pieces import (
+    BROKEN,
+    FACES,
+    FREE,
+    LANDS,
+    LEAVES,
+    ROUNDING,
+    SINGULAR,
+    SLIDE,
+    SLIPS,
+    STICK,
+    TURNS,
+    WEDGE,
+)
 from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
 
-LEAVES, SLIPS, TURNS, LANDS = 0, 1, 2, 3
-"""What a contact does beyond a row."""
 HERE, ONWARD, NEAREST, BESIDE = 0, 1, 2, 3
 """Modes that there is memory for, see ``Room``."""
 LEFT = wp.constant(real(1e-8))
@@ -31,14 +42,11 @@ _Faces = wp.types.vector(FACES, real)
 _ANGLES = [2.0 * math.pi * face / FACES for face in range(FACES)]
 _COSINES, _SINES = (wp.constant(_Faces(*map(each, _ANGLES))) for each in (math.cos, math.sin))
 _FACE_COSINE = wp.constant(real(math.cos(math.pi / FACES)))
-_WEDGE_SINE, _WEDGE_COSINE = wp.constant(real(math.sin(math.pi / 6.0))), wp.constant(real(math.cos(math.pi / 6.0)))
-_SINGULAR = wp.constant(real(1e-7))
-"""As in ``pieces``."""
+_WEDGE_SINE, _WEDGE_COSINE = wp.constant(real(math.sin(WEDGE))), wp.constant(real(math.cos(WEDGE)))
+_SINGULAR, _BROKEN, _ROUNDING = (wp.constant(real(each)) for each in (SINGULAR, BROKEN, ROUNDING))
 _NO_PIVOT = wp.constant(real(1e-10))
 """Of the mean of the operator's diagonal."""
-_BROKEN, _ROUNDING = wp.constant(real(0.02)), wp.constant(real(1e-6))
-"""As in ``contact_pieces``."""
-_ROOM = wp.constant(real(9e-6))
+ROOM = wp.constant(real(9e-6))
 """By which bounds are moved apart, as by ``SplittingProgram``."""
 
 
@@ -379,13 +387,13 @@ def write_rows(program: Program, room: Room, rows: UnitRows, begun: wp.array[rea
         if row < m:
             free = room.minimum[row]
             start = room.start[row]
-            room.bounds[0, row] = program.told[program.lower + row] - _ROOM
-            room.bounds[1, row] = program.told[program.upper + row] + _ROOM
+            room.bounds[0, row] = program.told[program.lower + row] - ROOM
+            room.bounds[1, row] = program.told[program.upper + row] + ROOM
         else:
             free = of_row(room, row - m, room.at_minimum)
             start = of_row(room, row - m, room.at_start)
             least = -offset_of_row(room, row - m, m)
-            room.bounds[0, row] = wp.min(least, wp.max(start, least - _BROKEN)) - _ROUNDING - _ROOM
+            room.bounds[0, row] = wp.min(least, wp.max(start, least - _BROKEN)) - _ROUNDING - ROOM
             room.bounds[1, row] = real(wp.inf)
         rows.free[row] = free / length
         begun[row] = (start - free) / length

@@ -19,11 +19,9 @@ from egs_warp.kernels.locomotion.block_elimination import invert_root
 from egs_warp.kernels.locomotion.block_pieces import (
     BESIDE,
     HERE,
-    LEAVES,
     LEFT,
     NEAREST,
     ONWARD,
-    SLIPS,
     Program,
     Room,
     count_of,
@@ -35,7 +33,7 @@ from egs_warp.kernels.locomotion.block_pieces import (
     write_speeds,
 )
 from egs_warp.kernels.locomotion.block_splitting import Splitting, iterate
-from egs_warp.kernels.locomotion.pieces import FREE, SLIDE, STICK
+from egs_warp.kernels.locomotion.pieces import ACTIVE, FREE, GAIN, LEAVES, SLIDE, SLIPS, SLOWEST, STICK
 from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
@@ -50,10 +48,9 @@ _LEAVES, _SLIPS = wp.constant(LEAVES), wp.constant(SLIPS)
 _HERE, _ONWARD = wp.constant(HERE), wp.constant(ONWARD)
 _NEAREST, _BESIDE = wp.constant(NEAREST), wp.constant(BESIDE)
 _HEADER = wp.constant(HEADER)
-_HOPELESS = wp.constant(real(1e6))
-"""As in ``active_set``."""
-_ACTIVE, _GAIN, _SLOWEST = wp.constant(real(1e-3)), wp.constant(real(5e-3)), wp.constant(real(1e-9))
-"""As in ``contact_pieces``."""
+HOPELESS = wp.constant(real(1e6))
+"""As on the host."""
+_ACTIVE, _GAIN, _SLOWEST = (wp.constant(real(each)) for each in (ACTIVE, GAIN, SLOWEST))
 
 
 @wp.func
@@ -246,7 +243,7 @@ def solve_piece(program: Program, room: Room, rows: UnitRows, holding: Holding, 
     write_rows(program, room, rows, splitting.begun, answers, further)
     rows.unknowns = m
     rows.count = m + further
-    rows.most = _HOPELESS * worth
+    rows.most = HOPELESS * worth
     holds = int(0)
     solved.ended = FOUND
     if guess(rows, holding) > 0:

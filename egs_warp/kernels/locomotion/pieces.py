@@ -14,13 +14,25 @@ wp.set_module_options({"enable_backward": False})
 
 FREE, STICK, SLIDE = 0, 1, 2
 """How a contact moves."""
+LEAVES, SLIPS, TURNS, LANDS = 0, 1, 2, 3
+"""What it does beyond a row that says where a piece ends."""
 FACES = 8
 """Of the pyramid that stands in for the friction cone of a contact that sticks."""
-_WEDGE = math.radians(30.0)
+WEDGE = math.radians(30.0)
 """How far a contact that slides may turn from the way that its friction is taken against. Friction that stays where it
 was while a foot slides elsewhere pushes a body along that no ground would."""
-_SINGULAR = 1e-7
+SINGULAR = 1e-7
 """Of the mean of the operator's diagonal: more points than the cage can resolve leave it singular."""
+SLOWEST = 1e-9
+"""Of sqrt(g H): tangential velocity without a direction."""
+ACTIVE = 1e-3
+"""Multiplier, of the objective's value for a unit of the row, from which a bound is worth leaving."""
+GAIN = 5e-3
+"""Share of the objective by which a further piece has to lower it."""
+BROKEN = 0.02
+"""By which a start may break a row that its piece does not quite hold."""
+ROUNDING = 1e-6
+"""Of a start that is the only point of its piece, as where contacts repeat each other."""
 _NO_PIVOT = 1e-14
 _ANGLES = [2.0 * math.pi * face / FACES for face in range(FACES)]
 _NORMALS = ", ".join(f"{math.cos(math.pi / FACES)}, {-math.cos(angle)}, {-math.sin(angle)}" for angle in _ANGLES)
@@ -45,8 +57,8 @@ def room_of(activations: int, contacts: int) -> int:
         ROW_ELIMINATION
         + f"""
     constexpr int FREE = {FREE}, STICK = {STICK}, SLIDE = {SLIDE}, FACES = {FACES};
-    constexpr double SINGULAR = {_SINGULAR}, NO_PIVOT = {_NO_PIVOT};
-    constexpr double WEDGE_SINE = {math.sin(_WEDGE)}, WEDGE_COSINE = {math.cos(_WEDGE)};
+    constexpr double SINGULAR = {SINGULAR}, NO_PIVOT = {_NO_PIVOT};
+    constexpr double WEDGE_SINE = {math.sin(WEDGE)}, WEDGE_COSINE = {math.cos(WEDGE)};
     // What each face leaves of the normal force over the friction, and of the tangents.
     const double sides[3 * FACES] = {{{_NORMALS}}};
 """
