@@ -37,11 +37,13 @@ class DenseFactors:
         self._upper = torch.from_numpy(rows * count + columns).to(self.device)
         self._lower = torch.from_numpy(columns * count + rows).to(self.device)
         self._root = _InverseRoot(Slabs.of(upper_pattern), self.stream)
-        self._places = self._root.places_of(rows, columns)
+        self.places = self._root.places_of(rows, columns)
+        """Of the entries in the matrix that is factored."""
         self._other = torch.zeros((count, count), dtype=torch.float64, device=self.device)
         self._entries, self._diagonal = self._other.new_zeros(len(rows)), self._other.new_zeros(count)
         self._diagonal_here = np.zeros(count)
-        self._told = self.stream.pinned(2)
+        self._told, self.verdict = self.stream.pinned(2), self._other.new_zeros(2)
+        """Whether the entries were finite, and the matrix definite."""
         self._factored = self.stream.recorded(self._factor)
         self._strain_told, self._strain_entries = Upload(self.stream, 3 * count), torch.zeros_like(self._entries)
         self._strain_here, self._strains = self.stream.pinned(0), Recordings(self.stream)
@@ -56,21 +58,33 @@ class DenseFactors:
         """See ``Factors``."""
         with self.stream:
             self._entries.copy_(self._take(entries))
-            diagonal = np.zeros(len(self._diagonal)) if diagonal is None else diagonal
-            # From step to step it is the same.
-            if not np.array_equal(diagonal, self._diagonal_here):
-                self._diagonal_here = diagonal.copy()
-                self._diagonal.copy_(self._take(diagonal))
+            self.tell(np.zeros(len(self._diagonal)) if diagonal is None else diagonal)
             self._factored()
+        self._begun = True
+
+    def tell(self, diagonal: np.ndarray) -> None:
+        """The ``diagonal`` (n,) that is added to the entries."""
+        # From step to step it is the same.
+        if not np.array_equal(diagonal, self._diagonal_here):
+            self._diagonal_here = diagonal.copy()
+            self._diagonal.copy_(self._take(diagonal))
+
+    def enqueue(self, entries: torch.Tensor) -> None:
+        """``begin`` with the diagonal that was told, as part of a graph; who launches that says so by ``begun``."""
+        self._entries.copy_(entries)
+        self._factor()
+
+    def begun(self) -> None:
+        """Factors are on their way."""
         self._begun = True
 
     def _factor(self) -> None:
         """Of what lies in the entries and the diagonal, and whether these are finite and make it definite."""
-        self._root.matrix.view(-1)[self._places] = self._entries
+        self._root.matrix.view(-1)[self.places] = self._entries
         self._root.matrix.diagonal().add_(self._diagonal[self._root.order])
         definite = self._root.make()
-        told = torch.stack([self._entries.isfinite().all(), definite]).to(torch.float64)
-        self._told.copy_(told, non_blocking=True)
+        self.verdict.copy_(torch.stack([self._entries.isfinite().all(), definite]))
+        self._told.copy_(self.verdict, non_blocking=True)
 
     def add(self, across: np.ndarray, rates: np.ndarray) -> bool:
         """See ``Factors``; S keeps its own factor where the sum has none."""
@@ -149,12 +163,26 @@ class DenseFactors:
     def _strain(self, given: torch.Tensor, near: float, far: float) -> torch.Tensor:
         """Form and slope, one behind the other, with what was told; no numbers where there are no factors."""
         slope, weights, away = self._strain_told.there.split([len(given)] * 3)
-        moves = near * given + far * self._solve(weights[:, None] * given)
+        form, along = self.strain(self._strain_entries, slope, weights, given, near, far, away)
+        return torch.cat([form.flatten(), along])
+
+    def strain(
+        self,
+        entries: torch.Tensor,
+        slope: torch.Tensor,
+        weights: torch.Tensor,
+        vectors: torch.Tensor,
+        near: float,
+        far: float,
+        away: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """``strain_ahead`` of what lies on the device, with nothing that waits."""
+        moves = near * vectors + far * self._solve(weights[:, None] * vectors)
         moves[:, -1] -= away
         flat = self._other.view(-1)
-        flat[self._upper] = self._strain_entries
-        flat[self._lower] = self._strain_entries
-        return torch.cat([(moves.T @ (self._other @ moves)).flatten(), slope @ moves])
+        flat[self._upper] = entries
+        flat[self._lower] = entries
+        return moves.T @ (self._other @ moves), slope @ moves
 
     def _take(self, values: np.ndarray | torch.Tensor) -> torch.Tensor:
         if isinstance(values, torch.Tensor):

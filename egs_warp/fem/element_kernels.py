@@ -73,7 +73,8 @@ class ElementKernels:
         self._positions_here = Mirror(self._positions)
         # Both come to the host at once.
         self._energies_and_determinants = wp.zeros((2, tet_count), dtype=real, device=device)
-        self._energies, self._determinants = self._energies_and_determinants[0], self._energies_and_determinants[1]
+        energies: Any = self._energies_and_determinants
+        self._energies, self._determinants = energies[0], energies[1]
         self._energies_here = Mirror(self._energies_and_determinants)
         self._corner_gradients = wp.zeros((tet_count, 4), dtype=Vec3, device=device)
         self._node_gradients = wp.zeros(node_count, dtype=Vec3, device=device)
@@ -103,34 +104,32 @@ class ElementKernels:
         # A kernel that is told no step does not read the gradients.
         return (self._no_gradients, 0.0) if damping is None else (damping.start, damping.dt)
 
-    def _damping_inputs(self, damping: Damping | None) -> list:
-        start, dt = self._start_of(damping)
-        return [start, self._positions, dt]
-
     def energy(self, positions: np.ndarray, damping: Damping | None) -> tuple[float, np.ndarray]:
         """Joules, and det F (T,)."""
         self._positions_here.put(positions)
-        self._enqueue_energies(damping)
+        self.enqueue_energies(self._positions, *self._start_of(damping))
         energies, determinants = self._energies_here.get()
         return float(energies.sum()), determinants
 
     def energy_and_gradient(self, positions: np.ndarray, damping: Damping | None) -> tuple[float, np.ndarray]:
         """Joules, and (N, 3) newtons, of elasticity and damping."""
         self._positions_here.put(positions)
-        self._enqueue_energies(damping)
         start, dt = self._start_of(damping)
+        self.enqueue_energies(self._positions, start, dt)
         self.enqueue_gradient(self._positions, start, dt, None, self._no_shares, self._node_gradients)
         (energies, _), gradients = Mirror.get_all(self._energies_here, self._gradients_here)
         return float(energies.sum()), gradients
 
-    def _enqueue_energies(self, damping: Damping | None) -> None:
+    def enqueue_energies(self, positions: wp.array, start: wp.array, dt: float) -> wp.array:
+        """(T,) joules of each element, of what lies on the device, with nothing that waits."""
         launch_again(
             kernels.element_energies_kernel,
             len(self._tets),
-            inputs=[*self._model, *self._damping_inputs(damping)],
+            inputs=[*self._model, start, positions, dt],
             outputs=[self._energies, self._determinants],
             device=self._device,
         )
+        return self._energies
 
     def gradient(self, positions: np.ndarray, damping: Damping | None, tension: MuscleTension | None) -> np.ndarray:
         """(N, 3) newtons."""
@@ -188,11 +187,18 @@ class ElementKernels:
     def _made(self, positions: np.ndarray, damping: Damping | None, factor: float, projected: bool) -> wp.array:
         """(nnz,) upper entries, overwritten the next time."""
         self._positions_here.put(positions)
+        start, dt = self._start_of(damping)
+        return self.enqueue_entries(self._positions, start, dt, factor=factor, projected=projected)
+
+    def enqueue_entries(
+        self, positions: wp.array, start: wp.array, dt: float, *, factor: float, projected: bool
+    ) -> wp.array:
+        """The same of what lies on the device, with nothing that waits."""
         hessian = kernels.element_projected_hessians_kernel if projected else kernels.element_hessians_kernel
         launch_again(
             hessian,
             len(self._tets),
-            inputs=[*self._model, *self._damping_inputs(damping)],
+            inputs=[*self._model, start, positions, dt],
             outputs=[self._blocks],
             device=self._device,
         )

@@ -18,9 +18,6 @@ from egs_warp.launching import Device, kept_by_thread, launch_again, zeros
 from egs_warp.locomotion.solvers import QpSolver, quadratic_program
 from egs_warp.precision import real
 
-_NOTHING = 1e-9
-"""Body weights: what rounding leaves of the force of a contact that is open."""
-
 FREE, STICK, SLIDE = kernels.FREE, kernels.STICK, kernels.SLIDE
 
 
@@ -84,8 +81,8 @@ class ContactModes:
     def of(cls, forces: np.ndarray, friction: float) -> ContactModes:
         """Those of ``forces`` (n, 3) body weights that obey Coulomb's law."""
         pull = np.linalg.norm(forces[:, 1:], axis=1)
-        pressing = forces[:, 0] > _NOTHING
-        sliding = pressing & (pull >= (1.0 - 1e-6) * friction * forces[:, 0])
+        pressing = forces[:, 0] > kernels.NOTHING
+        sliding = pressing & (pull >= kernels.NEARLY * friction * forces[:, 0])
         kind = np.where(sliding, SLIDE, np.where(pressing, STICK, FREE))
         return cls(kind, _unit(-forces[:, 1:]))
 

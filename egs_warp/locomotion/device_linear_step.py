@@ -12,6 +12,7 @@ import warp as wp
 
 from egs_warp.contact.detection import ContactSet
 from egs_warp.contact.device_response import DeviceResponder, DeviceResponse
+from egs_warp.contact.device_room import ContactRoom, vectors
 from egs_warp.fem.graphs import GraphStream, Recordings, Upload
 from egs_warp.fem.worlds import shared
 from egs_warp.locomotion.linear_step import LinearStep, Prospect, torques_of
@@ -19,7 +20,7 @@ from egs_warp.locomotion.objectives import Objective
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleTension
-from egs_warp.precision import Vec3, real
+from egs_warp.precision import real
 
 _MORE = 8
 """Contacts for which there is memory beyond those that there are."""
@@ -32,8 +33,8 @@ class DeviceLinearStep(LinearStep):
     response: DeviceResponse
     known: np.ndarray
     """(3n, k + 1) m/s of the contacts."""
-    of_ends: _Room
-    of_squares: _Room
+    of_ends: Transfers
+    of_squares: Transfers
 
     def end(self, x: np.ndarray) -> np.ndarray:
         """See ``LinearStep``."""
@@ -50,26 +51,33 @@ class DeviceLinearStep(LinearStep):
 
     def squares(self, objectives: Sequence[Objective]) -> Callable[[], np.ndarray]:
         """See ``LinearStep``; those begun before are lost."""
-        stream, width, size = self.response.owner.stream, self.count + 1, len(self.velocities)
-        one, several = _by_entries(objectives)
-        rows = np.concatenate([np.zeros((0, size)), *(root * dense for root, dense, _ in several)])
-        targets = np.concatenate([np.zeros(0), *(root * target for root, _, target in several)])
-        parts = [np.concatenate([np.zeros(0), *each]) for each in zip(*one, strict=True)] or [np.zeros(0)] * 3
+        stream, width = self.response.owner.stream, self.count + 1
         with stream:
-            told = self.of_squares.there(*parts, targets, rows)
-            places, shares, wanted, asked, dense = told.split([*(len(part) for part in parts), len(targets), rows.size])
-            missed = shares[:, None] * self.velocities[places.long()]
-            missed[:, -1] -= wanted
-            form = missed.T @ missed
-            missed = dense.view(-1, size) @ self.velocities
-            missed[:, -1] -= asked
-            self.of_squares.here(form.addmm_(missed.T, missed).view(-1))
+            self.of_squares.here(squares_of(self.velocities, objectives, self.of_squares).view(-1))
 
         def form_here() -> np.ndarray:
             stream.wait()
             return self.of_squares.found(width**2).reshape(width, width).copy()
 
         return form_here
+
+
+def squares_of(velocities: torch.Tensor, objectives: Sequence[Objective], room: Transfers) -> torch.Tensor:
+    """``LinearStep.squares`` of the ``velocities`` (3N, k + 1), on the device; what is asked goes there by the
+    ``room``."""
+    size = len(velocities)
+    one, several = _by_entries(objectives)
+    rows = np.concatenate([np.zeros((0, size)), *(root * dense for root, dense, _ in several)])
+    targets = np.concatenate([np.zeros(0), *(root * target for root, _, target in several)])
+    parts = [np.concatenate([np.zeros(0), *each]) for each in zip(*one, strict=True)] or [np.zeros(0)] * 3
+    told = room.there(*parts, targets, rows)
+    places, shares, wanted, asked, dense = told.split([*(len(part) for part in parts), len(targets), rows.size])
+    missed = shares[:, None] * velocities[places.long()]
+    missed[:, -1] -= wanted
+    form = missed.T @ missed
+    missed = dense.view(-1, size) @ velocities
+    missed[:, -1] -= asked
+    return form.addmm_(missed.T, missed)
 
 
 def _by_entries(objectives: Sequence[Objective]) -> tuple[list[Any], list[Any]]:
@@ -88,7 +96,7 @@ def _by_entries(objectives: Sequence[Objective]) -> tuple[list[Any], list[Any]]:
     return one, several
 
 
-class _Room:
+class Transfers:
     """Memory by which numbers go to the device in one piece and come back so, as long as they need it."""
 
     def __init__(self, stream: GraphStream) -> None:
@@ -124,13 +132,13 @@ class DeviceLinearSteps:
         self._works = Recordings(owner.stream)
         self._memory = owner.zeros(0)
         self._speeds_here = owner.stream.pinned(0)
-        self._rooms = _Room(owner.stream), _Room(owner.stream)
+        self._rooms = Transfers(owner.stream), Transfers(owner.stream)
 
     def about(self, prospect: Prospect, other: Callable[[], Any]) -> tuple[LinearStep, Any]:
         """See ``LinearSteps``; it is overwritten by the next. ``other`` comes last: both work on one stream."""
         response, owner, m = prospect.response, self.owner, self.count
         assert isinstance(response, DeviceResponse)
-        room, dt, newtons = response.room, response.tangent.problem.dt, owner.body.weight
+        room, dt = response.room, response.tangent.problem.dt
         width = 3 * response.contacts.count
         # Without muscles and contact.
         response.at(None, prospect.velocities, prospect.forces)
@@ -138,17 +146,14 @@ class DeviceLinearSteps:
             velocities, speeds = self._room_for(3 * len(prospect.velocities), 3 * room.places, m + width + 1)
 
             def work() -> None:
-                foreseen, _, free, _ = room.tried()
-                moved = room.moved(torch.hstack([self.impulses(room.ends.view(-1, 3), dt), free[:, None]]))
-                velocities[:, :m] = moved[:, :-1]
-                torch.mul(room.columns[:, :width], newtons, out=velocities[:, m:-1])
-                torch.sub(foreseen, moved[:, -1], out=velocities[:, -1])
+                self.write(room, self.pulls(room), dt, velocities)
                 speeds.copy_(room.speeds(velocities), non_blocking=True)
 
             self._works.run((id(room), width, dt), work)
             owner.stream.wait()
         known = speeds.numpy()[:width].copy()
-        return DeviceLinearStep(velocities, torques_of(response, m), response, known, *self._rooms), other()
+        torques = torques_of(response.tangent.problem, response.contacts, m)
+        return DeviceLinearStep(velocities, torques, response, known, *self._rooms), other()
 
     def _room_for(self, unknowns: int, rows: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:
         """(unknowns, width) on the device and (rows, width) on the host, always in the same memory while that will
@@ -160,8 +165,23 @@ class DeviceLinearSteps:
         velocities = self._memory[: unknowns * width].view(unknowns, width)
         return velocities, self._speeds_here[: rows * width].view(rows, width)
 
-    def impulses(self, positions: torch.Tensor, dt: float) -> torch.Tensor:
-        """(3N, m) N s over ``dt`` seconds at node ``positions`` (N, 3), of each group at its bounds: Eq. (7)."""
-        pulls = wp.to_torch(self.owner.lines.enqueue_pulls(shared(self._tensions, real), shared(positions, Vec3)))
+    def pulls(self, room: ContactRoom) -> torch.Tensor:
+        """(M, 3) newtons by which the segments draw their ends together at their bounds, where the last trial of the
+        ``room`` ends."""
+        return wp.to_torch(self.owner.lines.enqueue_pulls(shared(self._tensions, real), vectors(room.ends)))
+
+    def write(self, room: ContactRoom, pulls: torch.Tensor, dt: float, velocities: torch.Tensor) -> None:
+        """``LinearStep.velocities`` about the last trial of the ``room``, one under no muscles: Eq. (7)."""
+        m = self.count
+        foreseen, _, free, _ = room.tried()
         of_groups = pulls[:, :, None] * self._members[:, None, :]
-        return (self._rows.T @ of_groups.flatten(1)).mul_(-dt).view(-1, self.count)
+        impulses = (self._rows.T @ of_groups.flatten(1)).mul_(-dt).view(-1, m)
+        moved = room.moved(torch.hstack([impulses, free[:, None]]))
+        velocities[:, :m] = moved[:, :-1]
+        columns = velocities[:, m:-1]
+        torch.mul(room.columns[:, : columns.shape[1]], self.owner.body.weight, out=columns)
+        torch.sub(foreseen, moved[:, -1], out=velocities[:, -1])
+
+    def lengths(self, positions: torch.Tensor) -> torch.Tensor:
+        """(M,) metres of the segments at node ``positions`` (3N,)."""
+        return torch.linalg.vector_norm(self._rows @ positions.view(-1, 3), dim=1)

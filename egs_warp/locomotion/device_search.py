@@ -28,19 +28,20 @@ def search_at_once(
     return _room(program.activations, places, device.alias).search(program, start, modes, qp_limit)
 
 
-class _Room:
-    """Memory for programs of m activations and n contacts at most."""
+class SearchRoom:
+    """Memory for programs of m activations and n contacts at most, and the launch that reads what is ``told`` and
+    writes the ``answer``, see ``search_kernel``."""
 
     def __init__(self, m: int, n: int, alias: str) -> None:
         self._device, size = wp.get_device(alias), m + 3 * n
         zeros = partial(wp.zeros, device=self._device)
-        self._told = zeros(kernels.HEADER + size * size + size + 3 * n * (size + 1) + 3 * m + 3 * n, dtype=real)
-        self._answer = zeros(kernels.HEADER + size, dtype=real)
-        self._answer_here = Mirror(self._answer)
+        self.told = zeros(kernels.HEADER + size * size + size + 3 * n * (size + 1) + 3 * m + 3 * n, dtype=real)
+        self.answer = zeros(kernels.HEADER + size, dtype=real)
+        self._answer_here = Mirror(self.answer)
         # What is read is what was told for this search: the launch before has ended, since its answer was looked at.
-        self._told_here = self._told
+        self._told_here = self.told
         if not self._device.is_cpu:
-            self._told_here = wp.zeros(self._told.shape, dtype=real, device="cpu", pinned=True)
+            self._told_here = wp.zeros(self.told.shape, dtype=real, device="cpu", pinned=True)
         self._given = self._told_here.numpy()
         further, forces, answers = 9 * n, 3 * n, 5 * n
         total = m + further
@@ -82,12 +83,16 @@ class _Room:
         self._launch: Any = wp.launch(
             kernels.search_kernel,
             dim=1 if self._device.is_cpu else kernels.BLOCK,
-            inputs=[self._told, room, rows, holding, splitting],
-            outputs=[self._answer],
+            inputs=[self.told, room, rows, holding, splitting],
+            outputs=[self.answer],
             device=self._device,
             block_dim=kernels.BLOCK,
             record_cmd=True,
         )
+
+    def enqueue(self) -> None:
+        """The search, with nothing that waits."""
+        self._launch.launch()
 
     def search(
         self, program: ContactPieces, start: np.ndarray, modes: ContactModes, qp_limit: int
@@ -102,9 +107,9 @@ class _Room:
         ):
             given[at : at + part.size] = part.ravel()
             at += part.size
-        if self._told_here is not self._told:
-            wp.copy(self._told, self._told_here, count=at)
-        self._launch.launch()
+        if self._told_here is not self.told:
+            wp.copy(self.told, self._told_here, count=at)
+        self.enqueue()
         answer = self._answer_here.get()
         ended, count, infeasible, objective, there = answer[:5].tolist()
         if ended == ASTRAY:
@@ -113,4 +118,4 @@ class _Room:
         return PieceSearch(x, objective, int(count), int(infeasible))
 
 
-_room = kept_by_thread(16)(_Room)
+_room = kept_by_thread(16)(SearchRoom)

@@ -10,11 +10,15 @@ import numpy as np
 
 from egs_warp.contact.detection import ContactSet
 from egs_warp.contact.response import ContactResponse
+from egs_warp.fem.step_problem import StepProblem
 from egs_warp.launching import beside
 from egs_warp.locomotion.objectives import Objective
 from egs_warp.locomotion.synergies import Synergies
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import GroupImpulses
+
+LOOKS = 2
+"""Newton steps with contact in which a step is foreseen."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,21 @@ class Prospect:
     """(N, 3) m/s."""
     forces: np.ndarray
     """(n, 3) newtons."""
+
+
+@dataclass(frozen=True)
+class StepStart:
+    """What a step begins with."""
+
+    problem: StepProblem
+    contacts: ContactSet
+    shift: np.ndarray
+    """(n,) m/s, see ``Prospect``."""
+    friction: float
+    activations: np.ndarray
+    """(M,) metres of the step before."""
+    forces: np.ndarray
+    """(n, 3) newtons of the step before, as far as these contacts were there."""
 
 
 @dataclass(frozen=True)
@@ -104,11 +123,10 @@ class HostLinearSteps:
         velocities[:, :m] = solved[:, :-1]
         np.multiply(weight, response.columns, out=velocities[:, m:-1])
         np.subtract(foreseen.ravel(), solved[:, -1], out=velocities[:, -1])
-        return LinearStep(velocities, torques_of(response, m)), given
+        return LinearStep(velocities, torques_of(problem, contacts, m)), given
 
 
-def torques_of(response: ContactResponse, m: int) -> np.ndarray:
+def torques_of(problem: StepProblem, contacts: ContactSet, m: int) -> np.ndarray:
     """(3, m + 3n) kg m^2/s of a step: none of ``m`` activations, of each contact force of a body weight."""
-    problem = response.tangent.problem
-    torques = problem.dt * problem.body.weight * response.contacts.speeds(problem.turns).T
+    torques = problem.dt * problem.body.weight * contacts.speeds(problem.turns).T
     return np.hstack([np.zeros((3, m)), torques])

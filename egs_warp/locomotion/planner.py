@@ -31,7 +31,7 @@ others that they stretch (jumps of pawn, robot and monkey work 1.64, 1.78 and 1.
 """
 _FASTEST = 7.0
 """Bounds of activations, in their bounds a sqrt(H / g): how fast a muscle is switched on and off."""
-_REGULAR = 1e-7
+REGULAR = 1e-7
 
 
 @dataclass(frozen=True)
@@ -124,31 +124,37 @@ class StepPlanner:
         speeds = linear.speeds(contacts)
         rows, offset = speeds[:, :-1] / speed, speeds[:, -1] / speed
         offset[::3] += prospect.shift / speed
-        reach = _FASTEST * problem.dt / body.time_unit
-        pieces = ContactPieces(
-            *(cost.P, cost.q, cost.constant, rows, offset, self.friction),
-            *(np.maximum(previous - reach, -1.0), np.minimum(previous + reach, 1.0)),
-        )
+        bounds = self.activation_bounds(previous, problem.dt)
+        pieces = ContactPieces(cost.P, cost.q, cost.constant, rows, offset, self.friction, *bounds)
         slip = contacts.speeds(foreseen.ravel()).reshape(-1, 3) / speed
         start = self.synergies.mean(prospect.activations / self.muscles.bounds)
         return StepProgram(pieces, Foreseen(start, prospect.forces / weight, slip), linear, speeds)
+
+    def activation_bounds(self, previous: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        """(m,) each, how low and how high activations may go in ``dt`` seconds from the ``previous`` (m,)."""
+        reach = _FASTEST * dt / self.body.time_unit
+        return np.maximum(previous - reach, -1.0), np.minimum(previous + reach, 1.0)
 
     def _activation_cost(
         self, problem: StepProblem, foreseen: np.ndarray, previous: np.ndarray, count: int
     ) -> QuadraticCost:
         """Of ``count`` unknowns that begin with the activations, how large they are, what their muscles give or take
         on the way to the end of ``foreseen`` (N, 3) m/s, and how they change from ``previous`` (m,)."""
-        settings, body = self.settings, self.body
-        share = problem.dt * STEPS_A_UNIT / body.time_unit
-        strengths, squares = self._strengths
+        size, change = self.activation_weights(problem.dt)
         shorter = shortenings(self.muscles, problem.state.positions, problem.end_positions(foreseen))
-        works = self.muscles.max_forces * shorter / (body.weight * body.height)
-        size = settings.activation_weight * share**2 * strengths + WORK * (self.synergies.members.T @ works**2)
-        change = settings.activation_change_weight * share * squares
+        works = self.muscles.max_forces * shorter / (self.body.weight * self.body.height)
+        size = size + WORK * (self.synergies.members.T @ works**2)
         diagonal, q = np.zeros(count), np.zeros(count)
-        diagonal[: len(previous)] = 2.0 * (size + change) + _REGULAR
+        diagonal[: len(previous)] = 2.0 * (size + change) + REGULAR
         q[: len(previous)] = -2.0 * change * previous
         return QuadraticCost(np.diag(diagonal), q, float(change @ previous**2))
+
+    def activation_weights(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        """(m,) of the squares of activations, and of their changes, in a step of ``dt`` seconds."""
+        share = dt * STEPS_A_UNIT / self.body.time_unit
+        strengths, squares = self._strengths
+        settings = self.settings
+        return settings.activation_weight * share**2 * strengths, settings.activation_change_weight * share * squares
 
     @cached_property
     def _strengths(self) -> tuple[np.ndarray, np.ndarray]:

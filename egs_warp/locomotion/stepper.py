@@ -18,11 +18,13 @@ from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.factors import Factors, factors_on
 from egs_warp.fem.sparse_factors import SparseFactors
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.locomotion.linear_step import HostLinearSteps, LinearSteps, Prospect
+from egs_warp.locomotion.linear_step import LOOKS, HostLinearSteps, LinearSteps, Prospect, StepStart
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.planner import STEPS_A_UNIT, Plan, StageClock, StepPlanner
 from egs_warp.locomotion.settings import LocomotionSettings
+from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.step_cost import objectives_missed
+from egs_warp.locomotion.strategies import Strategy
 from egs_warp.locomotion.synergies import Synergies, find_synergies
 from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.muscles.muscle_set import MuscleSet
@@ -31,8 +33,6 @@ from egs_warp.muscles.tension import MuscleTension, muscle_columns
 MOST_HALVINGS = 4
 _AMISS, _LITTLE = 1.2, 0.01
 """A step whose end costs more than this factor of what its program expected, and this much more, is asked for again."""
-LOOKS = 2
-"""Newton steps with contact in which a step is foreseen."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +119,7 @@ class LocomotionStepper:
             factors_on(body.assembly.device, body.assembly.upper_pattern),
             linear_steps_by(self.solver.respond, muscles, synergies),
         )
+        self._at_once = _device_planner(self.planner, self.solver.respond)
 
     def with_friction(self, friction: float) -> LocomotionStepper:
         """The same on ground of another Coulomb coefficient, for nothing: it shares what this one works with, so the
@@ -225,18 +226,37 @@ class LocomotionStepper:
         problem = StepProblem(self.body, state, dt, self.settings.drag)
         contacts = self._detect(problem, memory)
         clock.lap("detect")
-        prospect = self.foresee(problem, contacts, memory, memory.activations)
-        clock.lap("foresee")
-        plan = self.planner.plan(prospect, memory.activations, objectives, clock)
-        result = self._solve(prospect.response, plan)
+        response, plan = self._plan(problem, contacts, memory, objectives, clock)
+        result = self._solve(response, plan)
         clock.lap("solve")
-        expected = self._missed(problem, objectives, prospect.response.contacts, plan)
+        expected = self._missed(problem, objectives, response.contacts, plan)
         if (
             result.converged
             and self._missed(problem, objectives, result.contacts, result) > _AMISS * expected + _LITTLE
         ):
             plan, result = self._again(problem, plan, result, memory, objectives, clock)
         return self._finish(problem, plan, result, clock)
+
+    def _plan(
+        self,
+        problem: StepProblem,
+        contacts: ContactSet,
+        memory: StepMemory,
+        objectives: Sequence[AnyObjective],
+        clock: StageClock,
+    ) -> tuple[ContactResponse, Plan]:
+        """What is foreseen, and the plan about it: on a GPU at once, if all goes as usual."""
+        if self._at_once is not None:
+            known = self.points.matched(contacts.points, memory.points, memory.forces)
+            shift, friction = self.solver.shift(contacts, problem.dt), self.geometry.friction
+            start = StepStart(problem, contacts, shift, friction, memory.activations, known)
+            found = self._at_once.plan(start, objectives)
+            clock.lap("plan")
+            if found is not None:
+                return found
+        prospect = self.foresee(problem, contacts, memory, memory.activations)
+        clock.lap("foresee")
+        return prospect.response, self.planner.plan(prospect, memory.activations, objectives, clock)
 
     def _again(
         self,
@@ -350,3 +370,18 @@ def linear_steps_by(respond: Responder, muscles: MuscleSet, synergies: Synergies
 
     assert isinstance(respond, DeviceResponder)
     return DeviceLinearSteps(respond, muscles, synergies)
+
+
+def _device_planner(planner: StepPlanner, respond: Responder) -> Any:
+    """Plans where the matrices are, if they are not on the host, and the search is a kernel; else None."""
+    settings, device = planner.settings, planner.body.assembly.device
+    if isinstance(respond, HostResponder) or Strategy(settings.strategy) is not Strategy.PIECES:
+        return None
+    if settings.qp_solver_on(device) is not QpSolver.ADMM:
+        return None
+    from egs_warp.contact.device_response import DeviceResponder
+    from egs_warp.locomotion.device_linear_step import DeviceLinearSteps
+    from egs_warp.locomotion.device_plan import DevicePlanner
+
+    assert isinstance(respond, DeviceResponder) and isinstance(planner.linear_steps, DeviceLinearSteps)
+    return DevicePlanner(planner, respond, planner.linear_steps)

@@ -23,6 +23,10 @@ WEDGE = math.radians(30.0)
 was while a foot slides elsewhere pushes a body along that no ground would."""
 SINGULAR = 1e-7
 """Of the mean of the operator's diagonal: more points than the cage can resolve leave it singular."""
+NOTHING = 1e-9
+"""Body weights: what rounding leaves of the force of a contact that is open."""
+NEARLY = 1.0 - 1e-6
+"""Of the cone's radius: a contact whose friction comes so near to it slides."""
 SLOWEST = 1e-9
 """Of sqrt(g H): tangential velocity without a direction."""
 ACTIVE = 1e-3

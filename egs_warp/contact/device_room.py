@@ -1,0 +1,360 @@
+"""Memory and graphs for a step with contact on a GPU: matrices stay there, and a Newton step is one graph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from egs_warp.contact.detection import ContactSet
+from egs_warp.fem.body import SoftBody
+from egs_warp.fem.dense_factors import DenseFactors
+from egs_warp.fem.element_kernels import ElementKernels
+from egs_warp.fem.graphs import Recordings, Upload
+from egs_warp.fem.step_problem import StepProblem
+from egs_warp.fem.worlds import shared
+from egs_warp.kernels.contact import batch_contacts as of_worlds
+from egs_warp.kernels.contact import iterate as kernels
+from egs_warp.launching import Mirror
+from egs_warp.muscles.muscle_set import MuscleSet
+from egs_warp.muscles.tension import MuscleTension
+from egs_warp.precision import Mat33, Vec3, Vec4, real
+
+KEPT, TRIED, BEGUN = 0.0, 1.0, 2.0
+"""Where a trial begins: at the base as it is, at the last trial, or at what was told."""
+
+
+class BodyRoom:
+    """Of one body with dense ``factors``, where its elements are: a step's start, and what keeps its momentum."""
+
+    def __init__(self, factors: DenseFactors, body: SoftBody, muscles: MuscleSet) -> None:
+        self.factors, self.body, self.stream = factors, body, factors.stream
+        elements = body.assembly.elements
+        assert isinstance(elements, ElementKernels)
+        self.elements = elements
+        size = 3 * len(body.mesh.nodes)
+        self.turned, self.keeping = self.zeros(size, 3), self.zeros(3, size)
+        """What a solution lacks of a turn is ``turned`` times ``keeping`` times what it is the solution of."""
+        self.masses = self.tensor(body.node_mass)
+        self._start = Upload(self.stream, 6 * size + 9)
+        parts = self._start.there.split([size, size, size, 3 * size, 9])
+        self.positions, self.velocities, self.arms, self.turns, self.rates = parts
+        self.turns = self.turns.view(size, 3)
+        self.no_tensions = wp.zeros(0, dtype=real, device=body.assembly.device)
+        self.gradients = wp.zeros(len(body.mesh.tets), dtype=Mat33, device=body.assembly.device)
+        self.lines = elements.muscle_lines(MuscleTension.of(muscles, np.zeros(muscles.segment_count)))
+        self.segment_count = muscles.segment_count
+        self._problem: StepProblem | None = None
+
+    def zeros(self, *shape: int) -> torch.Tensor:
+        """On the device."""
+        return torch.zeros(shape, dtype=torch.float64, device=self.factors.device)
+
+    def tensor(self, values: np.ndarray) -> torch.Tensor:
+        """On the device."""
+        return torch.as_tensor(np.ascontiguousarray(values, dtype=np.float64), device=self.factors.device)
+
+    def take(self, problem: StepProblem) -> None:
+        """The step that begins there."""
+        if self._problem is problem:
+            return
+        self._problem = problem
+        state = problem.state
+        self._start.take(state.positions, state.velocities, problem.arms, problem.turns, problem.turning_rates)
+        wp.copy(self.gradients, problem.damping.start)
+
+    def enqueue_gradient(self, ends: wp.array, dt: float, tensions: wp.array, gradient: wp.array) -> None:
+        """Into ``gradient``, newtons, at the positions ``ends``, under ``tensions`` of the muscles."""
+        self.elements.enqueue_gradient(ends, self.gradients, dt, self.lines, tensions, gradient)
+
+
+class ContactRoom:
+    """Memory and graphs for so many contacts."""
+
+    def __init__(self, owner: BodyRoom, places: int) -> None:
+        self.owner, self.places, self._device = owner, places, owner.body.assembly.device
+        self._node_count = len(owner.body.mesh.nodes)
+        size, width = 3 * self._node_count, 3 * places
+        self._contact_nodes = wp.zeros(places, dtype=wp.vec4i, device=self._device)
+        self._contact_nodes_here = Mirror(self._contact_nodes)
+        self._contact_frames = Upload(owner.stream, 13 * places)
+        weights, axes = self._contact_frames.there.split([4 * places, 9 * places])
+        self._contacts = [
+            self._contact_nodes,
+            *(shared(weights.view(-1, 4), Vec4), shared(axes.view(-1, 3, 3), Mat33)),
+        ]
+        # As one of many worlds.
+        counts = wp.array([places], dtype=int, device=self._device)
+        self._world = [counts, *(each.reshape((1, places)) for each in self._contacts)]
+        self.columns = owner.zeros(size, width)
+        self._right, self.delassus = owner.zeros(size, 3 + width), owner.zeros(width, width)
+        self._delassus_here = owner.stream.pinned(width * width)
+        self._held = owner.zeros(2, 3, 3)
+        # What is told and what is asked of a trial goes in one piece each.
+        self._told = Upload(owner.stream, 3 + width)
+        self.told, self.wanted = self._told.there.split([3, width])
+        """Of a trial its length, whether forces push, where it begins; and the forces (3K,) newtons."""
+        self._asked, self._asked_here = owner.zeros(1 + width + size), owner.stream.pinned(1 + width + size)
+        self.size, self.speeds_after, self.velocities = self._asked.split([1, width, size])
+        """Of a trial, N s, m/s; the speeds are the contacts' after a Newton step without their forces."""
+        self._begun = Upload(owner.stream, 3 * size + width + owner.segment_count)
+        self.begun, self.tensions = self._begun.there.split([3 * size + width, owner.segment_count])
+        """As the base; newtons of the muscles."""
+        self._tensions = shared(self.tensions, real)
+        self._base, self._trial = owner.zeros(3 * size + width), owner.zeros(3 * size + width)
+        self.ends, self._gradient, self._rest, self._solved, self._pushed, self._half = owner.zeros(6, size)
+        self._torque, self._turn = owner.zeros(2, 3)
+        self._works = Recordings(owner.stream)
+        self.at_base: Any = None
+        self.at_trial: Any = None
+        """The iterates that lie there."""
+
+    def tried(self) -> Any:
+        """Of the last trial, see ``parts``."""
+        return self.parts(self._trial)
+
+    def moved(self, impulses: torch.Tensor) -> torch.Tensor:
+        """(3N, j) m/s of ``impulses`` of that shape, N s, by the response at hand."""
+        owner = self.owner
+        solved = owner.factors.inverse.T @ (owner.factors.inverse @ impulses)
+        return solved.addmm_(owner.turned, owner.keeping @ impulses)
+
+    def speeds(self, velocities: torch.Tensor) -> torch.Tensor:
+        """(3K, j) m/s of the contacts for nodal ``velocities`` (3N, j)."""
+        made = velocities.new_empty((3 * self.places, velocities.shape[1]))
+        self._enqueue_speeds(velocities, made)
+        return made
+
+    def _enqueue_speeds(self, velocities: torch.Tensor, made: torch.Tensor) -> None:
+        self._launch(
+            of_worlds.contact_speeds_kernel,
+            (1, self.places, velocities.shape[1]),
+            [*self._world, shared(velocities[None], real)],
+            [shared(made[None], real)],
+        )
+
+    def respond(self, problem: StepProblem, contacts: ContactSet) -> np.ndarray:
+        """(3K, 3K) m/(N s) of ``contacts``, which are those of this room from now on, by the factors at hand."""
+        self.take(contacts)
+        self._do(self.enqueue_response, problem.dt, 1.0 + problem.dt * problem.drag)
+        self.owner.stream.wait()
+        return self.delassus_here()
+
+    def delassus_here(self) -> np.ndarray:
+        """What has come of ``respond``."""
+        return self._delassus_here.numpy().reshape(3 * self.places, -1).copy()
+
+    def take(self, contacts: ContactSet) -> None:
+        """Those of this room from now on."""
+        more = self.places - contacts.count
+        self._contact_nodes_here.put(np.vstack([contacts.nodes, np.zeros((more, 4), np.int32)]))
+        self._contact_frames.take(contacts.weights, np.zeros(4 * more), contacts.axes)
+
+    def ahead(
+        self,
+        problem: StepProblem,
+        contacts: ContactSet,
+        tension: MuscleTension | None,
+        velocities: np.ndarray,
+        forces: np.ndarray,
+    ) -> tuple[float, np.ndarray]:
+        """Velocities (3N,) after a Newton step under those ``forces`` by the factors at hand, and a number, which is
+        none if they invert an element."""
+        with self.owner.stream:
+            self.take(contacts)
+            self.begin_at(tension, velocities, forces)
+        self.tell(0.0, False, forces, BEGUN)
+        size, _, ahead = self._ask(self._enqueue_ahead, problem.dt, 1.0 + problem.dt * problem.drag)
+        return float(size), ahead
+
+    def _do(self, work: Callable[..., None], *given: Any) -> None:
+        self._works.run((work.__name__, *given), lambda: work(*given))
+
+    def enqueue_response(self, dt: float, ratio: float) -> None:
+        """``respond``, with nothing that waits."""
+        owner, inverse = self.owner, self.owner.factors.inverse
+        momenta, impulses = self._right[:, :3], self._right[:, 3:]
+        torch.mul(owner.turns, owner.masses.repeat_interleave(3)[:, None], out=momenta)
+        impulses.zero_()
+        self._launch(of_worlds.contact_rows_kernel, (1, self.places), self._world, [shared(impulses[None], real)])
+        impulses.mul_(dt)
+        solved = inverse.T @ (inverse @ self._right)
+        self._enqueue_keeping(momenta, solved[:, :3], ratio)
+        torch.addmm(solved[:, 3:], owner.turned, owner.keeping @ impulses, out=self.columns)
+        self._enqueue_speeds(self.columns, self.delassus)
+        self._delassus_here.copy_(self.delassus.view(-1), non_blocking=True)
+
+    def _enqueue_keeping(self, momenta: torch.Tensor, turned: torch.Tensor, ratio: float) -> None:
+        """What keeps the momentum, of the ``momenta`` (3N, 3) of turns and what these bring about."""
+        owner = self.owner
+        owner.turned.copy_(turned)
+        torch.mm(momenta.T, owner.turned, out=self._held[0])
+        self._launch(kernels.holding_kernel, 1, [ratio, shared(self._held[:1], Mat33)], [shared(self._held[1:], Mat33)])
+        torch.mm(self._held[1], owner.turns.T - ratio * owner.turned.T, out=owner.keeping)
+
+    def _launch(self, kernel: Any, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, dim, inputs=inputs, outputs=outputs, device=self._device)
+
+    def parts(self, state: torch.Tensor) -> Any:
+        """Velocities, those after a Newton step without contact forces, residual without them (3N,); forces (3K,)."""
+        size = 3 * self._node_count
+        return state.split([size, size, size, 3 * self.places])
+
+    def begin(
+        self, problem: StepProblem, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
+        """As ``go``, at the very ``velocities`` (N, 3) and ``forces`` (n, 3), under ``tension``."""
+        with self.owner.stream:
+            self.begin_at(tension, velocities, forces)
+        return self.go(problem, length=0.0, push=False, wanted=forces, base=BEGUN)
+
+    def begin_at(self, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray) -> None:
+        """Tell where a trial may begin."""
+        more = np.zeros(3 * self.places - forces.size)
+        told = [] if tension is None else [tension.tensions]
+        self._begun.take(velocities, velocities, np.zeros(velocities.size), forces, more, *told)
+
+    def go(
+        self, problem: StepProblem, *, length: float, push: bool, wanted: np.ndarray, base: float
+    ) -> tuple[np.ndarray, ...]:
+        """A trial from the ``base`` (``KEPT``, ``TRIED`` or ``BEGUN``): its size, the contacts' speeds after its
+        Newton step, its velocities."""
+        self.tell(length, push, wanted, base)
+        return self._ask(self._enqueue_trial, problem.dt, 1.0 + problem.dt * problem.drag)
+
+    def tell(self, length: float, push: bool, wanted: np.ndarray, base: float) -> None:
+        """What ``send`` sends: see ``go``."""
+        told = self._told.here.numpy()
+        told[:3], told[3:] = (length, float(push), base), 0.0
+        told[3 : 3 + wanted.size] = wanted.ravel()
+
+    def again(self, *, base: float) -> tuple[np.ndarray, ...]:
+        """The ``base`` by the response at hand: no number, the contacts' speeds, no numbers."""
+        self._told.here[2] = base
+        return self._ask(self._enqueue_again)
+
+    def _ask(self, work: Callable[..., None], *given: float) -> tuple[np.ndarray, ...]:
+        with self.owner.stream:
+            self._do(work, *given)
+            self.owner.stream.wait()
+        return self.answer()
+
+    def answer(self) -> tuple[np.ndarray, ...]:
+        """What has come of what was asked of a trial: see ``go``."""
+        asked = self._asked_here.numpy()
+        return asked[0], asked[1 : 1 + 3 * self.places], asked[1 + 3 * self.places :]
+
+    def send(self) -> None:
+        """What is told of a trial."""
+        self._told.send()
+
+    def _enqueue_base(self) -> None:
+        self._launch(
+            kernels.base_kernel,
+            len(self._base),
+            [shared(self.told[2:], real), shared(self._trial, real), shared(self.begun, real)],
+            [shared(self._base, real)],
+        )
+
+    def _enqueue_again(self) -> None:
+        self.send()
+        self._enqueue_base()
+        self._enqueue_newton(self._base)
+        self.give()
+
+    def give(self) -> None:
+        """What was asked of a trial is on its way to the host."""
+        self._asked_here.copy_(self._asked, non_blocking=True)
+
+    def _enqueue_newton(self, state: torch.Tensor) -> None:
+        """A Newton step without contact forces from ``state``, and the contacts' speeds after it."""
+        velocities, loose, free, _ = self.parts(state)
+        self._enqueue_step(velocities, free, loose)
+        self._enqueue_speeds(loose[:, None], self.speeds_after[:, None])
+
+    def _enqueue_step(self, velocities: torch.Tensor, missing: torch.Tensor, after: torch.Tensor) -> None:
+        """``after`` a Newton step from ``velocities``, where so much is ``missing`` (3N,)."""
+        owner, inverse = self.owner, self.owner.factors.inverse
+        torch.mv(inverse, missing, out=self._half)
+        torch.mv(inverse.T, self._half, out=self._solved)
+        torch.mv(owner.keeping, missing, out=self._turn)
+        self._launch(
+            kernels.loose_kernel,
+            self._node_count,
+            [shared(owner.turned, real), vectors(velocities), vectors(self._solved), shared(self._turn, real)],
+            [vectors(after)],
+        )
+
+    def _enqueue_ahead(self, dt: float, ratio: float) -> None:
+        self.send()
+        self.enqueue_ahead(dt, ratio)
+        self.give()
+
+    def enqueue_ahead(self, dt: float, ratio: float) -> None:
+        """``ahead`` of what is told, with nothing that waits."""
+        owner, inverse = self.owner, self.owner.factors.inverse
+        momenta = self._right[:, :3]
+        torch.mul(owner.turns, owner.masses.repeat_interleave(3)[:, None], out=momenta)
+        self._enqueue_keeping(momenta, inverse.T @ (inverse @ momenta), ratio)
+        self.enqueue_residual(dt, ratio)
+        velocities, loose, _, _ = self.tried()
+        self._enqueue_step(velocities, self._rest, loose)
+        torch.add(owner.positions, loose, alpha=dt, out=self.ends)
+        owner.enqueue_gradient(vectors(self.ends), dt, self._tensions, vectors(self._gradient))
+        torch.linalg.vector_norm(self._gradient, out=self.size[0])
+        self.velocities.copy_(loose)
+
+    def _enqueue_trial(self, dt: float, ratio: float) -> None:
+        self.send()
+        self.enqueue_trial(dt, ratio)
+        self.give()
+
+    def enqueue_trial(self, dt: float, ratio: float) -> None:
+        """``go`` as is told, with nothing that waits."""
+        self.enqueue_residual(dt, ratio)
+        torch.linalg.vector_norm(self._rest, out=self.size[0])
+        self.velocities.copy_(self.tried()[0])
+        self._enqueue_newton(self._trial)
+
+    def enqueue_residual(self, dt: float, ratio: float) -> None:
+        """Where a trial ends, and what is missing there."""
+        owner, nodes = self.owner, self._node_count
+        self._enqueue_base()
+        velocities, _, free, forces = self.parts(self._trial)
+        old, old_loose, _, old_forces = self.parts(self._base)
+        lengths, wanted = shared(self.told[:1], real), self.wanted
+        torch.mv(self.columns, wanted, out=self._pushed)
+        self._pushed.mul_(self.told[1])
+        self._launch(
+            kernels.trial_kernel,
+            nodes,
+            [vectors(owner.positions), dt, lengths, vectors(old), vectors(old_loose), vectors(self._pushed)],
+            [vectors(velocities), vectors(self.ends)],
+        )
+        self._launch(
+            kernels.trial_forces_kernel,
+            self.places,
+            [lengths, vectors(old_forces), vectors(wanted)],
+            [vectors(forces)],
+        )
+        owner.enqueue_gradient(vectors(self.ends), dt, self._tensions, vectors(self._gradient))
+        torch.mv(owner.turns.T, self._gradient, out=self._torque)
+        gravity = Vec3(*(float(each) for each in owner.body.gravity))
+        self._launch(
+            kernels.residual_kernel,
+            nodes,
+            [
+                *(shared(owner.masses, real), gravity, ratio, dt, vectors(owner.arms)),
+                *(shared(owner.rates.view(1, 3, 3), Mat33), vectors(owner.velocities), *self._contacts),
+                *(vectors(self._torque), vectors(self._gradient), vectors(velocities), vectors(forces)),
+            ],
+            [vectors(free), vectors(self._rest)],
+        )
+
+
+def vectors(flat: torch.Tensor) -> wp.array:
+    """(N, 3) of a ``flat`` one (3N,)."""
+    return shared(flat.view(-1, 3), Vec3)

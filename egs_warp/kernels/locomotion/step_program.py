@@ -1,0 +1,112 @@
+"""The program of a step from where it is made to where it is searched, and what was found back from there, on a device.
+
+See ``egs_warp/locomotion/device_plan.py``; numbers are told as ``search_kernel`` reads them.
+"""
+
+import warp as wp
+
+from egs_warp.kernels.locomotion.piece_search import HEADER, unit_of
+from egs_warp.kernels.locomotion.pieces import FREE, NEARLY, NOTHING, SLIDE, STICK
+from egs_warp.precision import Vec3, real
+
+wp.set_module_options({"enable_backward": False})
+
+_HEADER = wp.constant(HEADER)
+_FREE, _STICK, _SLIDE = wp.constant(FREE), wp.constant(STICK), wp.constant(SLIDE)
+_NOTHING, _NEARLY = wp.constant(real(NOTHING)), wp.constant(real(NEARLY))
+
+
+@wp.func
+def tell_contact(told: wp.array[real], kinds: int, slips: int, i: int, force: Vec3, friction: real):
+    """How contact ``i`` moves under its ``force``, body weights, which obeys Coulomb's law."""
+    pull = wp.sqrt(force[1] * force[1] + force[2] * force[2])
+    kind = _FREE
+    if force[0] > _NOTHING:
+        kind = _STICK
+        if pull >= _NEARLY * friction * force[0]:
+            kind = _SLIDE
+    way = unit_of(-force[1], -force[2])
+    told[kinds + i] = real(kind)
+    told[slips + 2 * i] = way[0]
+    told[slips + 2 * i + 1] = way[1]
+
+
+@wp.kernel
+def tell_kernel(
+    # Model:
+    limit: int,
+    speed: real,
+    weight: real,
+    # In:
+    counts: wp.array[int],
+    frictions: wp.array[real],
+    form: wp.array2d[real],
+    speeds: wp.array2d[real],
+    shifts: wp.array[real],
+    bounds: wp.array2d[real],
+    forces: wp.array[Vec3],
+    # Out:
+    told_out: wp.array[real],
+):
+    """The program of m activations and n contacts, of the K for which there are places: the cost's ``form``
+    (m + 3K + 1, m + 3K + 1), ``speeds`` (3K, m + 3K + 1) m/s of the contacts, ``shifts`` (K,) m/s, ``bounds`` (3, m) of
+    the activations and their start, and ``forces`` (K,) newtons that contact answers there. ``speed`` is sqrt(g H) m/s,
+    ``weight`` newtons, ``limit`` the most programs; (m + 6K + 1, m + 3K + 1) threads."""
+    row, column = wp.tid()
+    m = bounds.shape[1]
+    n = counts[0]
+    size = m + 3 * n
+    last = form.shape[0] - 1
+    q = _HEADER + size * size
+    rows = q + size
+    offset = rows + 3 * n * size
+    if row < last:
+        if row < size:
+            if column < size:
+                told_out[_HEADER + row * size + column] = form[row, column]
+            elif column == last:
+                told_out[q + row] = form[row, last]
+    elif row < last + speeds.shape[0]:
+        k = row - last
+        if k < 3 * n:
+            if column < size:
+                told_out[rows + k * size + column] = speeds[k, column] / speed
+            elif column == last:
+                told_out[offset + k] = speeds[k, last] / speed
+                if k % 3 == 0:
+                    told_out[offset + k] = (speeds[k, last] + shifts[k / 3]) / speed
+    else:
+        begin = offset + 3 * n
+        for part in range(3):
+            if column < m:
+                told_out[begin + part * m + column] = bounds[part, column]
+        kinds = begin + 3 * m
+        if column < n:
+            tell_contact(told_out, kinds, kinds + n, column, forces[column] / weight, frictions[0])
+        if column == last:
+            told_out[0] = real(m)
+            told_out[1] = real(n)
+            told_out[2] = frictions[0]
+            told_out[3] = real(0.5) * form[last, last]
+            told_out[4] = real(limit)
+
+
+@wp.kernel
+def take_kernel(
+    # In:
+    counts: wp.array[int],
+    answer: wp.array[real],
+    m: int,
+    # Out:
+    x_out: wp.array[real],
+):
+    """The point of the ``answer`` in ``x_out`` (m + 3K + 1,): zero where no contact is, 1 behind all."""
+    k = wp.tid()
+    size = m + 3 * counts[0]
+    last = x_out.shape[0] - 1
+    value = real(0.0)
+    if k < size:
+        value = answer[_HEADER + k]
+    elif k == last:
+        value = real(1.0)
+    x_out[k] = value

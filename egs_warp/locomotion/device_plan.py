@@ -1,0 +1,301 @@
+"""The plan of a step where a GPU has its matrices: foreseen, programmed, searched and begun, with one look at the end
+(Eq. 4, 7, 8, 9, 12, 13).
+
+What ``LocomotionStepper.foresee`` and ``StepPlanner.plan`` do one after the other, as far as all goes the usual way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+import warp as wp
+
+from egs_warp.contact.coulomb import ASTRAY
+from egs_warp.contact.device_response import DeviceResponder, DeviceResponse
+from egs_warp.contact.device_room import BEGUN, TRIED, ContactRoom, vectors
+from egs_warp.contact.response import SINGULAR
+from egs_warp.fem.dense_factors import DenseFactors
+from egs_warp.fem.graphs import Recordings, Upload
+from egs_warp.fem.step_problem import Tangent
+from egs_warp.fem.worlds import launch_on, shared
+from egs_warp.kernels.contact import coulomb
+from egs_warp.kernels.locomotion import step_program as kernels
+from egs_warp.kernels.locomotion.active_set import FOUND
+from egs_warp.kernels.locomotion.piece_search import HEADER
+from egs_warp.locomotion.device_linear_step import DeviceLinearSteps, Transfers, squares_of
+from egs_warp.locomotion.device_search import SearchRoom
+from egs_warp.locomotion.linear_step import LOOKS, StepStart, torques_of
+from egs_warp.locomotion.objectives import AnyObjective, Objective
+from egs_warp.locomotion.planner import REGULAR, WORK, Plan, StepPlanner
+from egs_warp.locomotion.step_cost import EFFORT, HORIZON
+from egs_warp.locomotion.strategies import COSTLY
+from egs_warp.muscles.tension import MuscleTension
+from egs_warp.precision import Vec4, real
+
+_TOLERANCE, _ITERATIONS = 1e-12, 16
+"""As in ``coulomb_forces``."""
+
+
+class DevicePlanner:
+    """Plans of one body's steps, of the strategy ``pieces``."""
+
+    def __init__(self, planner: StepPlanner, owner: DeviceResponder, linear: DeviceLinearSteps) -> None:
+        assert isinstance(planner.factors, DenseFactors)
+        self.planner, self.owner, self.linear, self.factors = planner, owner, linear, planner.factors
+        self.asked, self.others = Transfers(owner.stream), Transfers(owner.stream)
+        muscles, body = planner.muscles, planner.body
+        self.members = owner.tensor(planner.synergies.members.toarray())
+        self.group_from_muscle = torch.as_tensor(
+            planner.synergies.group_from_muscle, device=owner.factors.device
+        ).long()
+        self.tensions = owner.tensor(muscles.bounds), owner.tensor(muscles.stiffness)
+        self.works = owner.tensor(muscles.max_forces / (body.weight * body.height))
+        self.masses = np.repeat(body.node_mass, 3)
+        self._rooms: dict[int, PlanRoom] = {}
+
+    def plan(self, start: StepStart, objectives: Sequence[AnyObjective]) -> tuple[DeviceResponse, Plan] | None:
+        """The response that is at hand then, and the plan for what the ``objectives`` ask, at which that has been asked
+        already; None where something is not as usual: a matrix that is not definite, an element that is inverted,
+        forces that are not found, a search that goes astray or ends where another may be better."""
+        room = self.owner.room_for(start.contacts)
+        if room.places not in self._rooms:
+            self._rooms[room.places] = PlanRoom(self, room)
+        return self._rooms[room.places].plan(start, objectives)
+
+
+class PlanRoom:
+    """Memory and graphs for so many contacts."""
+
+    def __init__(self, owner: DevicePlanner, room: ContactRoom) -> None:
+        body, zeros = owner.owner, owner.owner.zeros
+        self.owner, self.body, self.room = owner, body, room
+        self.m, size, places = owner.planner.synergies.count, len(room.ends), room.places
+        m, width = self.m, 3 * places
+        self._told = Upload(body.stream, 2 + places + 5 * m + 1)
+        parts = self._told.there.split([1, 1, places, 3 * m, 2 * m, 1])
+        self._count, self._friction, self._shifts, bounds, activation, self._constant = parts
+        self._bounds, (self._diagonal, self._slopes) = bounds.view(3, m), activation.view(2, m)
+        self._counts = torch.zeros(1, dtype=torch.int32, device=body.factors.device)
+        # To stay where the last trial is, and to go from there to the end of a Newton step.
+        self._stay, self._forward = body.tensor(np.array([0.0, 0.0, TRIED])), body.tensor(np.array([1.0, 1.0, TRIED]))
+        self._begin = body.tensor(np.array([0.0, 0.0, BEGUN]))
+        self._regular = zeros(width, width)
+        self._velocities, self._speeds = zeros(size, m + width + 1), zeros(width, m + width + 1)
+        self._form = zeros(m + width + 1, m + width + 1)
+        self._entries, self._slope, self._energy = zeros(len(owner.factors.places)), zeros(size), zeros(1)
+        # In one piece, as it comes back: what tells whether all went as usual, the answer, and forces.
+        lengths = [6, LOOKS + 3, LOOKS + 1, HEADER + m + width, width]
+        self._found, self._ends = zeros(sum(lengths)), np.cumsum(lengths)[:-1]
+        self._found_here = body.stream.pinned(len(self._found))
+        verdicts, self._sizes, self._missed, self._answer, self._forces = self._found.split(lengths)
+        self._verdicts = verdicts.view(3, 2)
+        self._x = zeros(m + width + 1)
+        self._search = SearchRoom(m, places, str(body.factors.device))
+        self._vectors, self._indices = zeros(1, 5, width), self._counts.new_zeros((1, 2, width))
+        self._matrices = zeros(1, width, (width + 4) // 4, 4)
+        self._works = Recordings(body.stream)
+
+    def plan(self, start: StepStart, objectives: Sequence[AnyObjective]) -> tuple[DeviceResponse, Plan] | None:
+        """See ``DevicePlanner``."""
+        body, room, problem, planner = self.body, self.room, start.problem, self.owner.planner
+        dt, ratio = problem.dt, 1.0 + problem.dt * problem.drag
+        time = max(HORIZON * body.body.time_unit, dt)
+        body.at_hand = room.at_base = room.at_trial = None
+        with body.stream:
+            self._tell(start)
+            self._do(self._enqueue_foresight, dt, ratio)
+            self._do(self._enqueue_linear, dt, ratio, time)
+            self._ask(start, objectives)
+            self._do(self._enqueue_search, dt, ratio, time)
+            body.stream.wait()
+        for factors in (body.factors, self.owner.factors):
+            factors.begun()
+        found = self._found_here.numpy()
+        verdicts, sizes, missed, answer, forces = np.split(found, self._ends)
+        ended, count, infeasible, objective, there = answer[:5]
+        usual = (
+            verdicts.min() > 0.0
+            and np.isfinite(sizes).all()
+            and missed.max() <= ASTRAY
+            and ended == FOUND
+            and there == 1.0
+        )
+        if not usual or (start.contacts.count > 0 and objective >= COSTLY):
+            return None
+        width, (size, speeds, velocities) = 3 * start.contacts.count, room.answer()
+        response = DeviceResponse.there(
+            Tangent(problem, body.factors), start.contacts, body, room, room.delassus_here()
+        )
+        body.at_hand = response
+        activations = (planner.synergies.members @ answer[HEADER : HEADER + self.m]) * planner.muscles.bounds
+        tension = MuscleTension.of(planner.muscles, activations)
+        begun = response.made(tension, forces[:width].reshape(-1, 3).copy(), (size, speeds, velocities))
+        room.at_trial = begun
+        return response, Plan(activations, begun.velocities, begun.forces, int(count), int(infeasible))
+
+    def _do(self, work: Callable[..., None], *given: float) -> None:
+        self._works.run((work.__name__, *given), lambda: work(*given))
+
+    def _tell(self, start: StepStart) -> None:
+        """All that is known at the start."""
+        problem, planner, room = start.problem, self.owner.planner, self.room
+        self.body.take(problem)
+        room.take(start.contacts)
+        room.begin_at(MuscleTension.of(planner.muscles, start.activations), problem.start, start.forces)
+        room.tell(0.0, False, start.forces, BEGUN)
+        self.body.factors.tell((1.0 + problem.dt * problem.drag) * self.owner.masses)
+        self.owner.factors.tell(self.owner.masses)
+        previous = planner.synergies.mean(start.activations / planner.muscles.bounds)
+        size, change = planner.activation_weights(problem.dt)
+        self._told.take(
+            np.array([start.contacts.count, start.friction]),
+            *(start.shift, np.zeros(room.places - start.contacts.count)),
+            *(*planner.activation_bounds(previous, problem.dt), previous),
+            *(2.0 * (size + change) + REGULAR, -2.0 * change * previous, np.array([2.0 * (change @ previous**2)])),
+        )
+
+    def _enqueue_foresight(self, dt: float, ratio: float) -> None:
+        """A Newton step ahead under the forces that are known, and from there ``LOOKS`` with contact."""
+        body, room = self.body, self.room
+        room.send()
+        self._counts.copy_(self._count)
+        torch.add(body.positions, room.parts(room.begun)[0], alpha=dt, out=room.ends)
+        self._enqueue_factors(dt, 0)
+        room.enqueue_ahead(dt, ratio)
+        self._sizes[0].copy_(room.size[0])
+        self._enqueue_factors(dt, 1)
+        room.enqueue_response(dt, ratio)
+        self._regular.copy_(room.delassus)
+        diagonal = room.delassus.diagonal()
+        self._regular.diagonal().add_(SINGULAR * diagonal.sum() / (3.0 * self._count).clamp(min=1.0))
+        room.parts(room.begun)[0].copy_(room.velocities)
+        room.enqueue_trial(dt, ratio)
+        self._sizes[1].copy_(room.size[0])
+        for look in range(LOOKS):
+            self._enqueue_forces(room.speeds_after, look)
+            room.told.copy_(self._forward)
+            room.enqueue_trial(dt, ratio)
+            self._sizes[2 + look].copy_(room.size[0])
+
+    def _enqueue_factors(self, dt: float, which: int) -> None:
+        """Of the step's matrix where the last trial ends."""
+        body = self.body
+        made = body.elements.enqueue_entries(vectors(self.room.ends), body.gradients, dt, factor=dt**2, projected=False)
+        body.factors.enqueue(wp.to_torch(made))
+        self._verdicts[which].copy_(body.factors.verdict)
+
+    def _enqueue_forces(self, speeds: torch.Tensor, which: int) -> None:
+        """``ContactResponse.forces`` from those that are wanted on, which are these then."""
+        lanes = coulomb.BLOCK if speeds.is_cuda else 1
+        launch_on(
+            speeds.device,
+            coulomb.coulomb_kernel,
+            (1, lanes),
+            inputs=[
+                (self._counts, wp.int32),
+                *((each, real) for each in (self._regular[None], speeds[None], self._shifts[None], self._friction)),
+                *(_TOLERANCE, _ITERATIONS, (self.room.wanted[None], real), (self._vectors, real)),
+                *((self._indices, wp.int32), (self._matrices, Vec4)),
+            ],
+            outputs=[(self._missed[which : which + 1], real)],
+            block_dim=lanes,
+        )
+
+    def _enqueue_linear(self, dt: float, ratio: float, time: float) -> None:
+        """The linear step about what is foreseen, and factors of its horizon, see ``Horizon``."""
+        body, room, owner = self.body, self.room, self.owner
+        room.tensions.zero_()
+        room.told.copy_(self._stay)
+        room.enqueue_residual(dt, ratio)
+        pulls, ends = owner.linear.pulls(room), vectors(room.ends)
+        torch.sum(wp.to_torch(body.elements.enqueue_energies(ends, body.gradients, time)), dim=0, out=self._energy[0])
+        body.elements.enqueue_gradient(ends, body.gradients, time, None, body.no_tensions, vectors(self._slope))
+        made = body.elements.enqueue_entries(ends, body.gradients, time, factor=1.0, projected=True)
+        self._entries.copy_(wp.to_torch(made))
+        body.stream.at_once(
+            [
+                lambda: owner.factors.enqueue(time**2 * self._entries),
+                lambda: owner.linear.write(room, pulls, dt, self._velocities),
+            ]
+        )
+        self._verdicts[2].copy_(owner.factors.verdict)
+        self._speeds.copy_(room.speeds(self._velocities))
+
+    def _ask(self, start: StepStart, objectives: Sequence[AnyObjective]) -> None:
+        """The form (m + 3K + 1, ...) of what the ``objectives`` ask, see ``objectives_cost``."""
+        problem, m, speed = start.problem, self.m, self.body.body.speed_unit
+        plain = [each for each in objectives if isinstance(each, Objective)]
+        torch.mul(squares_of(self._velocities, plain, self.owner.asked), 1.0 / speed**2, out=self._form)
+        others = [each for each in objectives if not isinstance(each, Objective)]
+        torques = torques_of(problem, start.contacts, m)
+        told = [np.zeros((0, len(self._form)))]
+        for objective in others:
+            slopes = objective.slopes(problem, start.contacts, torques, speed)
+            gap = objective.gap(problem, start.contacts, np.zeros(0), np.zeros(3), speed)
+            rows = np.zeros((len(gap), len(self._form)))
+            rows[:, : slopes.shape[1]], rows[:, -1] = slopes, gap
+            told.append(np.sqrt(2.0 * objective.weight) * rows)
+        if sum(map(len, told)) > 0:
+            rows = self.owner.others.there(*told).view(-1, len(self._form))
+            self._form.addmm_(rows.T, rows)
+
+    def _enqueue_search(self, dt: float, ratio: float, time: float) -> None:
+        """The program, its search, and the step's equation at the end that it expects."""
+        body, room, owner, planner = self.body, self.room, self.owner, self.owner.planner
+        width = 3 * room.places
+        self._enqueue_cost(dt, time)
+        target = body.body.assembly.device
+        wp.launch(
+            kernels.tell_kernel,
+            (len(self._form) + width, len(self._form)),
+            inputs=[
+                *(planner.settings.qp_limit, body.body.speed_unit, body.body.weight),
+                *(shared(self._counts, wp.int32), shared(self._friction, real), shared(self._form, real)),
+                *(shared(self._speeds, real), shared(self._shifts, real), shared(self._bounds, real)),
+                vectors(room.wanted),
+            ],
+            outputs=[self._search.told],
+            device=target,
+        )
+        self._search.enqueue()
+        wp.launch(
+            kernels.take_kernel,
+            len(self._x),
+            inputs=[shared(self._counts, wp.int32), self._search.answer, self.m],
+            outputs=[shared(self._x, real)],
+            device=target,
+        )
+        self._answer.copy_(wp.to_torch(self._search.answer))
+        activations = self._x[: self.m]
+        moved = torch.addmv(self._speeds[:, -1], self._speeds[:, : self.m], activations)
+        torch.mul(self._x[self.m : -1], body.body.weight, out=room.wanted)
+        self._enqueue_forces(moved, LOOKS)
+        torch.mul(room.wanted, 1.0 / body.body.weight, out=self._x[self.m : -1])
+        velocities, _, _, forces = room.parts(room.begun)
+        torch.mv(self._velocities, self._x, out=velocities)
+        forces.copy_(room.wanted)
+        self._forces.copy_(room.wanted)
+        bounds, stiffness = owner.tensions
+        torch.mul(activations[owner.group_from_muscle] * bounds, stiffness, out=room.tensions)
+        room.told.copy_(self._begin)
+        room.enqueue_trial(dt, ratio)
+        self._sizes[-1].copy_(room.size[0])
+        room.give()
+        self._found_here.copy_(self._found, non_blocking=True)
+
+    def _enqueue_cost(self, dt: float, time: float) -> None:
+        """Added to the form: effort and activations, see ``effort_cost`` and ``StepPlanner``."""
+        body, room, owner, form = self.body, self.room, self.owner, self._form
+        unit = EFFORT / (body.body.weight * body.body.height)
+        away = dt * room.tried()[0]
+        masses = body.masses.repeat_interleave(3)
+        strain, along = owner.factors.strain(self._entries, self._slope, masses, self._velocities, dt, time - dt, away)
+        form.add_(strain, alpha=unit)
+        form[:, -1].add_(along, alpha=unit)
+        form[-1, -1].add_(unit * (along[-1] + 2.0 * self._energy[0]) + self._constant[0])
+        shorter = owner.linear.lengths(body.positions) - owner.linear.lengths(room.ends)
+        works = owner.members.T @ (owner.works * shorter).square()
+        form.diagonal()[: self.m].add_(self._diagonal + (2.0 * WORK) * works)
+        form[: self.m, -1].add_(self._slopes)
