@@ -9,7 +9,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from egs_warp.contact.coulomb import ASTRAY, SOFT
+from egs_warp.contact.coulomb import ASTRAY, ITERATIONS, SOFT, TOLERANCE
 from egs_warp.contact.detection import ContactGeometry
 from egs_warp.contact.points import ContactPoints
 from egs_warp.errors import ArgumentError
@@ -18,9 +18,6 @@ from egs_warp.kernels.contact import batch_contacts as kernels
 from egs_warp.kernels.contact import coulomb
 from egs_warp.kernels.contact.gaps import point_gaps_kernel
 from egs_warp.precision import Mat33, Vec3, Vec4, real
-
-_TOLERANCE, _ITERATIONS = 1e-12, 16
-"""As in ``coulomb_forces``."""
 
 
 @dataclass(frozen=True)
@@ -279,7 +276,7 @@ def _found(
         inputs=[
             (counts, wp.int32),
             *((each.contiguous(), real) for each in given),
-            *(_TOLERANCE, _ITERATIONS),
+            *(TOLERANCE, ITERATIONS),
             *((forces.view(worlds, size), real), (vectors, real), (numbers, wp.int32), (matrices, Vec4)),
         ],
         outputs=[(missed, real)],

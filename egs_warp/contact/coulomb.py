@@ -12,6 +12,8 @@ from egs_warp.kernels.contact.coulomb_equations import Contacts
 from egs_warp.launching import kept_by_thread
 from egs_warp.precision import Vec4, real
 
+TOLERANCE, ITERATIONS = 1e-12, 16
+"""m/s by which forces may miss the laws, and steps of Newton's method until they do."""
 ASTRAY = 1e-8
 """m/s: forces that miss the laws by more are sought by another way."""
 SOFT = (1e-4, 1e-5, 1e-6, 1e-7)
@@ -27,8 +29,8 @@ def coulomb_forces(
     friction: float,
     start: np.ndarray,
     *,
-    tolerance: float = 1e-12,
-    iteration_limit: int = 16,
+    tolerance: float = TOLERANCE,
+    iteration_limit: int = ITERATIONS,
 ) -> tuple[np.ndarray, float]:
     """Forces f (n, 3) with 0 <= f_n, 0 <= u_n + shift, complementary, and exact Coulomb friction; u = free + G f
     (Eq. 8, 9).

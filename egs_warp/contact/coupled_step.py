@@ -134,11 +134,12 @@ class CoupledSolver:
         now = trial = response.at(tension, velocities, forces)
         recent: list[float] = []
         for iteration in range(1, ITERATIONS + 1):
-            wanted, missed = response.forces(now.speeds, shift, friction, now.forces)
+            wanted, missed, trial = now.onward(shift, friction)
             unanswered += missed > answered
             length, better = 1.0, False
             while length > SHORTEST:
-                trial = now.toward(wanted, length)
+                if length < 1.0:
+                    trial = now.toward(wanted, length)
                 # Contacts that open, close or begin to slide change the forces at once: the residual need not fall in
                 # every step. It is no number where an element is inverted.
                 least = max((1.0 - 1e-4 * length) * max(recent, default=np.inf), self.tolerance)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from egs_warp.contact.coulomb import ASTRAY
 from egs_warp.contact.detection import ContactSet
 from egs_warp.contact.device_room import KEPT, TRIED, BodyRoom, ContactRoom
 from egs_warp.contact.response import ContactResponse, Iterate
@@ -98,10 +99,10 @@ class DeviceResponse(ContactResponse):
 
     def made(self, tension: MuscleTension | None, forces: np.ndarray, found: tuple[np.ndarray, ...]) -> DeviceIterate:
         """Of what the room has ``found``."""
-        size, speeds, velocities = found
+        size, speeds, velocities, *_ = found
         return DeviceIterate(
             *(self, tension, velocities.reshape(-1, 3).copy(), forces),
-            *(float(size) / self.tangent.problem.unit, speeds[: 3 * self.contacts.count].copy()),
+            *(float(size[0]) / self.tangent.problem.unit, speeds[: 3 * self.contacts.count].copy()),
         )
 
 
@@ -139,11 +140,22 @@ class DeviceIterate:
         room.at_base, room.at_trial = self, self.response.made(self.tension, told, found)
         return room.at_trial
 
+    def onward(self, shift: np.ndarray, friction: float) -> tuple[np.ndarray, float, Iterate]:
+        """See ``Iterate``."""
+        room, count = self.response.room, self.response.contacts.count
+        found = room.onward(self.response.tangent.problem, shift, friction, base=self._base())
+        missed, forces = float(found[3][0]), found[4][: 3 * count].reshape(-1, 3).copy()
+        room.at_base, room.at_trial = self, self.response.made(self.tension, forces, found)
+        if missed <= ASTRAY:
+            return forces, missed, room.at_trial
+        forces, missed = self.response.forces(self.speeds, shift, friction, self.forces)
+        return forces, missed, self.toward(forces)
+
     def by(self, response: ContactResponse) -> Iterate:
         """See ``Iterate``."""
         assert isinstance(response, DeviceResponse) and response.room is self.response.room
         room = response.room
-        _, speeds, _ = room.again(base=self._base())
+        _, speeds, *_ = room.again(base=self._base())
         room.at_base = replace(self, response=response, speeds=speeds[: len(self.speeds)].copy())
         return room.at_base
 

@@ -10,6 +10,7 @@ import torch
 import warp as wp
 
 from egs_warp.contact.detection import ContactSet
+from egs_warp.contact.device_coulomb import CoulombRoom
 from egs_warp.fem.body import SoftBody
 from egs_warp.fem.dense_factors import DenseFactors
 from egs_warp.fem.element_kernels import ElementKernels
@@ -80,8 +81,8 @@ class ContactRoom:
         size, width = 3 * self._node_count, 3 * places
         self._contact_nodes = wp.zeros(places, dtype=wp.vec4i, device=self._device)
         self._contact_nodes_here = Mirror(self._contact_nodes)
-        self._contact_frames = Upload(owner.stream, 13 * places)
-        weights, axes = self._contact_frames.there.split([4 * places, 9 * places])
+        self._contact_frames = Upload(owner.stream, 1 + 13 * places)
+        count, weights, axes = self._contact_frames.there.split([1, 4 * places, 9 * places])
         self._contacts = [
             self._contact_nodes,
             *(shared(weights.view(-1, 4), Vec4), shared(axes.view(-1, 3, 3), Mat33)),
@@ -97,9 +98,13 @@ class ContactRoom:
         self._told = Upload(owner.stream, 3 + width)
         self.told, self.wanted = self._told.there.split([3, width])
         """Of a trial its length, whether forces push, where it begins; and the forces (3K,) newtons."""
-        self._asked, self._asked_here = owner.zeros(1 + width + size), owner.stream.pinned(1 + width + size)
-        self.size, self.speeds_after, self.velocities = self._asked.split([1, width, size])
-        """Of a trial, N s, m/s; the speeds are the contacts' after a Newton step without their forces."""
+        parts = [1, width, size, 1, width]
+        self._asked, self._asked_here = owner.zeros(sum(parts)), owner.stream.pinned(sum(parts))
+        self.size, self.speeds_after, self.velocities, self.missed, self._found = self._asked.split(parts)
+        """Of a trial, N s, m/s; the speeds are the contacts' after a Newton step without their forces. By how much the
+        forces that were found last miss their laws, m/s."""
+        self._answer_ends = np.cumsum(parts)[:-1]
+        self.coulomb = CoulombRoom(owner.stream, places, count)
         self._begun = Upload(owner.stream, 3 * size + width + owner.segment_count)
         self.begun, self.tensions = self._begun.there.split([3 * size + width, owner.segment_count])
         """As the base; newtons of the muscles."""
@@ -151,7 +156,7 @@ class ContactRoom:
         """Those of this room from now on."""
         more = self.places - contacts.count
         self._contact_nodes_here.put(np.vstack([contacts.nodes, np.zeros((more, 4), np.int32)]))
-        self._contact_frames.take(contacts.weights, np.zeros(4 * more), contacts.axes)
+        self._contact_frames.take(np.array([contacts.count]), contacts.weights, np.zeros(4 * more), contacts.axes)
 
     def ahead(
         self,
@@ -167,8 +172,8 @@ class ContactRoom:
             self.take(contacts)
             self.begin_at(tension, velocities, forces)
         self.tell(0.0, False, forces, BEGUN)
-        size, _, ahead = self._ask(self._enqueue_ahead, problem.dt, 1.0 + problem.dt * problem.drag)
-        return float(size), ahead
+        size, _, ahead, *_ = self._ask(self._enqueue_ahead, problem.dt, 1.0 + problem.dt * problem.drag)
+        return float(size[0]), ahead
 
     def _do(self, work: Callable[..., None], *given: Any) -> None:
         self._works.run((work.__name__, *given), lambda: work(*given))
@@ -185,6 +190,7 @@ class ContactRoom:
         self._enqueue_keeping(momenta, solved[:, :3], ratio)
         torch.addmm(solved[:, 3:], owner.turned, owner.keeping @ impulses, out=self.columns)
         self._enqueue_speeds(self.columns, self.delassus)
+        self.coulomb.enqueue_operator(self.delassus)
         self._delassus_here.copy_(self.delassus.view(-1), non_blocking=True)
 
     def _enqueue_keeping(self, momenta: torch.Tensor, turned: torch.Tensor, ratio: float) -> None:
@@ -225,6 +231,30 @@ class ContactRoom:
         self.tell(length, push, wanted, base)
         return self._ask(self._enqueue_trial, problem.dt, 1.0 + problem.dt * problem.drag)
 
+    def onward(
+        self, problem: StepProblem, shifts: np.ndarray, friction: float, *, base: float
+    ) -> tuple[np.ndarray, ...]:
+        """A trial at the end of a Newton step from the ``base`` under the forces that obey contact and friction there:
+        as ``go``, by how much these miss their laws, and these (3K,)."""
+        with self.owner.stream:
+            self.coulomb.tell(shifts, friction)
+        self.tell(1.0, True, shifts[:0], base)
+        return self._ask(self._enqueue_onward, problem.dt, 1.0 + problem.dt * problem.drag)
+
+    def _enqueue_onward(self, dt: float, ratio: float) -> None:
+        self.send()
+        self._enqueue_base()
+        self.wanted.copy_(self.parts(self._base)[3])
+        self.told[2] = KEPT
+        self.enqueue_onward(dt, ratio)
+        self.give()
+
+    def enqueue_onward(self, dt: float, ratio: float) -> None:
+        """``onward`` as is told, from the forces that are wanted, with nothing that waits."""
+        self.coulomb.enqueue_forces(self.speeds_after, self.wanted, self.missed)
+        self._found.copy_(self.wanted)
+        self.enqueue_trial(dt, ratio)
+
     def tell(self, length: float, push: bool, wanted: np.ndarray, base: float) -> None:
         """What ``send`` sends: see ``go``."""
         told = self._told.here.numpy()
@@ -244,8 +274,7 @@ class ContactRoom:
 
     def answer(self) -> tuple[np.ndarray, ...]:
         """What has come of what was asked of a trial: see ``go``."""
-        asked = self._asked_here.numpy()
-        return asked[0], asked[1 : 1 + 3 * self.places], asked[1 + 3 * self.places :]
+        return tuple(np.split(self._asked_here.numpy(), self._answer_ends))
 
     def send(self) -> None:
         """What is told of a trial."""

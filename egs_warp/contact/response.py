@@ -156,9 +156,20 @@ class Iterate(Protocol):
         """``length`` of the way to the end of a Newton step with contact ``forces`` (n, 3)."""
         ...
 
+    def onward(self, shift: np.ndarray, friction: float) -> tuple[np.ndarray, float, Iterate]:
+        """Forces (n, 3) that obey contact and friction if the contacts move at these ``speeds`` without them, the m/s
+        by which they miss that, and the end of a Newton step with them."""
+        ...
+
     def by(self, response: ContactResponse) -> Iterate:
         """The same place, of which the Newton step is by another ``response`` of the same contacts."""
         ...
+
+
+def _onward(now: VectorIterate | HostIterate, shift: np.ndarray, friction: float) -> tuple[np.ndarray, float, Iterate]:
+    """``Iterate.onward``, one after the other."""
+    forces, missed = now.response.forces(now.speeds, shift, friction, now.forces)
+    return forces, missed, now.toward(forces)
 
 
 def _elements_are_here(tangent: Tangent) -> bool:
@@ -215,6 +226,10 @@ class VectorIterate:
         step = response.columns_at, forces, length
         found = _room_of(response).trial(response.tangent.problem, self.tension, self._after, step)
         return type(self)(response, self.tension, *found)
+
+    def onward(self, shift: np.ndarray, friction: float) -> tuple[np.ndarray, float, Iterate]:
+        """See ``Iterate``."""
+        return _onward(self, shift, friction)
 
     def by(self, response: ContactResponse) -> Self:
         """See ``Iterate``."""
@@ -277,6 +292,10 @@ class HostIterate:
             velocities=self.velocities + length * (end - self.velocities),
             forces=self.forces + length * (forces - self.forces),
         )
+
+    def onward(self, shift: np.ndarray, friction: float) -> tuple[np.ndarray, float, Iterate]:
+        """See ``Iterate``."""
+        return _onward(self, shift, friction)
 
     def by(self, response: ContactResponse) -> Self:
         """See ``Iterate``."""

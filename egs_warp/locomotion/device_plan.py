@@ -15,12 +15,10 @@ import warp as wp
 from egs_warp.contact.coulomb import ASTRAY
 from egs_warp.contact.device_response import DeviceResponder, DeviceResponse
 from egs_warp.contact.device_room import BEGUN, TRIED, ContactRoom, vectors
-from egs_warp.contact.response import SINGULAR
 from egs_warp.fem.dense_factors import DenseFactors
 from egs_warp.fem.graphs import Recordings, Upload
 from egs_warp.fem.step_problem import Tangent
-from egs_warp.fem.worlds import launch_on, shared
-from egs_warp.kernels.contact import coulomb
+from egs_warp.fem.worlds import shared
 from egs_warp.kernels.locomotion import step_program as kernels
 from egs_warp.kernels.locomotion.active_set import FOUND
 from egs_warp.kernels.locomotion.piece_search import HEADER
@@ -32,10 +30,7 @@ from egs_warp.locomotion.planner import REGULAR, WORK, Plan, StepPlanner
 from egs_warp.locomotion.step_cost import EFFORT, HORIZON
 from egs_warp.locomotion.strategies import COSTLY
 from egs_warp.muscles.tension import MuscleTension
-from egs_warp.precision import Vec4, real
-
-_TOLERANCE, _ITERATIONS = 1e-12, 16
-"""As in ``coulomb_forces``."""
+from egs_warp.precision import real
 
 
 class DevicePlanner:
@@ -73,15 +68,12 @@ class PlanRoom:
         self.owner, self.body, self.room = owner, body, room
         self.m, size, places = owner.planner.synergies.count, len(room.ends), room.places
         m, width = self.m, 3 * places
-        self._told = Upload(body.stream, 2 + places + 5 * m + 1)
-        parts = self._told.there.split([1, 1, places, 3 * m, 2 * m, 1])
-        self._count, self._friction, self._shifts, bounds, activation, self._constant = parts
-        self._bounds, (self._diagonal, self._slopes) = bounds.view(3, m), activation.view(2, m)
-        self._counts = torch.zeros(1, dtype=torch.int32, device=body.factors.device)
+        self._told = Upload(body.stream, 5 * m + 1)
+        bounds, self._diagonal, self._slopes, self._constant = self._told.there.split([3 * m, m, m, 1])
+        self._bounds = bounds.view(3, m)
         # To stay where the last trial is, and to go from there to the end of a Newton step.
         self._stay, self._forward = body.tensor(np.array([0.0, 0.0, TRIED])), body.tensor(np.array([1.0, 1.0, TRIED]))
         self._begin = body.tensor(np.array([0.0, 0.0, BEGUN]))
-        self._regular = zeros(width, width)
         self._velocities, self._speeds = zeros(size, m + width + 1), zeros(width, m + width + 1)
         self._form = zeros(m + width + 1, m + width + 1)
         self._entries, self._slope, self._energy = zeros(len(owner.factors.places)), zeros(size), zeros(1)
@@ -93,8 +85,6 @@ class PlanRoom:
         self._verdicts = verdicts.view(3, 2)
         self._x = zeros(m + width + 1)
         self._search = SearchRoom(m, places, str(body.factors.device))
-        self._vectors, self._indices = zeros(1, 5, width), self._counts.new_zeros((1, 2, width))
-        self._matrices = zeros(1, width, (width + 4) // 4, 4)
         self._works = Recordings(body.stream)
 
     def plan(self, start: StepStart, objectives: Sequence[AnyObjective]) -> tuple[DeviceResponse, Plan] | None:
@@ -124,7 +114,7 @@ class PlanRoom:
         )
         if not usual or (start.contacts.count > 0 and objective >= COSTLY):
             return None
-        width, (size, speeds, velocities) = 3 * start.contacts.count, room.answer()
+        width, (size, speeds, velocities, *_) = 3 * start.contacts.count, room.answer()
         response = DeviceResponse.there(
             Tangent(problem, body.factors), start.contacts, body, room, room.delassus_here()
         )
@@ -145,13 +135,12 @@ class PlanRoom:
         room.take(start.contacts)
         room.begin_at(MuscleTension.of(planner.muscles, start.activations), problem.start, start.forces)
         room.tell(0.0, False, start.forces, BEGUN)
+        room.coulomb.tell(start.shift, start.friction)
         self.body.factors.tell((1.0 + problem.dt * problem.drag) * self.owner.masses)
         self.owner.factors.tell(self.owner.masses)
         previous = planner.synergies.mean(start.activations / planner.muscles.bounds)
         size, change = planner.activation_weights(problem.dt)
         self._told.take(
-            np.array([start.contacts.count, start.friction]),
-            *(start.shift, np.zeros(room.places - start.contacts.count)),
             *(*planner.activation_bounds(previous, problem.dt), previous),
             *(2.0 * (size + change) + REGULAR, -2.0 * change * previous, np.array([2.0 * (change @ previous**2)])),
         )
@@ -160,24 +149,20 @@ class PlanRoom:
         """A Newton step ahead under the forces that are known, and from there ``LOOKS`` with contact."""
         body, room = self.body, self.room
         room.send()
-        self._counts.copy_(self._count)
         torch.add(body.positions, room.parts(room.begun)[0], alpha=dt, out=room.ends)
         self._enqueue_factors(dt, 0)
         room.enqueue_ahead(dt, ratio)
         self._sizes[0].copy_(room.size[0])
         self._enqueue_factors(dt, 1)
         room.enqueue_response(dt, ratio)
-        self._regular.copy_(room.delassus)
-        diagonal = room.delassus.diagonal()
-        self._regular.diagonal().add_(SINGULAR * diagonal.sum() / (3.0 * self._count).clamp(min=1.0))
         room.parts(room.begun)[0].copy_(room.velocities)
         room.enqueue_trial(dt, ratio)
         self._sizes[1].copy_(room.size[0])
         for look in range(LOOKS):
-            self._enqueue_forces(room.speeds_after, look)
             room.told.copy_(self._forward)
-            room.enqueue_trial(dt, ratio)
+            room.enqueue_onward(dt, ratio)
             self._sizes[2 + look].copy_(room.size[0])
+            self._missed[look].copy_(room.missed[0])
 
     def _enqueue_factors(self, dt: float, which: int) -> None:
         """Of the step's matrix where the last trial ends."""
@@ -185,23 +170,6 @@ class PlanRoom:
         made = body.elements.enqueue_entries(vectors(self.room.ends), body.gradients, dt, factor=dt**2, projected=False)
         body.factors.enqueue(wp.to_torch(made))
         self._verdicts[which].copy_(body.factors.verdict)
-
-    def _enqueue_forces(self, speeds: torch.Tensor, which: int) -> None:
-        """``ContactResponse.forces`` from those that are wanted on, which are these then."""
-        lanes = coulomb.BLOCK if speeds.is_cuda else 1
-        launch_on(
-            speeds.device,
-            coulomb.coulomb_kernel,
-            (1, lanes),
-            inputs=[
-                (self._counts, wp.int32),
-                *((each, real) for each in (self._regular[None], speeds[None], self._shifts[None], self._friction)),
-                *(_TOLERANCE, _ITERATIONS, (self.room.wanted[None], real), (self._vectors, real)),
-                *((self._indices, wp.int32), (self._matrices, Vec4)),
-            ],
-            outputs=[(self._missed[which : which + 1], real)],
-            block_dim=lanes,
-        )
 
     def _enqueue_linear(self, dt: float, ratio: float, time: float) -> None:
         """The linear step about what is foreseen, and factors of its horizon, see ``Horizon``."""
@@ -244,7 +212,7 @@ class PlanRoom:
     def _enqueue_search(self, dt: float, ratio: float, time: float) -> None:
         """The program, its search, and the step's equation at the end that it expects."""
         body, room, owner, planner = self.body, self.room, self.owner, self.owner.planner
-        width = 3 * room.places
+        width, laws = 3 * room.places, room.coulomb
         self._enqueue_cost(dt, time)
         target = body.body.assembly.device
         wp.launch(
@@ -252,8 +220,8 @@ class PlanRoom:
             (len(self._form) + width, len(self._form)),
             inputs=[
                 *(planner.settings.qp_limit, body.body.speed_unit, body.body.weight),
-                *(shared(self._counts, wp.int32), shared(self._friction, real), shared(self._form, real)),
-                *(shared(self._speeds, real), shared(self._shifts, real), shared(self._bounds, real)),
+                *(shared(laws.counts, wp.int32), shared(laws.friction, real), shared(self._form, real)),
+                *(shared(self._speeds, real), shared(laws.shifts, real), shared(self._bounds, real)),
                 vectors(room.wanted),
             ],
             outputs=[self._search.told],
@@ -263,7 +231,7 @@ class PlanRoom:
         wp.launch(
             kernels.take_kernel,
             len(self._x),
-            inputs=[shared(self._counts, wp.int32), self._search.answer, self.m],
+            inputs=[shared(laws.counts, wp.int32), self._search.answer, self.m],
             outputs=[shared(self._x, real)],
             device=target,
         )
@@ -271,7 +239,7 @@ class PlanRoom:
         activations = self._x[: self.m]
         moved = torch.addmv(self._speeds[:, -1], self._speeds[:, : self.m], activations)
         torch.mul(self._x[self.m : -1], body.body.weight, out=room.wanted)
-        self._enqueue_forces(moved, LOOKS)
+        laws.enqueue_forces(moved, room.wanted, self._missed[LOOKS:])
         torch.mul(room.wanted, 1.0 / body.body.weight, out=self._x[self.m : -1])
         velocities, _, _, forces = room.parts(room.begun)
         torch.mv(self._velocities, self._x, out=velocities)

@@ -317,8 +317,7 @@ class LocomotionStepper:
         now = response.at(tension, velocities, known)
         forces = known
         for _ in range(LOOKS):
-            forces, _ = response.forces(now.speeds, shift, self.geometry.friction, now.forces)
-            ahead = now.toward(forces)
+            forces, _, ahead = now.onward(shift, self.geometry.friction)
             if not ahead.feasible:
                 break
             now = ahead
