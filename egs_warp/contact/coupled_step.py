@@ -8,7 +8,7 @@ import numpy as np
 
 from egs_warp.contact.detection import ContactDetector, ContactSet, push_out_speeds
 from egs_warp.contact.points import ContactPoints
-from egs_warp.contact.response import ContactResponse, HostResponder, Iterate, Responder
+from egs_warp.contact.response import ContactResponse, HostResponder, Iterate, Responder, Seen
 from egs_warp.fem.factors import Factors
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.muscles.tension import MuscleTension
@@ -55,6 +55,8 @@ class CoupledResult:
     """Factorisations made on the way."""
     response: ContactResponse
     """By the last of them: of the contacts of the end."""
+    seen: Seen | None
+    """At the end; None if nobody looked."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +105,11 @@ class CoupledSolver:
             forces = np.vstack([forces, np.zeros((len(added), 3))])
         return replace(result, iterations=iterations, tangents=tangents)
 
-    def _sinking(self, problem: StepProblem, contacts: ContactSet, velocities: np.ndarray) -> np.ndarray:
-        """(k,) points not among ``contacts`` that would end too deep."""
-        gaps, _ = self.detector.gaps(problem.end_positions(velocities))
+    def _sinking(self, problem: StepProblem, contacts: ContactSet, end: Iterate) -> np.ndarray:
+        """(k,) points not among ``contacts`` that would ``end`` too deep."""
+        if end.seen is not None and not end.seen.sinking:
+            return contacts.points[:0]
+        gaps, _ = self.detector.gaps(problem.end_positions(end.velocities))
         depth = ADDED * self.penetration_tolerance
         if gaps.min() >= -depth:
             return contacts.points[:0]
@@ -154,7 +158,7 @@ class CoupledSolver:
                 obeys = length == 1.0 and missed <= answered
                 ended = obeys and now.size <= self.tolerance
                 if obeys and not last and (ended or before.size > JOINING >= now.size):
-                    added = self._sinking(problem, contacts, now.velocities)
+                    added = self._sinking(problem, contacts, now)
                     if len(added) > 0:
                         return _result(now, ended, iteration, tangents), added
                 if ended:
@@ -177,5 +181,6 @@ class CoupledSolver:
 def _result(end: Iterate, converged: bool, iterations: int, tangents: int) -> CoupledResult:
     response = end.response
     return CoupledResult(
-        end.velocities, response.contacts, end.forces, converged, end.size, iterations, tangents, response
+        *(end.velocities, response.contacts, end.forces, converged, end.size, iterations, tangents),
+        *(response, end.seen),
     )

@@ -265,7 +265,7 @@ class ContactDetector:
 
     def __init__(self, geometry: ContactGeometry, *, device: str | None = None) -> None:
         self.geometry = geometry
-        self._device = wp.get_device(device)
+        self.device = wp.get_device(device)
         self._tet_from_point = wp.array(geometry.tet_from_point, dtype=int, device=device)
         self._weights = wp.array(geometry.weights, dtype=Vec4, device=device)
         self._tets = wp.array(geometry.mesh.tets, dtype=wp.vec4i, device=device)
@@ -310,25 +310,7 @@ class ContactDetector:
 
     def _find(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         self._positions_here.put(positions)
-        solids, outputs = [self._planes, self._solids, self._positions], [self._gaps, self._nearest]
-        if self._device.is_cpu:
-            inputs = [self._corners, self._weights, *solids]
-            launch_again(
-                kernels.all_gaps_kernel, 1, inputs=inputs, outputs=[self._heights, *outputs], device=self._device
-            )
-        else:
-            inputs = [self._tets, self._tet_from_point, self._weights, *solids]
-            launch_again(
-                kernels.point_gaps_kernel, len(self._gaps), inputs=inputs, outputs=outputs, device=self._device
-            )
-        if self._field:
-            wp.launch(
-                ground_gaps_kernel,
-                dim=len(self.geometry.tet_from_point),
-                inputs=[self._tets, self._tet_from_point, self._weights, *self._field, self._positions],
-                outputs=[self._gaps, self._nearest],
-                device=self._device,
-            )
+        self.enqueue_gaps(self._positions, self._gaps, self._nearest)
         nearest = self._only_face
         if nearest is None:
             gaps, nearest = Mirror.get_all(self._gaps_here, self._nearest_here)
@@ -337,6 +319,26 @@ class ContactDetector:
             gaps = self._gaps_here.get()
         gaps.flags.writeable = False
         return gaps, nearest
+
+    def enqueue_gaps(self, positions: wp.array, gaps: wp.array, nearest: wp.array) -> None:
+        """The same of what lies on the device, into ``gaps`` (P,) and ``nearest`` (P,), with nothing that waits."""
+        solids, outputs = [self._planes, self._solids, positions], [gaps, nearest]
+        if self.device.is_cpu:
+            inputs = [self._corners, self._weights, *solids]
+            launch_again(
+                kernels.all_gaps_kernel, 1, inputs=inputs, outputs=[self._heights, *outputs], device=self.device
+            )
+        else:
+            inputs = [self._tets, self._tet_from_point, self._weights, *solids]
+            launch_again(kernels.point_gaps_kernel, len(self._gaps), inputs=inputs, outputs=outputs, device=self.device)
+        if self._field:
+            wp.launch(
+                ground_gaps_kernel,
+                dim=len(self.geometry.tet_from_point),
+                inputs=[self._tets, self._tet_from_point, self._weights, *self._field, positions],
+                outputs=outputs,
+                device=self.device,
+            )
 
     def points_within(self, positions: np.ndarray, distance: float) -> np.ndarray:
         """(k, 3) contact points that are nearer than ``distance`` metres to a plane at ``positions`` (N, 3)."""
@@ -347,15 +349,20 @@ class ContactDetector:
     def contact_set(self, points: np.ndarray, positions: np.ndarray) -> ContactSet:
         """The given points with their frames; ``positions`` (N, 3) at the start of the step."""
         gaps, nearest = self.gaps(positions)
+        return self.contact_set_at(points, positions, gaps[points], nearest[points])
+
+    def contact_set_at(
+        self, points: np.ndarray, positions: np.ndarray, gaps: np.ndarray, faces: np.ndarray
+    ) -> ContactSet:
+        """The same with ``gaps`` (n,) metres and ``faces`` (n,) of the ``points`` (n,) that are known."""
         nodes = self.geometry.mesh.tets[self.geometry.tet_from_point[points]]
         weights = self.geometry.weights[points]
-        faces = nearest[points]
         axes = self._frames[faces]
         if self.geometry.field is not None:
             uneven = faces == 0
             places = np.einsum("nw,nwi->ni", weights[uneven], positions[nodes[uneven]])
             axes[uneven] = self.geometry.field.frames(places)
-        return ContactSet(points, nodes, weights, axes, gaps[points], faces, len(positions))
+        return ContactSet(points, nodes, weights, axes, gaps, faces, len(positions))
 
 
 def push_out_speeds(gaps: np.ndarray, dt: float, cap: float, factor: float, slop: float) -> np.ndarray:

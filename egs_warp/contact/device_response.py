@@ -9,7 +9,8 @@ import numpy as np
 from egs_warp.contact.coulomb import ASTRAY
 from egs_warp.contact.detection import ContactSet
 from egs_warp.contact.device_room import KEPT, TRIED, BodyRoom, ContactRoom
-from egs_warp.contact.response import ContactResponse, Iterate
+from egs_warp.contact.device_sight import DeviceSight
+from egs_warp.contact.response import ContactResponse, Iterate, Seen
 from egs_warp.fem.body import SoftBody
 from egs_warp.fem.dense_factors import DenseFactors
 from egs_warp.fem.step_problem import Tangent
@@ -24,8 +25,8 @@ class DeviceResponder(BodyRoom):
     """Responses by dense factors of one body, where its elements are. The last one is at hand, others are not; of what
     was tried the last two."""
 
-    def __init__(self, factors: DenseFactors, body: SoftBody, muscles: MuscleSet) -> None:
-        super().__init__(factors, body, muscles)
+    def __init__(self, factors: DenseFactors, body: SoftBody, muscles: MuscleSet, sight: DeviceSight) -> None:
+        super().__init__(factors, body, muscles, sight)
         self._rooms: dict[int, ContactRoom] = {}
         self.at_hand: DeviceResponse | None = None
 
@@ -99,10 +100,10 @@ class DeviceResponse(ContactResponse):
 
     def made(self, tension: MuscleTension | None, forces: np.ndarray, found: tuple[np.ndarray, ...]) -> DeviceIterate:
         """Of what the room has ``found``."""
-        size, speeds, velocities, *_ = found
+        size, speeds, velocities, _, _, seen = found
         return DeviceIterate(
             *(self, tension, velocities.reshape(-1, 3).copy(), forces),
-            *(float(size[0]) / self.tangent.problem.unit, speeds[: 3 * self.contacts.count].copy()),
+            *(float(size[0]) / self.tangent.problem.unit, speeds[: 3 * self.contacts.count].copy(), Seen.of(seen)),
         )
 
 
@@ -116,6 +117,7 @@ class DeviceIterate:
     forces: np.ndarray
     size: float
     speeds: np.ndarray
+    seen: Seen
 
     def is_at(
         self, response: DeviceResponse, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray

@@ -11,6 +11,7 @@ import warp as wp
 
 from egs_warp.contact.detection import ContactSet
 from egs_warp.contact.device_coulomb import CoulombRoom
+from egs_warp.contact.device_sight import DeviceSight
 from egs_warp.fem.body import SoftBody
 from egs_warp.fem.dense_factors import DenseFactors
 from egs_warp.fem.element_kernels import ElementKernels
@@ -19,7 +20,7 @@ from egs_warp.fem.step_problem import StepProblem
 from egs_warp.fem.worlds import shared
 from egs_warp.kernels.contact import batch_contacts as of_worlds
 from egs_warp.kernels.contact import iterate as kernels
-from egs_warp.launching import Mirror
+from egs_warp.kernels.contact import step_start as of_start
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleTension
 from egs_warp.precision import Mat33, Vec3, Vec4, real
@@ -31,8 +32,8 @@ KEPT, TRIED, BEGUN = 0.0, 1.0, 2.0
 class BodyRoom:
     """Of one body with dense ``factors``, where its elements are: a step's start, and what keeps its momentum."""
 
-    def __init__(self, factors: DenseFactors, body: SoftBody, muscles: MuscleSet) -> None:
-        self.factors, self.body, self.stream = factors, body, factors.stream
+    def __init__(self, factors: DenseFactors, body: SoftBody, muscles: MuscleSet, sight: DeviceSight) -> None:
+        self.factors, self.body, self.stream, self.sight = factors, body, factors.stream, sight
         elements = body.assembly.elements
         assert isinstance(elements, ElementKernels)
         self.elements = elements
@@ -40,10 +41,13 @@ class BodyRoom:
         self.turned, self.keeping = self.zeros(size, 3), self.zeros(3, size)
         """What a solution lacks of a turn is ``turned`` times ``keeping`` times what it is the solution of."""
         self.masses = self.tensor(body.node_mass)
-        self._start = Upload(self.stream, 6 * size + 9)
-        parts = self._start.there.split([size, size, size, 3 * size, 9])
-        self.positions, self.velocities, self.arms, self.turns, self.rates = parts
-        self.turns = self.turns.view(size, 3)
+        self._start = Upload(self.stream, 2 * size)
+        self.positions, self.velocities = self._start.there.split(size)
+        self.arms, self.start, self.ballistic = self.zeros(3, size)
+        self.turns, self.rates = self.zeros(size, 3), self.zeros(1, 3, 3)
+        """See ``StepProblem``; ``ballistic`` is where the nodes would end without forces, metres."""
+        self._gravity = self.tensor(np.tile(body.gravity, len(body.mesh.nodes)))
+        self._works = Recordings(self.stream)
         self.no_tensions = wp.zeros(0, dtype=real, device=body.assembly.device)
         self.gradients = wp.zeros(len(body.mesh.tets), dtype=Mat33, device=body.assembly.device)
         self.lines = elements.muscle_lines(MuscleTension.of(muscles, np.zeros(muscles.segment_count)))
@@ -63,9 +67,31 @@ class BodyRoom:
         if self._problem is problem:
             return
         self._problem = problem
-        state = problem.state
-        self._start.take(state.positions, state.velocities, problem.arms, problem.turns, problem.turning_rates)
-        wp.copy(self.gradients, problem.damping.start)
+        self._start.write(problem.state.positions, problem.state.velocities)
+        self._works.run(problem.dt, lambda: self._enqueue_start(problem.dt))
+
+    def _enqueue_start(self, dt: float) -> None:
+        self._start.send()
+        device = self.body.assembly.device
+        lanes = 1 if device.is_cpu else of_start.BLOCK
+        wp.launch(
+            of_start.step_start_kernel,
+            lanes,
+            inputs=[dt, shared(self.masses, real), vectors(self.positions), vectors(self.velocities)],
+            outputs=[vectors(self.arms), shared(self.turns, real), shared(self.rates, Mat33), vectors(self.start)],
+            device=device,
+            block_dim=lanes,
+        )
+        self.elements.enqueue_start(vectors(self.positions), self.gradients)
+        torch.add(self.velocities, self._gravity, alpha=dt, out=self.ballistic)
+        self.ballistic.mul_(dt).add_(self.positions)
+
+    def choose(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet:
+        """Contacts of a step that begins there, see ``DeviceSight``."""
+        with self.stream:
+            self.take(problem)
+        ends = vectors(self.ballistic)
+        return self.sight.choose(vectors(self.positions), ends, before, loaded, problem.state.positions)
 
     def enqueue_gradient(self, ends: wp.array, dt: float, tensions: wp.array, gradient: wp.array) -> None:
         """Into ``gradient``, newtons, at the positions ``ends``, under ``tensions`` of the muscles."""
@@ -79,12 +105,12 @@ class ContactRoom:
         self.owner, self.places, self._device = owner, places, owner.body.assembly.device
         self._node_count = len(owner.body.mesh.nodes)
         size, width = 3 * self._node_count, 3 * places
-        self._contact_nodes = wp.zeros(places, dtype=wp.vec4i, device=self._device)
-        self._contact_nodes_here = Mirror(self._contact_nodes)
-        self._contact_frames = Upload(owner.stream, 1 + 13 * places)
-        count, weights, axes = self._contact_frames.there.split([1, 4 * places, 9 * places])
+        self._taken = Upload(owner.stream, 1 + 18 * places)
+        count, self._numbers_told, weights, axes = self._taken.there.split([1, 5 * places, 4 * places, 9 * places])
+        self._numbers = torch.zeros(5 * places, dtype=torch.int32, device=count.device)
+        self._points, nodes = self._numbers.split([places, 4 * places])
         self._contacts = [
-            self._contact_nodes,
+            shared(nodes.view(-1, 4), wp.vec4i),
             *(shared(weights.view(-1, 4), Vec4), shared(axes.view(-1, 3, 3), Mat33)),
         ]
         # As one of many worlds.
@@ -98,9 +124,10 @@ class ContactRoom:
         self._told = Upload(owner.stream, 3 + width)
         self.told, self.wanted = self._told.there.split([3, width])
         """Of a trial its length, whether forces push, where it begins; and the forces (3K,) newtons."""
-        parts = [1, width, size, 1, width]
+        parts = [1, width, size, 1, width, 5]
         self._asked, self._asked_here = owner.zeros(sum(parts)), owner.stream.pinned(sum(parts))
-        self.size, self.speeds_after, self.velocities, self.missed, self._found = self._asked.split(parts)
+        self.size, self.speeds_after, self.velocities, self.missed, self._found, seen = self._asked.split(parts)
+        self._seen, self._torque_seen = seen.split([2, 3])
         """Of a trial, N s, m/s; the speeds are the contacts' after a Newton step without their forces. By how much the
         forces that were found last miss their laws, m/s."""
         self._answer_ends = np.cumsum(parts)[:-1]
@@ -154,9 +181,12 @@ class ContactRoom:
 
     def take(self, contacts: ContactSet) -> None:
         """Those of this room from now on."""
-        more = self.places - contacts.count
-        self._contact_nodes_here.put(np.vstack([contacts.nodes, np.zeros((more, 4), np.int32)]))
-        self._contact_frames.take(np.array([contacts.count]), contacts.weights, np.zeros(4 * more), contacts.axes)
+        told = np.zeros((18, self.places))
+        places = np.split(told.ravel(), np.cumsum([1, 4, 4]) * self.places)
+        of_each = contacts.points, contacts.nodes, contacts.weights, contacts.axes
+        for place, values in zip(places, of_each, strict=True):
+            place[: values.size] = values.ravel()
+        self._taken.take(np.array([contacts.count]), told)
 
     def ahead(
         self,
@@ -181,6 +211,7 @@ class ContactRoom:
     def enqueue_response(self, dt: float, ratio: float) -> None:
         """``respond``, with nothing that waits."""
         owner, inverse = self.owner, self.owner.factors.inverse
+        self._numbers.copy_(self._numbers_told)
         momenta, impulses = self._right[:, :3], self._right[:, 3:]
         torch.mul(owner.turns, owner.masses.repeat_interleave(3)[:, None], out=momenta)
         impulses.zero_()
@@ -247,7 +278,14 @@ class ContactRoom:
         self.wanted.copy_(self.parts(self._base)[3])
         self.told[2] = KEPT
         self.enqueue_onward(dt, ratio)
+        self._look()
         self.give()
+
+    def _look(self) -> None:
+        """What is to be seen at the end of the last trial, see ``Seen``."""
+        owner = self.owner
+        owner.sight.enqueue_sinking(vectors(self.ends), self._points, self.coulomb.counts, self._seen)
+        self._torque_seen.copy_(self._torque)
 
     def enqueue_onward(self, dt: float, ratio: float) -> None:
         """``onward`` as is told, from the forces that are wanted, with nothing that waits."""
@@ -325,6 +363,7 @@ class ContactRoom:
     def enqueue_ahead(self, dt: float, ratio: float) -> None:
         """``ahead`` of what is told, with nothing that waits."""
         owner, inverse = self.owner, self.owner.factors.inverse
+        self._numbers.copy_(self._numbers_told)
         momenta = self._right[:, :3]
         torch.mul(owner.turns, owner.masses.repeat_interleave(3)[:, None], out=momenta)
         self._enqueue_keeping(momenta, inverse.T @ (inverse @ momenta), ratio)
@@ -339,6 +378,7 @@ class ContactRoom:
     def _enqueue_trial(self, dt: float, ratio: float) -> None:
         self.send()
         self.enqueue_trial(dt, ratio)
+        self._look()
         self.give()
 
     def enqueue_trial(self, dt: float, ratio: float) -> None:

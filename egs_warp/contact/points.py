@@ -45,18 +45,25 @@ class ContactPoints:
         self.cell_from_point, away = _few_cells(places, heights, sole, spacing, MOST_AT_REST)
         self.order = np.lexsort((np.rint(away / self.alike), self.cell_from_point))
         """(P,) points cell by cell, those next to its middle first."""
-        self._cells = int(self.cell_from_point.max()) + 1
+        self.cell_count = int(self.cell_from_point.max()) + 1
 
     def choose(self, previous: np.ndarray, loaded: np.ndarray, gaps: np.ndarray) -> np.ndarray:
         """(n,) points of the next step in ascending order; ``previous`` (m,) were the last's, ``loaded`` (m,) bool
         those that pressed; ``gaps`` (P,) metres as it may end.
         """
-        cells = self.cell_from_point
-        near = gaps[previous] < 2.0 * self.near
         lowest = self._lowest(gaps < self.near, gaps)
-        low = np.full(self._cells, np.inf)
-        low[cells[lowest]] = gaps[lowest]
-        kept = previous[near & (loaded | (gaps[previous] <= low[cells[previous]] + self.lower))]
+        return self.among(previous, loaded, gaps[previous], lowest, gaps[lowest])
+
+    def among(
+        self, previous: np.ndarray, loaded: np.ndarray, gaps: np.ndarray, lowest: np.ndarray, lowest_gaps: np.ndarray
+    ) -> np.ndarray:
+        """``choose``, of the ``previous`` (m,) points with ``gaps`` (m,), and of the ``lowest`` (k,) of each cell that
+        is near, with ``lowest_gaps`` (k,) metres."""
+        cells = self.cell_from_point
+        near = gaps < 2.0 * self.near
+        low = np.full(self.cell_count, np.inf)
+        low[cells[lowest]] = lowest_gaps
+        kept = previous[near & (loaded | (gaps <= low[cells[previous]] + self.lower))]
         fresh = lowest[~np.isin(cells[lowest], cells[kept])]
         return np.sort(np.concatenate([kept, fresh]))
 

@@ -12,7 +12,7 @@ from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.contact.detection import ContactSet
 from egs_warp.contact.newton_room import NewtonRoom, NewtonState, address_of, newton_room
 from egs_warp.fem.element_vectors import ElementVectors
-from egs_warp.fem.step_problem import Tangent
+from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.muscles.tension import MuscleTension
 
 SINGULAR = 1e-7
@@ -79,6 +79,11 @@ class Responder(Protocol):
         """Of ``contacts`` by ``tangent``."""
         ...
 
+    def choose(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet | None:
+        """The contacts of a step, after the points ``before`` (m,), of which those ``loaded`` (m,) bool pressed; None
+        if the gaps are on the host."""
+        ...
+
     def ahead(
         self,
         tangent: Tangent,
@@ -99,6 +104,10 @@ class HostResponder:
         """See ``Responder``."""
         return ContactResponse.of(tangent, contacts)
 
+    def choose(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet | None:
+        """See ``Responder``."""
+        return None
+
     def ahead(
         self,
         tangent: Tangent,
@@ -117,6 +126,23 @@ class HostResponder:
         missing = problem.residual(velocities, tension).ravel() - problem.dt * contacts.pushes(forces)
         ahead = velocities - tangent.solve(missing).reshape(velocities.shape)
         return ahead if problem.feasible(ahead) else None
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a trial on a GPU has seen on its way."""
+
+    sinking: bool
+    """Whether points sink that are in no contact, see ``CoupledSolver``."""
+    least_gap: float
+    """Metres, of all points."""
+    torque: np.ndarray
+    """(3,) N m of what is internal, minus that of its forces."""
+
+    @classmethod
+    def of(cls, found: np.ndarray) -> Seen:
+        """As it was ``found`` (5,), one behind the other."""
+        return cls(found[0] > 0.0, float(found[1]), np.array(found[2:]))
 
 
 class Iterate(Protocol):
@@ -152,6 +178,11 @@ class Iterate(Protocol):
         """(3n,) m/s of the contacts after a Newton step without contact forces."""
         ...
 
+    @property
+    def seen(self) -> Seen | None:
+        """What is seen on the way; None if nobody looked."""
+        ...
+
     def toward(self, forces: np.ndarray, length: float = 1.0) -> Iterate:
         """``length`` of the way to the end of a Newton step with contact ``forces`` (n, 3)."""
         ...
@@ -185,6 +216,7 @@ class VectorIterate:
     tension: MuscleTension | None
     state: NewtonState
     size: float
+    seen: None = None
 
     @classmethod
     def at(
@@ -248,6 +280,7 @@ class HostIterate:
     tension: MuscleTension | None
     velocities: np.ndarray
     forces: np.ndarray
+    seen: None = None
 
     @cached_property
     def _free(self) -> np.ndarray:

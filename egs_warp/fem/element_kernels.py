@@ -91,14 +91,18 @@ class ElementKernels:
         """What damping needs of a step's start at ``positions`` (N, 3)."""
         gradients = empty(len(self._tets), Mat33, self._device)
         self._positions_here.put(positions)
+        self.enqueue_start(self._positions, gradients)
+        return gradients
+
+    def enqueue_start(self, positions: wp.array, gradients: wp.array) -> None:
+        """The same into ``gradients`` (T,), of what lies on the device, with nothing that waits."""
         launch_again(
             kernels.deformation_gradients_kernel,
             len(self._tets),
-            inputs=[self._tets, self._rest_inverses, self._positions],
+            inputs=[self._tets, self._rest_inverses, positions],
             outputs=[gradients],
             device=self._device,
         )
-        return gradients
 
     def _start_of(self, damping: Damping | None) -> tuple[wp.array, float]:
         # A kernel that is told no step does not read the gradients.

@@ -131,6 +131,12 @@ class Upload:
 
     def take(self, *parts: np.ndarray) -> None:
         """``parts`` one behind the other, zeros behind the last."""
+        self.write(*parts)
+        self.send()
+        self._sent = self._stream.mark(self._sent)
+
+    def write(self, *parts: np.ndarray) -> None:
+        """The same, for a graph to ``send``; what it has sent before must have gone."""
         here, at = self.here.numpy(), 0
         if self._sent is not None:
             # What was told before may still be on its way.
@@ -139,8 +145,6 @@ class Upload:
             here[at : at + part.size] = part.ravel()
             at += part.size
         here[at:] = 0.0
-        self.send()
-        self._sent = self._stream.mark(self._sent)
 
     def send(self) -> None:
         """What lies ``here`` now."""

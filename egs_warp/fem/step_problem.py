@@ -108,7 +108,11 @@ class StepProblem:
 
     def spin(self, internal_gradient: np.ndarray) -> np.ndarray:
         """(3,) rad/s that the step gives back: the rigid turn whose momentum implicit Euler would have eaten."""
-        return self.dt * (self.turning_rates @ (self.turns.T @ internal_gradient.ravel()))
+        return self.spin_by(self.turns.T @ internal_gradient.ravel())
+
+    def spin_by(self, torque: np.ndarray) -> np.ndarray:
+        """``spin`` of an internal gradient with this ``torque`` (3,) N m about the centre of mass."""
+        return self.dt * (self.turning_rates @ torque)
 
     def residual(self, velocities: np.ndarray, tension: MuscleTension | None) -> np.ndarray:
         """(N, 3) N s, left side less right side of the equation without contact forces; not finite where an element is

@@ -68,8 +68,11 @@ class PlanRoom:
         self.owner, self.body, self.room = owner, body, room
         self.m, size, places = owner.planner.synergies.count, len(room.ends), room.places
         m, width = self.m, 3 * places
-        self._told = Upload(body.stream, 5 * m + 1)
-        bounds, self._diagonal, self._slopes, self._constant = self._told.there.split([3 * m, m, m, 1])
+        parts = [3 * m, m, m, 1, width, body.segment_count]
+        self._told = Upload(body.stream, sum(parts))
+        bounds, self._diagonal, self._slopes, self._constant, self._known, self._tensions = self._told.there.split(
+            parts
+        )
         self._bounds = bounds.view(3, m)
         # To stay where the last trial is, and to go from there to the end of a Newton step.
         self._stay, self._forward = body.tensor(np.array([0.0, 0.0, TRIED])), body.tensor(np.array([1.0, 1.0, TRIED]))
@@ -114,14 +117,14 @@ class PlanRoom:
         )
         if not usual or (start.contacts.count > 0 and objective >= COSTLY):
             return None
-        width, (size, speeds, velocities, *_) = 3 * start.contacts.count, room.answer()
+        width, found = 3 * start.contacts.count, room.answer()
         response = DeviceResponse.there(
             Tangent(problem, body.factors), start.contacts, body, room, room.delassus_here()
         )
         body.at_hand = response
         activations = (planner.synergies.members @ answer[HEADER : HEADER + self.m]) * planner.muscles.bounds
         tension = MuscleTension.of(planner.muscles, activations)
-        begun = response.made(tension, forces[:width].reshape(-1, 3).copy(), (size, speeds, velocities))
+        begun = response.made(tension, forces[:width].reshape(-1, 3).copy(), found)
         room.at_trial = begun
         return response, Plan(activations, begun.velocities, begun.forces, int(count), int(infeasible))
 
@@ -133,29 +136,35 @@ class PlanRoom:
         problem, planner, room = start.problem, self.owner.planner, self.room
         self.body.take(problem)
         room.take(start.contacts)
-        room.begin_at(MuscleTension.of(planner.muscles, start.activations), problem.start, start.forces)
-        room.tell(0.0, False, start.forces, BEGUN)
         room.coulomb.tell(start.shift, start.friction)
         self.body.factors.tell((1.0 + problem.dt * problem.drag) * self.owner.masses)
         self.owner.factors.tell(self.owner.masses)
         previous = planner.synergies.mean(start.activations / planner.muscles.bounds)
         size, change = planner.activation_weights(problem.dt)
-        self._told.take(
+        self._told.write(
             *(*planner.activation_bounds(previous, problem.dt), previous),
             *(2.0 * (size + change) + REGULAR, -2.0 * change * previous, np.array([2.0 * (change @ previous**2)])),
+            *(start.forces, np.zeros(3 * (room.places - start.contacts.count))),
+            MuscleTension.of(planner.muscles, start.activations).tensions,
         )
 
     def _enqueue_foresight(self, dt: float, ratio: float) -> None:
         """A Newton step ahead under the forces that are known, and from there ``LOOKS`` with contact."""
         body, room = self.body, self.room
-        room.send()
-        torch.add(body.positions, room.parts(room.begun)[0], alpha=dt, out=room.ends)
+        self._told.send()
+        velocities, _, _, forces = room.parts(room.begun)
+        velocities.copy_(body.start)
+        for each in (forces, room.wanted):
+            each.copy_(self._known)
+        room.tensions.copy_(self._tensions)
+        room.told.copy_(self._begin)
+        torch.add(body.positions, body.start, alpha=dt, out=room.ends)
         self._enqueue_factors(dt, 0)
         room.enqueue_ahead(dt, ratio)
         self._sizes[0].copy_(room.size[0])
         self._enqueue_factors(dt, 1)
         room.enqueue_response(dt, ratio)
-        room.parts(room.begun)[0].copy_(room.velocities)
+        velocities.copy_(room.velocities)
         room.enqueue_trial(dt, ratio)
         self._sizes[1].copy_(room.size[0])
         for look in range(LOOKS):

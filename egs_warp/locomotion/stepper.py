@@ -101,8 +101,9 @@ class LocomotionStepper:
             self._factors,
             push_out_cap=self.settings.push_out_cap * body.speed_unit,
             penetration_tolerance=self.settings.penetration_tolerance * body.height,
-            respond=_responder_by(self._factors, body, muscles),
         )
+        respond = _responder_by(self._factors, body, muscles, self.solver)
+        self.solver = replace(self.solver, respond=respond)
         rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
         # On one thread: what is found here must not hang on how many there are.
         with one_blas_thread():
@@ -294,11 +295,13 @@ class LocomotionStepper:
         return objectives_missed(problem, contacts, objectives, end.velocities, end.forces, self.body.speed_unit)
 
     def _detect(self, problem: StepProblem, memory: StepMemory) -> ContactSet:
+        loaded = memory.forces[:, 0] > 0.0
+        contacts = self.solver.respond.choose(problem, memory.points, loaded)
+        if contacts is not None:
+            return contacts
         ballistic = problem.state.velocities + problem.dt * self.body.gravity
         gaps, _ = self.detector.gaps(problem.end_positions(ballistic))
-        return self.detector.contact_set(
-            self.points.choose(memory.points, memory.forces[:, 0] > 0.0, gaps), problem.state.positions
-        )
+        return self.detector.contact_set(self.points.choose(memory.points, loaded, gaps), problem.state.positions)
 
     def foresee(
         self, problem: StepProblem, contacts: ContactSet, memory: StepMemory, activations: np.ndarray
@@ -327,9 +330,13 @@ class LocomotionStepper:
         self, problem: StepProblem, plan: Plan, result: CoupledResult, clock: StageClock
     ) -> tuple[BodyState, StepMemory, StepReport]:
         end = problem.end_positions(result.velocities)
-        gaps, _ = self.detector.gaps(end)
         after = BodyState(end, result.velocities, problem.state.time + problem.dt)
-        internal = problem.internal_gradient(result.velocities, MuscleTension.of(self.muscles, plan.activations))
+        if result.seen is None:
+            least_gap = float(self.detector.gaps(end)[0].min())
+            internal = problem.internal_gradient(result.velocities, MuscleTension.of(self.muscles, plan.activations))
+            spin = problem.spin(internal)
+        else:
+            least_gap, spin = result.seen.least_gap, problem.spin_by(result.seen.torque)
         clock.lap("report")
         report = StepReport(
             state=after,
@@ -337,27 +344,29 @@ class LocomotionStepper:
             contacts=result.contacts,
             forces=result.forces,
             end_gaps=result.contacts.end_gaps(problem.dt, result.velocities),
-            min_gap=float(gaps.min()),
+            min_gap=least_gap,
             activations=plan.activations,
             qp_count=plan.qp_count,
             qp_infeasible=plan.qp_infeasible,
             newton_iterations=result.iterations,
             converged=result.converged,
-            added_spin=float(np.linalg.norm(problem.spin(internal))),
+            added_spin=float(np.linalg.norm(spin)),
             milliseconds=clock.milliseconds,
         )
         return after, StepMemory.after(report), report
 
 
-def _responder_by(factors: Factors, body: SoftBody, muscles: MuscleSet) -> Responder:
-    """Of tangents of ``body`` by ``factors``: on the host, or where these are."""
+def _responder_by(factors: Factors, body: SoftBody, muscles: MuscleSet, solver: CoupledSolver) -> Responder:
+    """Of tangents of ``body`` by ``factors``, for the ``solver``: on the host, or where these are."""
     if isinstance(factors, SparseFactors):
         return HostResponder()
     from egs_warp.contact.device_response import DeviceResponder
+    from egs_warp.contact.device_sight import DeviceSight
     from egs_warp.fem.dense_factors import DenseFactors
 
     assert isinstance(factors, DenseFactors)
-    return DeviceResponder(factors, body, muscles)
+    sight = DeviceSight(solver.detector, solver.points, factors.stream, solver.penetration_tolerance)
+    return DeviceResponder(factors, body, muscles, sight)
 
 
 def linear_steps_by(respond: Responder, muscles: MuscleSet, synergies: Synergies) -> LinearSteps:

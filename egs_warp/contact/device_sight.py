@@ -1,0 +1,123 @@
+"""Contact points of a step chosen where a GPU has the gaps of all points: only the lowest come to the host."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import warp as wp
+
+from egs_warp.contact.coupled_step import ADDED, CREEPS, SINKS
+from egs_warp.contact.detection import ContactDetector, ContactSet
+from egs_warp.contact.points import ContactPoints
+from egs_warp.fem.graphs import GraphStream, Recordings, Upload
+from egs_warp.fem.worlds import shared
+from egs_warp.kernels.contact import sight as kernels
+from egs_warp.precision import Vec4, real
+
+_KNOWN = 64
+"""Points of the step before are so many at a time."""
+
+
+class DeviceSight:
+    """Gaps of all contact points of one body, at the start of a step and where it may end."""
+
+    def __init__(
+        self, detector: ContactDetector, points: ContactPoints, stream: GraphStream, penetration_tolerance: float
+    ) -> None:
+        """``penetration_tolerance`` metres, as ``CoupledSolver`` has it."""
+        self._detector, self._points, self._stream = detector, points, stream
+        self._tolerance = penetration_tolerance
+        count, device = len(detector.geometry.tet_from_point), detector.device
+        self._gaps, self._start_gaps = (wp.zeros(count, dtype=real, device=device) for _ in range(2))
+        self._faces, self._start_faces = (wp.zeros(count, dtype=int, device=device) for _ in range(2))
+        bounds = np.searchsorted(points.cell_from_point[points.order], np.arange(points.cell_count + 1))
+        self._cells = [wp.array(each.astype(np.int32), dtype=int, device=device) for each in (points.order, bounds)]
+        self._lanes = 1 if device.is_cpu else kernels.BLOCK
+        self._rooms: dict[int, _Room] = {}
+        self._works = Recordings(stream)
+
+    def choose(
+        self, positions: wp.array, ends: wp.array, before: np.ndarray, loaded: np.ndarray, start: np.ndarray
+    ) -> ContactSet:
+        """The contacts of a step from ``positions`` (N,), on the host ``start`` (N, 3), which may end at ``ends`` (N,):
+        ``ContactPoints.choose`` after the points ``before`` (m,), of which those ``loaded`` (m,) bool pressed."""
+        places = -(-max(len(before), 1) // _KNOWN) * _KNOWN
+        if places not in self._rooms:
+            self._rooms[places] = _Room(self._stream, places, self._points.cell_count)
+        room = self._rooms[places]
+        room.told.write(before)
+
+        def look() -> None:
+            room.told.send()
+            self._detector.enqueue_gaps(positions, self._start_gaps, self._start_faces)
+            self._detector.enqueue_gaps(ends, self._gaps, self._faces)
+            self._enqueue_choice(room)
+
+        with self._stream:
+            self._works.run((places, positions.ptr, ends.ptr), look)
+            self._stream.wait()
+        lowest, known = room.found()
+        known = known[: len(before)]
+        low = lowest[lowest[:, 0] >= 0.0]
+        points = self._points.among(before, loaded, known[:, 1], low[:, 0].astype(int), low[:, 1])
+        every = np.concatenate([low, known])
+        # Of those that are there twice both say the same.
+        _, first = np.unique(every[:, 0], return_index=True)
+        every = every[first]
+        chosen = every[np.searchsorted(every[:, 0], points)]
+        return self._detector.contact_set_at(points, start, chosen[:, 2], chosen[:, 3].astype(np.int32))
+
+    def _enqueue_choice(self, room: _Room) -> None:
+        gaps = [self._gaps, self._start_gaps, self._start_faces]
+        wp.launch(
+            kernels.lowest_kernel,
+            (self._points.cell_count, self._lanes),
+            inputs=[*self._cells, self._points.near, self._points.alike, *gaps],
+            outputs=[shared(room.lowest, Vec4)],
+            device=self._detector.device,
+            block_dim=self._lanes,
+        )
+        wp.launch(
+            kernels.known_kernel,
+            len(room.known),
+            inputs=[shared(room.told.there, real), *gaps],
+            outputs=[shared(room.known, Vec4)],
+            device=self._detector.device,
+        )
+        room.give()
+
+    def enqueue_sinking(self, ends: wp.array, points: torch.Tensor, counts: torch.Tensor, seen: torch.Tensor) -> None:
+        """Into ``seen`` (2,), of a step that was begun by ``choose`` and ends at ``ends`` (N,), how many points sink
+        that are none of ``counts`` (1,) ``points`` (K,) int32, and the least gap of all, metres."""
+        self._detector.enqueue_gaps(ends, self._gaps, self._faces)
+        seen.zero_()
+        wp.launch(
+            kernels.sinking_kernel,
+            len(self._gaps),
+            inputs=[
+                *(ADDED * self._tolerance, self._tolerance, SINKS, CREEPS),
+                *(shared(points, wp.int32), shared(counts, wp.int32), self._gaps, self._start_gaps),
+            ],
+            outputs=[shared(seen, real)],
+            device=self._detector.device,
+        )
+        torch.amin(wp.to_torch(self._gaps), dim=0, out=seen[1])
+
+
+class _Room:
+    """What goes there and comes back with so many points that are known."""
+
+    def __init__(self, stream: GraphStream, places: int, cells: int) -> None:
+        self.told = Upload(stream, places)
+        self._made = torch.zeros((cells + places, 4), dtype=torch.float64, device=stream.device)
+        self.lowest, self.known = self._made.split([cells, places])
+        self._made_here, self._cells = stream.pinned(self._made.numel()), cells
+
+    def give(self) -> None:
+        """On its way to the host."""
+        self._made_here.copy_(self._made.view(-1), non_blocking=True)
+
+    def found(self) -> tuple[np.ndarray, np.ndarray]:
+        """What has come: of the cells, and of the points that were told."""
+        made = self._made_here.numpy().reshape(-1, 4)
+        return made[: self._cells], made[self._cells :]
