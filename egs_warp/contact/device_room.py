@@ -278,10 +278,10 @@ class ContactRoom:
         self.wanted.copy_(self.parts(self._base)[3])
         self.told[2] = KEPT
         self.enqueue_onward(dt, ratio)
-        self._look()
+        self.look()
         self.give()
 
-    def _look(self) -> None:
+    def look(self) -> None:
         """What is to be seen at the end of the last trial, see ``Seen``."""
         owner = self.owner
         owner.sight.enqueue_sinking(vectors(self.ends), self._points, self.coulomb.counts, self._seen)
@@ -378,7 +378,7 @@ class ContactRoom:
     def _enqueue_trial(self, dt: float, ratio: float) -> None:
         self.send()
         self.enqueue_trial(dt, ratio)
-        self._look()
+        self.look()
         self.give()
 
     def enqueue_trial(self, dt: float, ratio: float) -> None:

@@ -259,6 +259,7 @@ class PlanRoom:
         room.told.copy_(self._begin)
         room.enqueue_trial(dt, ratio)
         self._sizes[-1].copy_(room.size[0])
+        room.look()
         room.give()
         self._found_here.copy_(self._found, non_blocking=True)
 

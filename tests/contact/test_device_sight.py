@@ -1,0 +1,81 @@
+"""Contact points that are chosen on the device are those of the host, on every kind of ground."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+import torch
+import warp as wp
+
+from egs_warp.contact.coupled_step import ADDED, CREEPS, SINKS
+from egs_warp.contact.detection import ContactDetector, ContactGeometry, ContactSet
+from egs_warp.contact.device_sight import DeviceSight
+from egs_warp.contact.points import ContactPoints
+from egs_warp.deformation.embedding import embed_points
+from egs_warp.fem.graphs import GraphStream
+from egs_warp.geometry.plane import Plane
+from egs_warp.precision import Vec3
+from tests.support.meshes import block_mesh
+from tests.support.waves import wavy_ground
+
+NEAR, TOLERANCE = 0.01, 2e-3
+FLOOR = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+WALL = Plane(np.array([-1.0, 0.0, 0.0]), 0.205)
+
+
+def ground(kind: str) -> ContactGeometry:
+    """A block with many points under its base and on its sides, on ``kind`` of ground."""
+    mesh = block_mesh()
+    half = mesh.nodes[:, 0].max()
+    side = np.linspace(-half, half, 15)
+    points = np.array([[x, y, z] for x in side for y in side for z in (0.0, 0.004 * (1 + x), 0.3)])
+    embedding = embed_points(mesh, points, device="cpu")
+    flat = ContactGeometry(mesh, (FLOOR,), 0.8, embedding.tets.numpy(), embedding.weights.numpy(), 0, 0.0)
+    if kind == "corner":
+        return replace(flat, planes=(FLOOR, WALL))
+    return replace(flat, field=wavy_ground(0.004)) if kind == "waves" else flat
+
+
+def assert_alike(there: ContactSet, here: ContactSet) -> None:
+    for name in ("points", "nodes", "faces"):
+        np.testing.assert_array_equal(getattr(there, name), getattr(here, name))
+    for name in ("weights", "axes", "gaps"):
+        np.testing.assert_allclose(getattr(there, name), getattr(here, name), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["flat", "corner", "waves"])
+def test_the_points_of_a_step_are_the_host_s(kind: str, device: str) -> None:
+    """Of a body that comes down, leans, slides to the wall and leaves: each after the points of the look before, of
+    which some press; and what sinks, but for points that are in contact."""
+    geometry = ground(kind)
+    nodes, random = geometry.mesh.nodes, np.random.default_rng(0)
+    detector, points = ContactDetector(geometry, device=device), ContactPoints(geometry, near=NEAR, lower=1e-3)
+    sight = DeviceSight(detector, points, GraphStream(torch.device(device)), TOLERANCE)
+    start, ends = (wp.zeros(len(nodes), dtype=Vec3, device=device) for _ in range(2))
+    before, changed, sunk = np.zeros(0, int), 0, 0
+    for lean, lift in ((0.0, 0.004), (0.0, 0.0), (0.03, -0.003), (-0.02, -0.004), (0.0, 0.05), (0.01, 0.0)):
+        at = nodes + [lean, 0.0, lift] + 0.002 * random.standard_normal(nodes.shape)
+        then = at + np.column_stack([np.zeros((len(nodes), 2)), lean * nodes[:, 0] - 0.002])
+        start.assign(at)
+        ends.assign(then)
+        loaded = random.random(len(before)) < 0.5
+        gaps, _ = detector.gaps(then)
+        here = detector.contact_set(points.choose(before, loaded, gaps), at)
+        there = sight.choose(start, ends, before, loaded, at)
+        assert_alike(there, here)
+        changed += len(before) > 0 and here.count > 0 and not np.array_equal(before, here.points)
+        taken = there.points[::2]
+        seen = torch.zeros(2, dtype=torch.float64, device=device)
+        told = torch.as_tensor(taken.astype(np.int32), device=device)
+        sight.enqueue_sinking(ends, told, torch.tensor([len(taken)], dtype=torch.int32, device=device), seen)
+        allowed = np.where(gaps < -TOLERANCE, CREEPS, SINKS) * TOLERANCE
+        sinks = (gaps < -ADDED * TOLERANCE) & (gaps < detector.gaps(at)[0] - allowed)
+        sinks[taken] = False
+        assert seen[0].item() == sinks.sum() and seen[1].item() == pytest.approx(gaps.min(), abs=1e-12)
+        sunk += sinks.any()
+        before = here.points
+    assert changed > 1 and sunk > 1

@@ -1,0 +1,165 @@
+"""Plans that are made at once on the device are those of one look after the other, on every device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+from egs_warp.contact.device_response import DeviceIterate
+from egs_warp.fem.body import BodyState
+from egs_warp.fem.step_problem import StepProblem
+from egs_warp.locomotion import device_plan
+from egs_warp.locomotion.device_plan import DevicePlanner
+from egs_warp.locomotion.linear_step import StepStart
+from egs_warp.locomotion.objectives import (
+    AnyObjective,
+    LoadObjective,
+    SpinObjective,
+    centre_of_mass_velocity,
+    node_velocities,
+)
+from egs_warp.locomotion.planner import StageClock
+from egs_warp.locomotion.settings import LocomotionSettings
+from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory
+from egs_warp.pipelines.creature import Creature
+from tests.support.creatures import coarse_pawn
+from tests.support.device_steps import on_device
+
+DT = 0.01
+
+
+@pytest.fixture(scope="module")
+def creature() -> Creature:
+    return coarse_pawn()
+
+
+@pytest.fixture
+def stepper(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> LocomotionStepper:
+    return on_device(creature, device, monkeypatch, LocomotionSettings(qp_solver="admm"))
+
+
+def asks(creature: Creature, speed: float) -> list[AnyObjective]:
+    """To rise at ``speed`` m/s in the pose that it has, without turning, and to carry less with some nodes."""
+    body = creature.body
+    lifted = np.argsort(creature.start.positions @ body.gravity)[-9::3]
+    up = -body.gravity / np.linalg.norm(body.gravity)
+    return [
+        centre_of_mass_velocity(body, speed * up, 2.0),
+        node_velocities(body, np.tile(speed * up, (len(body.node_mass), 1)), 1.0),
+        SpinObjective(np.zeros(3), 1.0),
+        LoadObjective(lifted, 0.1),
+    ]
+
+
+def begun(stepper: LocomotionStepper, state: BodyState, memory: StepMemory) -> StepStart:
+    problem = StepProblem(stepper.body, state, DT, stepper.settings.drag)
+    contacts = stepper._detect(problem, memory)
+    known = stepper.points.matched(contacts.points, memory.points, memory.forces)
+    shift = stepper.solver.shift(contacts, DT)
+    return StepStart(problem, contacts, shift, stepper.geometry.friction, memory.activations, known)
+
+
+def planner_of(stepper: LocomotionStepper) -> DevicePlanner:
+    planner = stepper._at_once
+    assert isinstance(planner, DevicePlanner)
+    return planner
+
+
+def is_the_host_s(
+    stepper: LocomotionStepper, start: StepStart, memory: StepMemory, objectives: Sequence[AnyObjective]
+) -> bool:
+    """The plan, its response, and the first look at its end; False if it is left to the host."""
+    found = planner_of(stepper).plan(start, objectives)
+    if found is None:
+        return False
+    response, plan = found
+    begun_at = response.at(None, plan.velocities, plan.forces)
+    delassus = response.delassus.copy()
+    prospect = stepper.foresee(start.problem, start.contacts, memory, memory.activations)
+    expected = stepper.planner.plan(prospect, memory.activations, objectives, StageClock())
+    height = stepper.body.height
+    assert plan.qp_count == expected.qp_count and plan.qp_infeasible == expected.qp_infeasible
+    np.testing.assert_allclose(plan.activations, expected.activations, rtol=0, atol=1e-7 * height)
+    np.testing.assert_allclose(plan.velocities, expected.velocities, rtol=0, atol=1e-7 * stepper.body.speed_unit)
+    np.testing.assert_allclose(plan.forces, expected.forces, rtol=0, atol=1e-6 * stepper.body.weight)
+    scale = np.abs(delassus).max(initial=1e-300)
+    np.testing.assert_allclose(delassus, prospect.response.delassus, rtol=0, atol=1e-9 * scale)
+    # Without muscles it is another place than the one that is at hand.
+    assert isinstance(begun_at, DeviceIterate) and begun_at.tension is None
+    return True
+
+
+def test_plans_are_those_of_one_look_after_the_other(creature: Creature, stepper: LocomotionStepper) -> None:
+    """Step after step from rest, and off the ground: what a GPU has recorded the first time it plays the second."""
+    state, memory, at_once = creature.start, stepper.initial_memory(), 0
+    objectives = asks(creature, 0.1)
+    for number in range(6):
+        at_once += is_the_host_s(stepper, begun(stepper, state, memory), memory, objectives)
+        state, memory, reports = stepper.advance(state, memory, objectives, DT)
+        assert all(report.converged for report in reports), number
+    # This body's base has few points that do not repeat each other: the search goes astray at times.
+    assert at_once >= 3
+    up = -stepper.body.gravity / np.linalg.norm(stepper.body.gravity)
+    flown = BodyState(creature.start.positions + 0.3 * stepper.body.height * up, state.velocities)
+    for _ in range(2):
+        start = begun(stepper, flown, memory)
+        assert start.contacts.count == 0
+        assert is_the_host_s(stepper, start, memory, objectives)
+
+
+def test_the_solve_goes_on_from_the_look_at_the_plan_s_end(
+    creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is asked there a second time, and what is found is what asking finds."""
+    from egs_warp.contact.device_room import ContactRoom
+    from egs_warp.muscles.tension import MuscleTension
+
+    memory = stepper.initial_memory()
+    found = planner_of(stepper).plan(begun(stepper, creature.start, memory), asks(creature, 0.1))
+    assert found is not None
+    response, plan = found
+    tension = MuscleTension.of(stepper.muscles, plan.activations)
+    asked: list[int] = []
+    begin = ContactRoom.begin
+    monkeypatch.setattr(ContactRoom, "begin", lambda *given: asked.append(1) or begin(*given))
+    first = response.at(tension, plan.velocities, plan.forces)
+    assert asked == []
+    second = response.at(tension, plan.velocities.copy(), plan.forces)
+    assert asked == [1]
+    assert second.size == pytest.approx(first.size, rel=1e-7) and first.size > 0.0
+    np.testing.assert_allclose(second.speeds, first.speeds, rtol=0, atol=1e-10)
+    assert first.seen is not None and second.seen is not None
+    np.testing.assert_allclose(second.seen.torque, first.seen.torque, rtol=1e-6)
+
+
+@pytest.mark.parametrize("what", ["costly", "astray", "forces"])
+def test_what_is_not_as_usual_is_left_to_the_host(
+    what: str, creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An end that costs too much, a search that goes astray, forces that miss their laws: the step is the host's."""
+    memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
+    start = begun(stepper, creature.start, memory)
+    assert planner_of(stepper).plan(start, objectives) is not None
+    if what == "costly":
+        monkeypatch.setattr(device_plan, "COSTLY", 0.0)
+    elif what == "astray":
+        monkeypatch.setattr(device_plan, "FOUND", -1)
+    else:
+        monkeypatch.setattr(device_plan, "ASTRAY", -1.0)
+    assert planner_of(stepper).plan(start, objectives) is None
+    end, _, reports = stepper.advance(creature.start, memory, objectives, DT)
+    stepper._at_once = None
+    expected, _, others = stepper.advance(creature.start, memory, objectives, DT)
+    assert reports[0].converged and reports[0].qp_count == others[0].qp_count
+    np.testing.assert_array_equal(end.velocities, expected.velocities)
+
+
+def test_a_matrix_that_is_not_definite_is_left_to_the_host(creature: Creature, stepper: LocomotionStepper) -> None:
+    """A body that is squeezed flat."""
+    squeezed = creature.start.positions * np.array([1.0, 0.4, 1.0])
+    memory = stepper.initial_memory()
+    assert planner_of(stepper).plan(begun(stepper, BodyState(squeezed, 0.0 * squeezed), memory), []) is None
