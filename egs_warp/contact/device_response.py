@@ -53,7 +53,7 @@ class DeviceResponder(BodyRoom):
         """See ``Responder``. No response is at hand then."""
         assert tangent.factors is self.factors
         room = self.room_for(contacts)
-        self.at_hand = room.at_base = room.at_trial = None
+        self.at_hand = room.at_base = room.at_trial = room.coming = None
         with self.stream:
             self.take(tangent.problem)
         size, ahead = room.ahead(tangent.problem, contacts, tension, velocities, forces)
@@ -92,8 +92,9 @@ class DeviceResponse(ContactResponse):
         """See ``ContactResponse``."""
         assert self.owner.at_hand is self
         room = self.room
-        if room.at_trial is not None and room.at_trial.is_at(self, tension, velocities, forces):
-            return room.at_trial
+        for known in (room.at_trial, room.coming):
+            if known is not None and known.is_at(self, tension, velocities, forces):
+                return known
         found = room.begin(self.tangent.problem, tension, velocities, forces)
         room.at_base, room.at_trial = None, self.made(tension, forces, found)
         return room.at_trial
@@ -101,9 +102,23 @@ class DeviceResponse(ContactResponse):
     def made(self, tension: MuscleTension | None, forces: np.ndarray, found: tuple[np.ndarray, ...]) -> DeviceIterate:
         """Of what the room has ``found``."""
         size, speeds, velocities, _, _, seen = found
+        self.room.coming = None
+        return self.iterate(tension, forces, float(size[0]), speeds, velocities, Seen.of(seen))
+
+    def iterate(
+        self,
+        tension: MuscleTension | None,
+        forces: np.ndarray,
+        size: float,
+        speeds: np.ndarray,
+        velocities: np.ndarray,
+        seen: Seen | None,
+    ) -> DeviceIterate:
+        """At those ``velocities`` (3N,), under ``forces`` (n, 3), where the equation misses ``size`` N s and contacts
+        go on at ``speeds`` (3K,)."""
         return DeviceIterate(
             *(self, tension, velocities.reshape(-1, 3).copy(), forces),
-            *(float(size[0]) / self.tangent.problem.unit, speeds[: 3 * self.contacts.count].copy(), Seen.of(seen)),
+            *(size / self.tangent.problem.unit, speeds[: 3 * self.contacts.count].copy(), seen),
         )
 
 
@@ -117,7 +132,7 @@ class DeviceIterate:
     forces: np.ndarray
     size: float
     speeds: np.ndarray
-    seen: Seen
+    seen: Seen | None
 
     def is_at(
         self, response: DeviceResponse, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray
@@ -145,7 +160,10 @@ class DeviceIterate:
     def onward(self, shift: np.ndarray, friction: float) -> tuple[np.ndarray, float, Iterate]:
         """See ``Iterate``."""
         room, count = self.response.room, self.response.contacts.count
-        found = room.onward(self.response.tangent.problem, shift, friction, base=self._base())
+        if room.coming is self:
+            found = room.arrived()
+        else:
+            found = room.onward(self.response.tangent.problem, shift, friction, base=self._base())
         missed, forces = float(found[3][0]), found[4][: 3 * count].reshape(-1, 3).copy()
         room.at_base, room.at_trial = self, self.response.made(self.tension, forces, found)
         if missed <= ASTRAY:
@@ -158,6 +176,7 @@ class DeviceIterate:
         assert isinstance(response, DeviceResponse) and response.room is self.response.room
         room = response.room
         _, speeds, *_ = room.again(base=self._base())
+        room.coming = None
         room.at_base = replace(self, response=response, speeds=speeds[: len(self.speeds)].copy())
         return room.at_base
 

@@ -143,6 +143,8 @@ class ContactRoom:
         self.at_base: Any = None
         self.at_trial: Any = None
         """The iterates that lie there."""
+        self.coming: Any = None
+        """The iterate at the base from which ``begin_onward`` goes."""
 
     def tried(self) -> Any:
         """Of the last trial, see ``parts``."""
@@ -267,10 +269,20 @@ class ContactRoom:
     ) -> tuple[np.ndarray, ...]:
         """A trial at the end of a Newton step from the ``base`` under the forces that obey contact and friction there:
         as ``go``, by how much these miss their laws, and these (3K,)."""
+        self.begin_onward(problem, shifts, friction, base=base)
+        return self.arrived()
+
+    def begin_onward(self, problem: StepProblem, shifts: np.ndarray, friction: float, *, base: float) -> None:
+        """``onward``, for which nobody waits: ``arrived`` does."""
+        self.tell(1.0, True, shifts[:0], base)
         with self.owner.stream:
             self.coulomb.tell(shifts, friction)
-        self.tell(1.0, True, shifts[:0], base)
-        return self._ask(self._enqueue_onward, problem.dt, 1.0 + problem.dt * problem.drag)
+            self._do(self._enqueue_onward, problem.dt, 1.0 + problem.dt * problem.drag)
+
+    def arrived(self) -> tuple[np.ndarray, ...]:
+        """See ``onward``."""
+        self.owner.stream.wait()
+        return self.answer()
 
     def _enqueue_onward(self, dt: float, ratio: float) -> None:
         self.send()
@@ -307,8 +319,7 @@ class ContactRoom:
     def _ask(self, work: Callable[..., None], *given: float) -> tuple[np.ndarray, ...]:
         with self.owner.stream:
             self._do(work, *given)
-            self.owner.stream.wait()
-        return self.answer()
+        return self.arrived()
 
     def answer(self) -> tuple[np.ndarray, ...]:
         """What has come of what was asked of a trial: see ``go``."""

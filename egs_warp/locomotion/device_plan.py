@@ -15,6 +15,7 @@ import warp as wp
 from egs_warp.contact.coulomb import ASTRAY
 from egs_warp.contact.device_response import DeviceResponder, DeviceResponse
 from egs_warp.contact.device_room import BEGUN, TRIED, ContactRoom, vectors
+from egs_warp.contact.response import ContactResponse
 from egs_warp.fem.dense_factors import DenseFactors
 from egs_warp.fem.graphs import Recordings, Upload
 from egs_warp.fem.step_problem import Tangent
@@ -24,7 +25,7 @@ from egs_warp.kernels.locomotion.active_set import FOUND
 from egs_warp.kernels.locomotion.piece_search import HEADER
 from egs_warp.locomotion.device_linear_step import DeviceLinearSteps, Transfers, squares_of
 from egs_warp.locomotion.device_search import SearchRoom
-from egs_warp.locomotion.linear_step import LOOKS, StepStart, torques_of
+from egs_warp.locomotion.linear_step import LOOKS, Prospect, StepStart, torques_of
 from egs_warp.locomotion.objectives import AnyObjective, Objective
 from egs_warp.locomotion.planner import REGULAR, WORK, Plan, StepPlanner
 from egs_warp.locomotion.step_cost import EFFORT, HORIZON
@@ -50,14 +51,30 @@ class DevicePlanner:
         self.masses = np.repeat(body.node_mass, 3)
         self._rooms: dict[int, PlanRoom] = {}
 
-    def plan(self, start: StepStart, objectives: Sequence[AnyObjective]) -> tuple[DeviceResponse, Plan] | None:
-        """The response that is at hand then, and the plan for what the ``objectives`` ask, at which that has been asked
-        already; None where something is not as usual: a matrix that is not definite, an element that is inverted,
-        forces that are not found, a search that goes astray or ends where another may be better."""
+    def plan(self, start: StepStart, objectives: Sequence[AnyObjective]) -> tuple[ContactResponse, Plan] | None:
+        """The response that is at hand then, and the plan for what the ``objectives`` ask, on the way to whose end the
+        solve's first step is; None where something is not as usual: a matrix that is not definite, an element that is
+        inverted, forces that are not found, a search that goes astray or ends where another may be better."""
+        return self._room_for(start).plan(start, objectives)
+
+    def plan_again(
+        self, prospect: Prospect, last: np.ndarray, objectives: Sequence[AnyObjective], friction: float
+    ) -> Plan | None:
+        """The same about a ``prospect`` where the last trial has ended, after ``last`` (M,) metres of the step
+        before."""
+        response = prospect.response
+        assert isinstance(response, DeviceResponse)
+        at = response.room.at_trial
+        if self.owner.at_hand is not response or at is None or at.velocities is not prospect.velocities:
+            return None
+        start = StepStart.again(prospect, friction, last)
+        return self._room_for(start).plan_again(start, prospect, objectives)
+
+    def _room_for(self, start: StepStart) -> PlanRoom:
         room = self.owner.room_for(start.contacts)
         if room.places not in self._rooms:
             self._rooms[room.places] = PlanRoom(self, room)
-        return self._rooms[room.places].plan(start, objectives)
+        return self._rooms[room.places]
 
 
 class PlanRoom:
@@ -81,68 +98,94 @@ class PlanRoom:
         self._form = zeros(m + width + 1, m + width + 1)
         self._entries, self._slope, self._energy = zeros(len(owner.factors.places)), zeros(size), zeros(1)
         # In one piece, as it comes back: what tells whether all went as usual, the answer, and forces.
-        lengths = [6, LOOKS + 3, LOOKS + 1, HEADER + m + width, width]
-        self._found, self._ends = zeros(sum(lengths)), np.cumsum(lengths)[:-1]
-        self._found_here = body.stream.pinned(len(self._found))
-        verdicts, self._sizes, self._missed, self._answer, self._forces = self._found.split(lengths)
-        self._verdicts = verdicts.view(3, 2)
+        lengths = [4, LOOKS + 2, LOOKS, 3, HEADER + m + width, width, width, size]
+        self._made, self._ends = zeros(sum(lengths)), np.cumsum(lengths)[:-1]
+        self._made_here = body.stream.pinned(len(self._made))
+        verdicts, self._sizes, self._missed, self._usual, *others = self._made.split(lengths)
+        self._answer, self._forces, self._speeds_after, self._end = others
+        self._verdicts = verdicts.view(2, 2)
         self._x = zeros(m + width + 1)
         self._search = SearchRoom(m, places, str(body.factors.device))
-        self._works = Recordings(body.stream)
+        self._works, self._arrived = Recordings(body.stream), None
 
-    def plan(self, start: StepStart, objectives: Sequence[AnyObjective]) -> tuple[DeviceResponse, Plan] | None:
+    def plan(self, start: StepStart, objectives: Sequence[AnyObjective]) -> tuple[ContactResponse, Plan] | None:
         """See ``DevicePlanner``."""
-        body, room, problem, planner = self.body, self.room, start.problem, self.owner.planner
+        body, room, problem = self.body, self.room, start.problem
+        body.at_hand = room.at_base = room.at_trial = room.coming = None
+        with body.stream:
+            body.take(problem)
+            room.take(start.contacts)
+            body.factors.tell((1.0 + problem.dt * problem.drag) * self.owner.masses)
+            self._tell(start, start.activations)
+            self._do(self._enqueue_foresight, problem.dt, 1.0 + problem.dt * problem.drag)
+        body.factors.begun()
+        self._search_for(start, objectives)
+        verdicts, sizes, missed, *_ = self._parts()
+        if not (verdicts.min() > 0.0 and np.isfinite(sizes).all() and missed.max() <= ASTRAY):
+            return None
+        tangent = Tangent(problem, body.factors)
+        body.at_hand = DeviceResponse.there(tangent, start.contacts, body, room, room.delassus_here())
+        plan = self._found(start, body.at_hand)
+        return None if plan is None else (body.at_hand, plan)
+
+    def plan_again(self, start: StepStart, prospect: Prospect, objectives: Sequence[AnyObjective]) -> Plan | None:
+        """See ``DevicePlanner``."""
+        with self.body.stream:
+            self._tell(start, prospect.activations)
+            self._told.send()
+            self.room.wanted.copy_(self._known)
+        self.room.at_base = self.room.at_trial = self.room.coming = None
+        self._search_for(start, objectives)
+        assert isinstance(prospect.response, DeviceResponse)
+        return self._found(start, prospect.response)
+
+    def _search_for(self, start: StepStart, objectives: Sequence[AnyObjective]) -> None:
+        """The program about the last trial, its search, and the first step of the solve, which nobody waits for."""
+        body, room, problem = self.body, self.room, start.problem
         dt, ratio = problem.dt, 1.0 + problem.dt * problem.drag
         time = max(HORIZON * body.body.time_unit, dt)
-        body.at_hand = room.at_base = room.at_trial = None
         with body.stream:
-            self._tell(start)
-            self._do(self._enqueue_foresight, dt, ratio)
             self._do(self._enqueue_linear, dt, ratio, time)
             self._ask(start, objectives)
             self._do(self._enqueue_search, dt, ratio, time)
-            body.stream.wait()
-        for factors in (body.factors, self.owner.factors):
-            factors.begun()
-        found = self._found_here.numpy()
-        verdicts, sizes, missed, answer, forces = np.split(found, self._ends)
+            self._arrived = body.stream.mark(self._arrived)
+        self.owner.factors.begun()
+        # While the host looks at the plan.
+        room.begin_onward(problem, start.shift, start.friction, base=TRIED)
+        if self._arrived is not None:
+            self._arrived.synchronize()
+
+    def _parts(self) -> list[np.ndarray]:
+        return np.split(self._made_here.numpy(), self._ends)
+
+    def _found(self, start: StepStart, response: DeviceResponse) -> Plan | None:
+        """What the search has found; None if that is not as usual."""
+        *_, (definite, size, missed), answer, forces, speeds, velocities = self._parts()
         ended, count, infeasible, objective, there = answer[:5]
-        usual = (
-            verdicts.min() > 0.0
-            and np.isfinite(sizes).all()
-            and missed.max() <= ASTRAY
-            and ended == FOUND
-            and there == 1.0
-        )
+        usual = definite > 0.0 and np.isfinite(size) and missed <= ASTRAY and ended == FOUND and there == 1.0
         if not usual or (start.contacts.count > 0 and objective >= COSTLY):
             return None
-        width, found = 3 * start.contacts.count, room.answer()
-        response = DeviceResponse.there(
-            Tangent(problem, body.factors), start.contacts, body, room, room.delassus_here()
-        )
-        body.at_hand = response
+        planner, room = self.owner.planner, self.room
         activations = (planner.synergies.members @ answer[HEADER : HEADER + self.m]) * planner.muscles.bounds
         tension = MuscleTension.of(planner.muscles, activations)
-        begun = response.made(tension, forces[:width].reshape(-1, 3).copy(), found)
-        room.at_trial = begun
-        return response, Plan(activations, begun.velocities, begun.forces, int(count), int(infeasible))
+        forces = forces[: 3 * start.contacts.count].reshape(-1, 3).copy()
+        end = response.iterate(tension, forces, float(size), speeds, velocities, None)
+        room.at_base = room.coming = end
+        return Plan(activations, end.velocities, end.forces, int(count), int(infeasible))
 
     def _do(self, work: Callable[..., None], *given: float) -> None:
         self._works.run((work.__name__, *given), lambda: work(*given))
 
-    def _tell(self, start: StepStart) -> None:
-        """All that is known at the start."""
+    def _tell(self, start: StepStart, activations: np.ndarray) -> None:
+        """All that is known at the start, from whose ``activations`` (M,) metres the search begins."""
         problem, planner, room = start.problem, self.owner.planner, self.room
-        self.body.take(problem)
-        room.take(start.contacts)
         room.coulomb.tell(start.shift, start.friction)
-        self.body.factors.tell((1.0 + problem.dt * problem.drag) * self.owner.masses)
         self.owner.factors.tell(self.owner.masses)
-        previous = planner.synergies.mean(start.activations / planner.muscles.bounds)
+        bounds = planner.muscles.bounds
+        previous = planner.synergies.mean(start.activations / bounds)
         size, change = planner.activation_weights(problem.dt)
         self._told.write(
-            *(*planner.activation_bounds(previous, problem.dt), previous),
+            *(*planner.activation_bounds(previous, problem.dt), planner.synergies.mean(activations / bounds)),
             *(2.0 * (size + change) + REGULAR, -2.0 * change * previous, np.array([2.0 * (change @ previous**2)])),
             *(start.forces, np.zeros(3 * (room.places - start.contacts.count))),
             MuscleTension.of(planner.muscles, start.activations).tensions,
@@ -197,7 +240,7 @@ class PlanRoom:
                 lambda: owner.linear.write(room, pulls, dt, self._velocities),
             ]
         )
-        self._verdicts[2].copy_(owner.factors.verdict)
+        torch.amin(owner.factors.verdict, dim=0, out=self._usual[0])
         self._speeds.copy_(room.speeds(self._velocities))
 
     def _ask(self, start: StepStart, objectives: Sequence[AnyObjective]) -> None:
@@ -248,7 +291,7 @@ class PlanRoom:
         activations = self._x[: self.m]
         moved = torch.addmv(self._speeds[:, -1], self._speeds[:, : self.m], activations)
         torch.mul(self._x[self.m : -1], body.body.weight, out=room.wanted)
-        laws.enqueue_forces(moved, room.wanted, self._missed[LOOKS:])
+        laws.enqueue_forces(moved, room.wanted, self._usual[2:])
         torch.mul(room.wanted, 1.0 / body.body.weight, out=self._x[self.m : -1])
         velocities, _, _, forces = room.parts(room.begun)
         torch.mv(self._velocities, self._x, out=velocities)
@@ -258,10 +301,10 @@ class PlanRoom:
         torch.mul(activations[owner.group_from_muscle] * bounds, stiffness, out=room.tensions)
         room.told.copy_(self._begin)
         room.enqueue_trial(dt, ratio)
-        self._sizes[-1].copy_(room.size[0])
-        room.look()
-        room.give()
-        self._found_here.copy_(self._found, non_blocking=True)
+        self._usual[1].copy_(room.size[0])
+        self._speeds_after.copy_(room.speeds_after)
+        self._end.copy_(room.velocities)
+        self._made_here.copy_(self._made, non_blocking=True)
 
     def _enqueue_cost(self, dt: float, time: float) -> None:
         """Added to the form: effort and activations, see ``effort_cost`` and ``StepPlanner``."""

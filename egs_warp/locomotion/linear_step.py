@@ -50,6 +50,12 @@ class StepStart:
     forces: np.ndarray
     """(n, 3) newtons of the step before, as far as these contacts were there."""
 
+    @classmethod
+    def again(cls, prospect: Prospect, friction: float, activations: np.ndarray) -> StepStart:
+        """Of the step of the ``prospect``, with its forces."""
+        response = prospect.response
+        return cls(response.tangent.problem, response.contacts, prospect.shift, friction, activations, prospect.forces)
+
 
 @dataclass(frozen=True)
 class LinearStep:

@@ -228,9 +228,10 @@ class LocomotionStepper:
         contacts = self._detect(problem, memory)
         clock.lap("detect")
         response, plan = self._plan(problem, contacts, memory, objectives, clock)
+        # A GPU is on its way to the end meanwhile.
+        expected = self._missed(problem, objectives, response.contacts, plan)
         result = self._solve(response, plan)
         clock.lap("solve")
-        expected = self._missed(problem, objectives, response.contacts, plan)
         if (
             result.converged
             and self._missed(problem, objectives, result.contacts, result) > _AMISS * expected + _LITTLE
@@ -273,7 +274,11 @@ class LocomotionStepper:
         response = result.response
         shift = self.solver.shift(result.contacts, problem.dt)
         prospect = Prospect(response, shift, plan.activations, result.velocities, result.forces)
-        other = self.planner.plan(prospect, memory.activations, objectives, clock)
+        other = None
+        if self._at_once is not None:
+            other = self._at_once.plan_again(prospect, memory.activations, objectives, self.geometry.friction)
+        if other is None:
+            other = self.planner.plan(prospect, memory.activations, objectives, clock)
         end = self._solve(response, other)
         clock.lap("again")
         costs = [self._missed(problem, objectives, one.contacts, one) for one in (result, end)]

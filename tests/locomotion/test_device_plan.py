@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("torch")
 
 from egs_warp.contact.device_response import DeviceIterate
+from egs_warp.contact.device_room import ContactRoom
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion import device_plan
@@ -25,6 +26,7 @@ from egs_warp.locomotion.objectives import (
 from egs_warp.locomotion.planner import StageClock
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory
+from egs_warp.muscles.tension import MuscleTension
 from egs_warp.pipelines.creature import Creature
 from tests.support.creatures import coarse_pawn
 from tests.support.device_steps import on_device
@@ -111,29 +113,36 @@ def test_plans_are_those_of_one_look_after_the_other(creature: Creature, stepper
         assert is_the_host_s(stepper, start, memory, objectives)
 
 
-def test_the_solve_goes_on_from_the_look_at_the_plan_s_end(
+def test_the_solve_goes_on_from_the_plan_s_end(
     creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nothing is asked there a second time, and what is found is what asking finds."""
-    from egs_warp.contact.device_room import ContactRoom
-    from egs_warp.muscles.tension import MuscleTension
-
+    """Nothing is asked there a second time: its first Newton step is on its way, and brings what asking brings."""
     memory = stepper.initial_memory()
-    found = planner_of(stepper).plan(begun(stepper, creature.start, memory), asks(creature, 0.1))
+    start = begun(stepper, creature.start, memory)
+    found = planner_of(stepper).plan(start, asks(creature, 0.1))
     assert found is not None
     response, plan = found
     tension = MuscleTension.of(stepper.muscles, plan.activations)
-    asked: list[int] = []
-    begin = ContactRoom.begin
-    monkeypatch.setattr(ContactRoom, "begin", lambda *given: asked.append(1) or begin(*given))
+    asked: list[str] = []
+    for name in ("begin", "begin_onward"):
+        real = getattr(ContactRoom, name)
+        monkeypatch.setattr(
+            ContactRoom, name, lambda *given, name=name, real=real, **named: asked.append(name) or real(*given, **named)
+        )
     first = response.at(tension, plan.velocities, plan.forces)
-    assert asked == []
+    forces, missed, ahead = first.onward(start.shift, start.friction)
+    assert asked == [] and first.size > 0.0
     second = response.at(tension, plan.velocities.copy(), plan.forces)
-    assert asked == [1]
-    assert second.size == pytest.approx(first.size, rel=1e-7) and first.size > 0.0
+    assert second.size == pytest.approx(first.size, rel=1e-7)
     np.testing.assert_allclose(second.speeds, first.speeds, rtol=0, atol=1e-10)
-    assert first.seen is not None and second.seen is not None
-    np.testing.assert_allclose(second.seen.torque, first.seen.torque, rtol=1e-6)
+    others, _, beyond = second.onward(start.shift, start.friction)
+    assert asked == ["begin", "begin_onward"] and missed < 1e-10
+    np.testing.assert_allclose(others, forces, rtol=0, atol=1e-7 * stepper.body.weight)
+    np.testing.assert_allclose(beyond.velocities, ahead.velocities, rtol=0, atol=1e-10)
+    assert ahead.seen is not None and beyond.seen is not None
+    assert ahead.seen.sinking == beyond.seen.sinking
+    assert ahead.seen.least_gap == pytest.approx(beyond.seen.least_gap, abs=1e-12)
+    np.testing.assert_allclose(beyond.seen.torque, ahead.seen.torque, rtol=1e-6)
 
 
 @pytest.mark.parametrize("what", ["costly", "astray", "forces"])
