@@ -138,7 +138,7 @@ class CoupledSolver:
         now = trial = response.at(tension, velocities, forces)
         recent: list[float] = []
         for iteration in range(1, ITERATIONS + 1):
-            wanted, missed, trial = now.onward(shift, friction)
+            wanted, missed, trial = now.onward(shift, friction, further=True)
             unanswered += missed > answered
             length, better = 1.0, False
             while length > SHORTEST:

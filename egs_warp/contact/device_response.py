@@ -96,13 +96,12 @@ class DeviceResponse(ContactResponse):
             if known is not None and known.is_at(self, tension, velocities, forces):
                 return known
         found = room.begin(self.tangent.problem, tension, velocities, forces)
-        room.at_base, room.at_trial = None, self.made(tension, forces, found)
+        room.at_base, room.at_trial, room.coming = None, self.made(tension, forces, found), None
         return room.at_trial
 
     def made(self, tension: MuscleTension | None, forces: np.ndarray, found: tuple[np.ndarray, ...]) -> DeviceIterate:
         """Of what the room has ``found``."""
         size, speeds, velocities, _, _, seen = found
-        self.room.coming = None
         return self.iterate(tension, forces, float(size[0]), speeds, velocities, Seen.of(seen))
 
     def iterate(
@@ -154,20 +153,31 @@ class DeviceIterate:
         room, problem = self.response.room, self.response.tangent.problem
         found = room.go(problem, length=length, push=True, wanted=forces, base=self._base())
         told = forces if length == 1.0 else self.forces + length * (forces - self.forces)
-        room.at_base, room.at_trial = self, self.response.made(self.tension, told, found)
+        room.at_base, room.at_trial, room.coming = self, self.response.made(self.tension, told, found), None
         return room.at_trial
 
-    def onward(self, shift: np.ndarray, friction: float) -> tuple[np.ndarray, float, Iterate]:
+    def onward(self, shift: np.ndarray, friction: float, *, further: bool = False) -> tuple[np.ndarray, float, Iterate]:
         """See ``Iterate``."""
-        room, count = self.response.room, self.response.contacts.count
-        if room.coming is self:
-            found = room.arrived()
-        else:
-            found = room.onward(self.response.tangent.problem, shift, friction, base=self._base())
+        room, count, problem = self.response.room, self.response.contacts.count, self.response.tangent.problem
+        number = room.slot
+        if room.coming is not self:
+            base = self._base()
+            if base == KEPT and room.at_trial is not None:
+                # The speeds are the trial's.
+                room.again(base=base)
+            number = room.begin_onward(problem, shift, friction, base=base)
+        if further:
+            # The device goes on while the host looks at what has come.
+            room.begin_onward(problem, shift, friction, base=TRIED)
+        found = room.arrived(number)
         missed, forces = float(found[3][0]), found[4][: 3 * count].reshape(-1, 3).copy()
-        room.at_base, room.at_trial = self, self.response.made(self.tension, forces, found)
+        trial = self.response.made(self.tension, forces, found)
+        if further:
+            room.at_base, room.at_trial, room.coming = trial, None, trial
+        else:
+            room.at_base, room.at_trial, room.coming = self, trial, None
         if missed <= ASTRAY:
-            return forces, missed, room.at_trial
+            return forces, missed, trial
         forces, missed = self.response.forces(self.speeds, shift, friction, self.forces)
         return forces, missed, self.toward(forces)
 
@@ -176,12 +186,17 @@ class DeviceIterate:
         assert isinstance(response, DeviceResponse) and response.room is self.response.room
         room = response.room
         _, speeds, *_ = room.again(base=self._base())
-        room.coming = None
+        room.at_trial = room.coming = None
         room.at_base = replace(self, response=response, speeds=speeds[: len(self.speeds)].copy())
         return room.at_base
 
     def _base(self) -> float:
-        """Where it lies."""
+        """Where it lies; what the device has left behind is told it again."""
         room = self.response.room
-        assert self is room.at_base or self is room.at_trial
-        return KEPT if self is room.at_base else TRIED
+        if self is room.at_base:
+            return KEPT
+        if self is not room.at_trial:
+            assert self.response.owner.at_hand is self.response
+            room.begin(self.response.tangent.problem, self.tension, self.velocities, self.forces)
+            room.at_base, room.at_trial = None, self
+        return TRIED

@@ -125,7 +125,10 @@ class ContactRoom:
         self.told, self.wanted = self._told.there.split([3, width])
         """Of a trial its length, whether forces push, where it begins; and the forces (3K,) newtons."""
         parts = [1, width, size, 1, width, 5]
-        self._asked, self._asked_here = owner.zeros(sum(parts)), owner.stream.pinned(sum(parts))
+        self._asked, self._asked_here = owner.zeros(sum(parts)), [owner.stream.pinned(sum(parts)) for _ in range(2)]
+        self._arrivals: list[Any] = [None, None]
+        self.slot = 0
+        """Where what was asked for last comes; one more may be on its way."""
         self.size, self.speeds_after, self.velocities, self.missed, self._found, seen = self._asked.split(parts)
         self._seen, self._torque_seen = seen.split([2, 3])
         """Of a trial, N s, m/s; the speeds are the contacts' after a Newton step without their forces. By how much the
@@ -139,12 +142,14 @@ class ContactRoom:
         self._base, self._trial = owner.zeros(3 * size + width), owner.zeros(3 * size + width)
         self.ends, self._gradient, self._rest, self._solved, self._pushed, self._half = owner.zeros(6, size)
         self._torque, self._turn = owner.zeros(2, 3)
+        # A whole Newton step from the trial, or from the base.
+        self._onward = {base: owner.tensor(np.array([1.0, 1.0, base])) for base in (KEPT, TRIED)}
         self._works = Recordings(owner.stream)
         self.at_base: Any = None
         self.at_trial: Any = None
         """The iterates that lie there."""
         self.coming: Any = None
-        """The iterate at the base from which ``begin_onward`` goes."""
+        """The iterate at the base from which ``begin_onward`` went last."""
 
     def tried(self) -> Any:
         """Of the last trial, see ``parts``."""
@@ -203,7 +208,7 @@ class ContactRoom:
         with self.owner.stream:
             self.take(contacts)
             self.begin_at(tension, velocities, forces)
-        self.tell(0.0, False, forces, BEGUN)
+        self._tell(0.0, False, forces, BEGUN)
         size, _, ahead, *_ = self._ask(self._enqueue_ahead, problem.dt, 1.0 + problem.dt * problem.drag)
         return float(size[0]), ahead
 
@@ -261,39 +266,34 @@ class ContactRoom:
     ) -> tuple[np.ndarray, ...]:
         """A trial from the ``base`` (``KEPT``, ``TRIED`` or ``BEGUN``): its size, the contacts' speeds after its
         Newton step, its velocities."""
-        self.tell(length, push, wanted, base)
+        self._tell(length, push, wanted, base)
         return self._ask(self._enqueue_trial, problem.dt, 1.0 + problem.dt * problem.drag)
 
-    def onward(
-        self, problem: StepProblem, shifts: np.ndarray, friction: float, *, base: float
-    ) -> tuple[np.ndarray, ...]:
-        """A trial at the end of a Newton step from the ``base`` under the forces that obey contact and friction there:
-        as ``go``, by how much these miss their laws, and these (3K,)."""
-        self.begin_onward(problem, shifts, friction, base=base)
-        return self.arrived()
-
-    def begin_onward(self, problem: StepProblem, shifts: np.ndarray, friction: float, *, base: float) -> None:
-        """``onward``, for which nobody waits: ``arrived`` does."""
-        self.tell(1.0, True, shifts[:0], base)
+    def begin_onward(self, problem: StepProblem, shifts: np.ndarray, friction: float, *, base: float) -> int:
+        """A trial at the end of a Newton step from the ``base`` (``KEPT`` or ``TRIED``) under the forces that obey
+        contact and friction there; nobody waits for it but ``arrived``, with the number that this gives. At most two
+        are on their way."""
         with self.owner.stream:
             self.coulomb.tell(shifts, friction)
-            self._do(self._enqueue_onward, problem.dt, 1.0 + problem.dt * problem.drag)
+            self.slot = 1 - self.slot
+            self._do(self._enqueue_onward, problem.dt, 1.0 + problem.dt * problem.drag, base, self.slot)
+            self._arrivals[self.slot] = self.owner.stream.mark(self._arrivals[self.slot])
+        return self.slot
 
-    def arrived(self) -> tuple[np.ndarray, ...]:
-        """See ``onward``."""
-        self.owner.stream.wait()
-        return self.answer()
+    def arrived(self, number: int) -> tuple[np.ndarray, ...]:
+        """As ``go``, by how much the forces miss their laws, these (3K,), and what was seen."""
+        if self._arrivals[number] is not None:
+            self._arrivals[number].synchronize()
+        return self._answer(number)
 
-    def _enqueue_onward(self, dt: float, ratio: float) -> None:
-        self.send()
-        self._enqueue_base()
-        self.wanted.copy_(self.parts(self._base)[3])
-        self.told[2] = KEPT
+    def _enqueue_onward(self, dt: float, ratio: float, base: float, slot: int) -> None:
+        self.wanted.copy_(self.parts(self._trial if base == TRIED else self._base)[3])
+        self.told.copy_(self._onward[base])
         self.enqueue_onward(dt, ratio)
-        self.look()
-        self.give()
+        self._look()
+        self._give(slot)
 
-    def look(self) -> None:
+    def _look(self) -> None:
         """What is to be seen at the end of the last trial, see ``Seen``."""
         owner = self.owner
         owner.sight.enqueue_sinking(vectors(self.ends), self._points, self.coulomb.counts, self._seen)
@@ -305,8 +305,7 @@ class ContactRoom:
         self._found.copy_(self.wanted)
         self.enqueue_trial(dt, ratio)
 
-    def tell(self, length: float, push: bool, wanted: np.ndarray, base: float) -> None:
-        """What ``send`` sends: see ``go``."""
+    def _tell(self, length: float, push: bool, wanted: np.ndarray, base: float) -> None:
         told = self._told.here.numpy()
         told[:3], told[3:] = (length, float(push), base), 0.0
         told[3 : 3 + wanted.size] = wanted.ravel()
@@ -319,15 +318,12 @@ class ContactRoom:
     def _ask(self, work: Callable[..., None], *given: float) -> tuple[np.ndarray, ...]:
         with self.owner.stream:
             self._do(work, *given)
-        return self.arrived()
+            self.owner.stream.wait()
+        return self._answer(0)
 
-    def answer(self) -> tuple[np.ndarray, ...]:
+    def _answer(self, slot: int) -> tuple[np.ndarray, ...]:
         """What has come of what was asked of a trial: see ``go``."""
-        return tuple(np.split(self._asked_here.numpy(), self._answer_ends))
-
-    def send(self) -> None:
-        """What is told of a trial."""
-        self._told.send()
+        return tuple(np.split(self._asked_here[slot].numpy(), self._answer_ends))
 
     def _enqueue_base(self) -> None:
         self._launch(
@@ -338,14 +334,14 @@ class ContactRoom:
         )
 
     def _enqueue_again(self) -> None:
-        self.send()
+        self._told.send()
         self._enqueue_base()
         self._enqueue_newton(self._base)
-        self.give()
+        self._give()
 
-    def give(self) -> None:
+    def _give(self, slot: int = 0) -> None:
         """What was asked of a trial is on its way to the host."""
-        self._asked_here.copy_(self._asked, non_blocking=True)
+        self._asked_here[slot].copy_(self._asked, non_blocking=True)
 
     def _enqueue_newton(self, state: torch.Tensor) -> None:
         """A Newton step without contact forces from ``state``, and the contacts' speeds after it."""
@@ -367,9 +363,9 @@ class ContactRoom:
         )
 
     def _enqueue_ahead(self, dt: float, ratio: float) -> None:
-        self.send()
+        self._told.send()
         self.enqueue_ahead(dt, ratio)
-        self.give()
+        self._give()
 
     def enqueue_ahead(self, dt: float, ratio: float) -> None:
         """``ahead`` of what is told, with nothing that waits."""
@@ -387,10 +383,10 @@ class ContactRoom:
         self.velocities.copy_(loose)
 
     def _enqueue_trial(self, dt: float, ratio: float) -> None:
-        self.send()
+        self._told.send()
         self.enqueue_trial(dt, ratio)
-        self.look()
-        self.give()
+        self._look()
+        self._give()
 
     def enqueue_trial(self, dt: float, ratio: float) -> None:
         """``go`` as is told, with nothing that waits."""

@@ -187,9 +187,9 @@ class Iterate(Protocol):
         """``length`` of the way to the end of a Newton step with contact ``forces`` (n, 3)."""
         ...
 
-    def onward(self, shift: np.ndarray, friction: float) -> tuple[np.ndarray, float, Iterate]:
+    def onward(self, shift: np.ndarray, friction: float, *, further: bool = False) -> tuple[np.ndarray, float, Iterate]:
         """Forces (n, 3) that obey contact and friction if the contacts move at these ``speeds`` without them, the m/s
-        by which they miss that, and the end of a Newton step with them."""
+        by which they miss that, and the end of a Newton step with them, from which it will go ``further``, likely."""
         ...
 
     def by(self, response: ContactResponse) -> Iterate:
@@ -259,7 +259,7 @@ class VectorIterate:
         found = _room_of(response).trial(response.tangent.problem, self.tension, self._after, step)
         return type(self)(response, self.tension, *found)
 
-    def onward(self, shift: np.ndarray, friction: float) -> tuple[np.ndarray, float, Iterate]:
+    def onward(self, shift: np.ndarray, friction: float, *, further: bool = False) -> tuple[np.ndarray, float, Iterate]:
         """See ``Iterate``."""
         return _onward(self, shift, friction)
 
@@ -326,7 +326,7 @@ class HostIterate:
             forces=self.forces + length * (forces - self.forces),
         )
 
-    def onward(self, shift: np.ndarray, friction: float) -> tuple[np.ndarray, float, Iterate]:
+    def onward(self, shift: np.ndarray, friction: float, *, further: bool = False) -> tuple[np.ndarray, float, Iterate]:
         """See ``Iterate``."""
         return _onward(self, shift, friction)
 

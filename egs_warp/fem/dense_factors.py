@@ -9,13 +9,14 @@ from itertools import pairwise
 import numpy as np
 import scipy.sparse as sparse
 import torch
+import warp as wp
 
 from egs_warp.fem.graphs import GraphStream, Recordings, Upload
 from egs_warp.fem.kept import Kept
 from egs_warp.fem.slabs import Slabs
-
-_LARGEST = 64
-"""Rows of the blocks of a triangle that are inverted at once."""
+from egs_warp.fem.worlds import shared
+from egs_warp.kernels.fem import triangles as kernels
+from egs_warp.precision import real
 
 
 class DenseFactors:
@@ -272,15 +273,13 @@ class _Triangle:
     """Inverses of Cholesky factors of one size: of small blocks on the diagonal at once, then of pairs of them."""
 
     def __init__(self, count: int, device: torch.device) -> None:
-        pairs = max(0, math.ceil(math.log2(count / _LARGEST)))
+        pairs = max(0, math.ceil(math.log2(count / kernels.LARGEST)))
         # Even, for what loads two numbers at once.
         side = 2 * math.ceil(count / 2 ** (pairs + 1))
         size = side * 2**pairs
         self._count, self._side, self._size = count, side, size
         self._given = torch.eye(size, dtype=torch.float64, device=device)
         self._made = torch.zeros_like(self._given)
-        self._identity = torch.eye(side, dtype=torch.float64, device=device)
-
         self.inverse = self._made[:count, :count]
 
     def factor(self, matrix: torch.Tensor) -> torch.Tensor:
@@ -292,9 +291,17 @@ class _Triangle:
     def _invert(self, lower: torch.Tensor) -> None:
         self._given[: self._count, : self._count] = lower
         side = self._side
-        small = _blocks(self._given, side, side, 0)
-        inverted = torch.linalg.solve_triangular(small, self._identity.expand_as(small), upper=False)
-        _blocks(self._made, side, side, 0).copy_(inverted)
+        # Torch would take one block after the other.
+        lanes = kernels.LARGEST if lower.is_cuda else 1
+        wp.launch(
+            kernels.invert_triangles_kernel,
+            (self._size // side, lanes),
+            inputs=[shared(self._given, real), side],
+            outputs=[shared(self._made, real)],
+            device=wp.device_from_torch(lower.device),
+            stream=wp.stream_from_torch(torch.cuda.current_stream(lower.device)) if lower.is_cuda else None,
+            block_dim=lanes,
+        )
         while side < self._size:
             first, second = (_blocks(self._made, side, 2 * side, place) for place in (0, side * (self._size + 1)))
             below = side * self._size

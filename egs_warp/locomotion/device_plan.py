@@ -14,7 +14,7 @@ import warp as wp
 
 from egs_warp.contact.coulomb import ASTRAY
 from egs_warp.contact.device_response import DeviceResponder, DeviceResponse
-from egs_warp.contact.device_room import BEGUN, TRIED, ContactRoom, vectors
+from egs_warp.contact.device_room import BEGUN, KEPT, TRIED, ContactRoom, vectors
 from egs_warp.contact.response import ContactResponse
 from egs_warp.fem.dense_factors import DenseFactors
 from egs_warp.fem.graphs import Recordings, Upload
@@ -60,15 +60,15 @@ class DevicePlanner:
     def plan_again(
         self, prospect: Prospect, last: np.ndarray, objectives: Sequence[AnyObjective], friction: float
     ) -> Plan | None:
-        """The same about a ``prospect`` where the last trial has ended, after ``last`` (M,) metres of the step
-        before."""
+        """The same about a ``prospect`` that is where a solve has ended, after ``last`` (M,) metres of the step before;
+        None, too, where the device has left that behind."""
         response = prospect.response
         assert isinstance(response, DeviceResponse)
-        at = response.room.at_trial
-        if self.owner.at_hand is not response or at is None or at.velocities is not prospect.velocities:
-            return None
-        start = StepStart.again(prospect, friction, last)
-        return self._room_for(start).plan_again(start, prospect, objectives)
+        for at, base in ((response.room.at_base, KEPT), (response.room.at_trial, TRIED)):
+            if self.owner.at_hand is response and at is not None and at.velocities is prospect.velocities:
+                start = StepStart.again(prospect, friction, last)
+                return self._room_for(start).plan_again(start, prospect, objectives, base)
+        return None
 
     def _room_for(self, start: StepStart) -> PlanRoom:
         room = self.owner.room_for(start.contacts)
@@ -91,9 +91,9 @@ class PlanRoom:
             parts
         )
         self._bounds = bounds.view(3, m)
-        # To stay where the last trial is, and to go from there to the end of a Newton step.
-        self._stay, self._forward = body.tensor(np.array([0.0, 0.0, TRIED])), body.tensor(np.array([1.0, 1.0, TRIED]))
-        self._begin = body.tensor(np.array([0.0, 0.0, BEGUN]))
+        # To stay where that is, and to go from the last trial to the end of a Newton step.
+        self._stay = {base: body.tensor(np.array([0.0, 0.0, base])) for base in (KEPT, TRIED, BEGUN)}
+        self._forward = body.tensor(np.array([1.0, 1.0, TRIED]))
         self._velocities, self._speeds = zeros(size, m + width + 1), zeros(width, m + width + 1)
         self._form = zeros(m + width + 1, m + width + 1)
         self._entries, self._slope, self._energy = zeros(len(owner.factors.places)), zeros(size), zeros(1)
@@ -119,7 +119,7 @@ class PlanRoom:
             self._tell(start, start.activations)
             self._do(self._enqueue_foresight, problem.dt, 1.0 + problem.dt * problem.drag)
         body.factors.begun()
-        self._search_for(start, objectives)
+        self._search_for(start, objectives, TRIED)
         verdicts, sizes, missed, *_ = self._parts()
         if not (verdicts.min() > 0.0 and np.isfinite(sizes).all() and missed.max() <= ASTRAY):
             return None
@@ -128,24 +128,27 @@ class PlanRoom:
         plan = self._found(start, body.at_hand)
         return None if plan is None else (body.at_hand, plan)
 
-    def plan_again(self, start: StepStart, prospect: Prospect, objectives: Sequence[AnyObjective]) -> Plan | None:
-        """See ``DevicePlanner``."""
+    def plan_again(
+        self, start: StepStart, prospect: Prospect, objectives: Sequence[AnyObjective], base: float
+    ) -> Plan | None:
+        """See ``DevicePlanner``; the prospect lies at the ``base``."""
         with self.body.stream:
             self._tell(start, prospect.activations)
             self._told.send()
             self.room.wanted.copy_(self._known)
         self.room.at_base = self.room.at_trial = self.room.coming = None
-        self._search_for(start, objectives)
+        self._search_for(start, objectives, base)
         assert isinstance(prospect.response, DeviceResponse)
         return self._found(start, prospect.response)
 
-    def _search_for(self, start: StepStart, objectives: Sequence[AnyObjective]) -> None:
-        """The program about the last trial, its search, and the first step of the solve, which nobody waits for."""
+    def _search_for(self, start: StepStart, objectives: Sequence[AnyObjective], base: float) -> None:
+        """The program about what lies at the ``base``, its search, and the first step of the solve, for which nobody
+        waits."""
         body, room, problem = self.body, self.room, start.problem
         dt, ratio = problem.dt, 1.0 + problem.dt * problem.drag
         time = max(HORIZON * body.body.time_unit, dt)
         with body.stream:
-            self._do(self._enqueue_linear, dt, ratio, time)
+            self._do(self._enqueue_linear, dt, ratio, time, base)
             self._ask(start, objectives)
             self._do(self._enqueue_search, dt, ratio, time)
             self._arrived = body.stream.mark(self._arrived)
@@ -200,7 +203,7 @@ class PlanRoom:
         for each in (forces, room.wanted):
             each.copy_(self._known)
         room.tensions.copy_(self._tensions)
-        room.told.copy_(self._begin)
+        room.told.copy_(self._stay[BEGUN])
         torch.add(body.positions, body.start, alpha=dt, out=room.ends)
         self._enqueue_factors(dt, 0)
         room.enqueue_ahead(dt, ratio)
@@ -223,11 +226,11 @@ class PlanRoom:
         body.factors.enqueue(wp.to_torch(made))
         self._verdicts[which].copy_(body.factors.verdict)
 
-    def _enqueue_linear(self, dt: float, ratio: float, time: float) -> None:
+    def _enqueue_linear(self, dt: float, ratio: float, time: float, base: float) -> None:
         """The linear step about what is foreseen, and factors of its horizon, see ``Horizon``."""
         body, room, owner = self.body, self.room, self.owner
         room.tensions.zero_()
-        room.told.copy_(self._stay)
+        room.told.copy_(self._stay[base])
         room.enqueue_residual(dt, ratio)
         pulls, ends = owner.linear.pulls(room), vectors(room.ends)
         torch.sum(wp.to_torch(body.elements.enqueue_energies(ends, body.gradients, time)), dim=0, out=self._energy[0])
@@ -299,7 +302,7 @@ class PlanRoom:
         self._forces.copy_(room.wanted)
         bounds, stiffness = owner.tensions
         torch.mul(activations[owner.group_from_muscle] * bounds, stiffness, out=room.tensions)
-        room.told.copy_(self._begin)
+        room.told.copy_(self._stay[BEGUN])
         room.enqueue_trial(dt, ratio)
         self._usual[1].copy_(room.size[0])
         self._speeds_after.copy_(room.speeds_after)

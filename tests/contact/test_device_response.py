@@ -92,8 +92,11 @@ def test_what_inverts_an_element_is_no_number(creature: Creature, device: str, m
     assert near.feasible and near.size == pytest.approx(host.toward(crushed, 1e-6).size, rel=1e-6)
 
 
-def test_what_is_at_hand_no_more_cannot_go_on(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Memory is there for one response and two places: others fail, in place of going on from what is not theirs."""
+def test_what_is_at_hand_no_more_is_told_again(
+    creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Memory is there for two places: from others a step goes on as it did the first time. And it is there for one
+    response: another fails, in place of going on from what is not its own."""
     stepper = on_device(creature, device, monkeypatch)
     respond, (problem, *_) = stepper.solver.respond, problems(stepper, creature)
     contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
@@ -102,8 +105,20 @@ def test_what_is_at_hand_no_more_cannot_go_on(creature: Creature, device: str, m
     first = old.at(None, problem.start, forces)
     second = first.toward(forces)
     second.toward(forces)
-    with pytest.raises(AssertionError):
-        first.toward(forces)
+    assert_alike(first.toward(forces), second)
+    shift = np.zeros(6)
+    begun = first.onward(shift, 0.8)
+    # The device has gone on, past what it has told.
+    again = first.onward(shift, 0.8, further=True)
+    for one, other in (
+        (begun, again),
+        (first.onward(shift, 0.8), begun),
+        (again[2].onward(shift, 0.8), begun[2].onward(shift, 0.8)),
+    ):
+        np.testing.assert_allclose(one[0], other[0], rtol=0, atol=1e-10)
+        assert_alike(one[2], other[2])
     respond(tangent, contacts)
+    with pytest.raises(AssertionError):
+        second.toward(forces)
     with pytest.raises(AssertionError):
         old.at(None, problem.start, forces)
