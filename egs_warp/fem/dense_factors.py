@@ -292,7 +292,7 @@ class _Triangle:
         self._given[: self._count, : self._count] = lower
         side = self._side
         # Torch would take one block after the other.
-        lanes = kernels.LARGEST if lower.is_cuda else 1
+        lanes = kernels.BLOCK if lower.is_cuda else 1
         wp.launch(
             kernels.invert_triangles_kernel,
             (self._size // side, lanes),

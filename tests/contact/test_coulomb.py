@@ -131,6 +131,27 @@ def test_problems_that_take_all_iterations_have_the_same_bits_side_by_side() -> 
     assert missed.tolist() == [size for _, size in alone] and 5 < (missed > 1e-9).sum() < 35
 
 
+@pytest.mark.cuda
+@pytest.mark.parametrize("friction", [0.0, 0.4, 5.0])
+def test_a_block_of_threads_finds_the_forces_of_one(friction: float) -> None:
+    """Of groups that are full and not, of as many unknowns as registers have room for and more, of more contacts than
+    are swept together."""
+    counts, room = [1, 4, 5, 6, 11, 33, 40, 45, 64, 65, 70], 70
+    random = np.random.default_rng(1)
+    delassus, free = np.zeros((len(counts), 3 * room, 3 * room)), random.normal(size=(len(counts), 3 * room))
+    shifts, starts = 0.1 * random.normal(size=(len(counts), room)), np.abs(random.normal(size=(len(counts), room, 3)))
+    for world, count in enumerate(counts):
+        half = random.normal(size=(3 * count, 3 * count + 4))
+        delassus[world, : 3 * count, : 3 * count] = half @ half.T
+    frictions = np.full(len(counts), friction)
+    given = [torch.from_numpy(each) for each in (delassus, free, shifts, frictions, starts)]
+    numbers = torch.tensor(counts, dtype=torch.int32)
+    one, _ = coulomb_forces_of_many(numbers, *given)
+    block, missed = coulomb_forces_of_many(numbers.cuda(), *(each.cuda() for each in given))
+    assert float(missed.max()) < 1e-9
+    np.testing.assert_allclose(block.cpu().numpy(), one.numpy(), rtol=0, atol=1e-9 * float(one.abs().max()))
+
+
 def test_many_points_under_a_soft_base_are_solved_from_rest() -> None:
     """25 points that move as 12 unknowns do, made unique as a step makes them, pressed, pushed and turned: their
     equations hold, and no force is large.

@@ -6,15 +6,22 @@ Each problem has a block of threads to itself on a GPU, one thread on a CPU; wha
 
 import warp as wp
 
-from egs_warp.kernels.block import largest_of_block, sum_of_block, wait_for_block
+from egs_warp.kernels.block import wait_for_block
+from egs_warp.kernels.contact.coulomb_block import (
+    BLOCK,
+    SWEPT,
+    in_block,
+    missed_by_block,
+    speeds_by_block,
+    step_by_block,
+    sweep_by_block,
+)
 from egs_warp.kernels.contact.coulomb_equations import Contacts, Newton, rate_of, solve_equations, write_equations
 from egs_warp.kernels.vectors import on_cpu
 from egs_warp.precision import Vec3, Vec4, real
 
 wp.set_module_options({"enable_backward": False})
 
-BLOCK = 128
-"""Threads for each problem on a GPU."""
 _FEW_SWEEPS, _MORE_SWEEPS = wp.constant(3), wp.constant(20)
 """Before the first attempt, and before each further one."""
 _Rates = wp.types.vector(7, real)
@@ -25,6 +32,9 @@ rate leaves it."""
 _BOLD = wp.constant(12)
 """Whole steps of each attempt but the first."""
 _HALVINGS = wp.constant(10)
+_SWEPT = wp.constant(SWEPT)
+_LEAST = wp.constant(real(1e-5))
+"""Pivots on the diagonal of the equations, whose entries are about 1, that are larger are taken without exchange."""
 _LESS = wp.constant(real(1e-4))
 """Of a step's length: share by which it has to make the residual smaller."""
 _SHORT, _SHORTER = wp.constant(real(1e-6)), wp.constant(real(1e-4))
@@ -123,7 +133,12 @@ def sweep(contacts: Contacts, sweeps: int, forces: wp.array[real]):
 def missed(contacts: Contacts, forces: wp.array[real], scale: real, length: real, newton: Newton):
     """Value f - projection of f - rate u at ``length`` of the step from ``forces``; its largest part and its norm, both
     in m/s."""
-    for i in range(newton.lane, contacts.count, wp.block_dim()):
+    if in_block() == 1:
+        return missed_by_block(
+            contacts.delassus, contacts.friction, contacts.count, forces, newton.velocities, newton.step,
+            newton.change, scale, length, newton.values,
+        )  # fmt: skip
+    for i in range(contacts.count):
         n = 3 * i
         rate = rate_of(contacts, i, scale)
         normal = forces[n] + length * newton.step[n]
@@ -140,19 +155,14 @@ def missed(contacts: Contacts, forces: wp.array[real], scale: real, length: real
             share = radius / pull
         newton.values[n + 1] = f1 - share * first
         newton.values[n + 2] = f2 - share * second
-    wait_for_block()
     most = real(0.0)
     square = real(0.0)
-    for i in range(newton.lane, contacts.count, wp.block_dim()):
+    for i in range(contacts.count):
         rate = rate_of(contacts, i, scale)
         for t in range(3):
             speed = newton.values[3 * i + t] / rate
             most = wp.max(most, wp.abs(speed))
             square += speed * speed
-    most = largest_of_block(most)
-    square = sum_of_block(square)
-    # The next values are written once all lanes are here.
-    wait_for_block()
     # A maximum passes over what is no number, a sum does not.
     if not square < real(wp.inf):
         most = real(wp.inf)
@@ -162,21 +172,35 @@ def missed(contacts: Contacts, forces: wp.array[real], scale: real, length: real
 @wp.func
 def find_step(contacts: Contacts, forces: wp.array[real], scale: real, short: real, newton: Newton):
     """A Newton step from the values at ``forces``, and what it changes of the velocities."""
-    unknowns = write_equations(contacts, forces, scale, short, newton)
-    solve_equations(unknowns, newton)
-    for i in range(newton.lane, contacts.count, wp.block_dim()):
+    solved = int(0)
+    if in_block() == 1:
+        solved = step_by_block(
+            contacts.delassus, contacts.friction, contacts.count, forces, newton.velocities, newton.values, scale,
+            short, _LEAST, newton.step, newton.change,
+        )  # fmt: skip
+    if solved == 0:
+        unknowns = write_equations(contacts, forces, scale, short, newton)
+        solve_equations(unknowns, newton)
+    if in_block() == 1:
+        speeds_by_block(contacts.delassus, 3 * contacts.count, newton.step, newton.change)
+        return
+    for i in range(contacts.count):
         speeds = speeds_of(contacts, i, newton.step)
         for t in range(3):
             newton.change[3 * i + t] = speeds[t]
-    wait_for_block()
 
 
 @wp.func
 def find_velocities(contacts: Contacts, forces: wp.array[real], newton: Newton):
     """Those at ``forces``; no step is left."""
+    if in_block() == 1:
+        speeds_by_block(contacts.delassus, 3 * contacts.count, forces, newton.velocities)
     for i in range(newton.lane, contacts.count, wp.block_dim()):
         n = 3 * i
-        speeds = speeds_of(contacts, i, forces)
+        if in_block() == 1:
+            speeds = Vec3(newton.velocities[n], newton.velocities[n + 1], newton.velocities[n + 2])
+        else:
+            speeds = speeds_of(contacts, i, forces)
         for t in range(3):
             newton.velocities[n + t] = speeds[t] + contacts.free[n + t]
             newton.step[n + t] = real(0.0)
@@ -189,8 +213,15 @@ def find_velocities(contacts: Contacts, forces: wp.array[real], newton: Newton):
 def sweep_together(contacts: Contacts, sweeps: int, forces: wp.array[real], newton: Newton):
     """``sweep`` by a block of threads: each contact is every lane's to work out, and each lane keeps the velocities of
     some rows up with it."""
-    if wp.block_dim() == 1:
+    if in_block() == 0:
         sweep(contacts, sweeps, forces)
+        return
+    if contacts.count == 0:
+        return
+    if contacts.count <= _SWEPT:
+        sweep_by_block(
+            contacts.delassus, contacts.free, contacts.shifts, contacts.friction, contacts.count, sweeps, forces
+        )
         return
     find_velocities(contacts, forces, newton)
     size = 3 * contacts.count
@@ -263,13 +294,14 @@ def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp
             length = real(1.0)
             if attempt == 0:
                 found = int(0)
-                for _half in range(_HALVINGS):
-                    if found == 0:
-                        trial = missed(contacts, forces, scale, length, newton)
-                        if trial[1] < (real(1.0) - _LESS * length) * size[1]:
-                            found = 1
-                        else:
-                            length *= real(0.5)
+                halvings = int(0)
+                while found == 0 and halvings < _HALVINGS:
+                    trial = missed(contacts, forces, scale, length, newton)
+                    if trial[1] < (real(1.0) - _LESS * length) * size[1]:
+                        found = 1
+                    else:
+                        length *= real(0.5)
+                    halvings += 1
                 if found == 0:
                     break
             move(contacts, forces, length, newton)
@@ -303,7 +335,7 @@ def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp
     return least
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=BLOCK)
 def coulomb_kernel(
     # In:
     counts: wp.array[int],

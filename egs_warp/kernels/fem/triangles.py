@@ -7,38 +7,49 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 LARGEST = 64
-"""Rows of a triangle at most, and threads for each on a GPU."""
+"""Rows of a triangle at most."""
+SHARE = 4
+"""Threads for each of its columns on a GPU."""
+BLOCK = LARGEST * SHARE
 
 
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
-    constexpr int WIDE = {LARGEST + 1};
-    __shared__ double both[{LARGEST} * WIDE];
+    constexpr int WIDE = {LARGEST + 1}, SHARE = {SHARE};
+    __shared__ double both[{LARGEST} * WIDE], over[{LARGEST}];
     const int lane = threadIdx.x, stride = given.strides[0] / 8, apart = made.strides[0] / 8;
     const double* const from = given.data + (size_t)block * side * (stride + 1);
     double* const to = made.data + (size_t)block * side * (apart + 1);
-    for (int i = 0; i < side; ++i)
-        if (lane <= i) both[i * WIDE + lane] = from[(size_t)i * stride + lane];
+    for (int k = lane; k < side * {LARGEST}; k += blockDim.x) {{
+        const int i = k / {LARGEST}, c = k % {LARGEST};
+        if (c < i) both[i * WIDE + c] = from[(size_t)i * stride + c];
+        if (c == i) over[i] = 1.0 / from[(size_t)i * stride + i];
+    }}
     __syncthreads();
-    // A column of the inverse is a thread's: above the diagonal, turned, lies what it has found.
-    if (lane < side) {{
-        double* const own = both + lane * WIDE;
-        const double first = 1.0 / own[lane];
-        to[(size_t)lane * apart + lane] = first;
-        for (int i = 1; i < side; ++i) {{
-            if (i <= lane) continue;
-            const double* const row = both + i * WIDE;
-            double sums[4] = {{row[lane] * first, 0.0, 0.0, 0.0}};
-            int k = lane + 1;
-            for (; k + 4 <= i; k += 4) {{
-                #pragma unroll
-                for (int t = 0; t < 4; ++t) sums[t] += row[k + t] * own[k + t];
-            }}
-            for (; k < i; ++k) sums[0] += row[k] * own[k];
-            const double value = -((sums[0] + sums[1]) + (sums[2] + sums[3])) / row[i];
-            own[i] = value;
-            to[(size_t)i * apart + lane] = value;
+    // A column of the inverse is for some threads, who take turns in its sums: above the diagonal, turned, lies what
+    // they have found. All threads of a warp go through all rows.
+    const int column = lane / SHARE, part = lane % SHARE;
+    double* const own = both + column * WIDE;
+    const double first = column < side ? over[column] : 0.0;
+    if (part == 0 && column < side) to[(size_t)column * apart + column] = first;
+    for (int i = 1; i < side; ++i) {{
+        const double* const row = both + i * WIDE;
+        const bool below = i > column;
+        double sum = part == 0 && below ? row[column] * first : 0.0, other = 0.0;
+        int k = column + 1 + part;
+        for (; k + SHARE < i; k += 2 * SHARE) {{
+            sum += row[k] * own[k];
+            other += row[k + SHARE] * own[k + SHARE];
         }}
+        if (k < i) sum += row[k] * own[k];
+        sum += other;
+        #pragma unroll
+        for (int away = SHARE / 2; away > 0; away >>= 1) sum += __shfl_xor_sync(0xffffffffu, sum, away);
+        if (part == 0 && below) {{
+            own[i] = -sum * over[i];
+            to[(size_t)i * apart + column] = -sum * over[i];
+        }}
+        __syncwarp();
     }}
 #else
     const int stride = given.strides[0] / 8, apart = made.strides[0] / 8;
