@@ -23,13 +23,14 @@ from egs_warp.fem.worlds import shared
 from egs_warp.kernels.locomotion import step_program as kernels
 from egs_warp.kernels.locomotion.active_set import FOUND
 from egs_warp.kernels.locomotion.piece_search import HEADER
+from egs_warp.locomotion.contact_pieces import PieceSearch
 from egs_warp.locomotion.device_linear_step import DeviceLinearSteps, Transfers, squares_of
 from egs_warp.locomotion.device_search import SearchRoom
 from egs_warp.locomotion.linear_step import LOOKS, Prospect, StepStart, torques_of
 from egs_warp.locomotion.objectives import AnyObjective, Objective
 from egs_warp.locomotion.planner import REGULAR, WORK, Plan, StepPlanner
 from egs_warp.locomotion.step_cost import EFFORT, HORIZON
-from egs_warp.locomotion.strategies import COSTLY
+from egs_warp.locomotion.strategies import COSTLY, Foreseen, search_on
 from egs_warp.muscles.tension import MuscleTension
 from egs_warp.precision import real
 
@@ -54,7 +55,7 @@ class DevicePlanner:
     def plan(self, start: StepStart, objectives: Sequence[AnyObjective]) -> tuple[ContactResponse, Plan] | None:
         """The response that is at hand then, and the plan for what the ``objectives`` ask, on the way to whose end the
         solve's first step is; None where something is not as usual: a matrix that is not definite, an element that is
-        inverted, forces that are not found, a search that goes astray or ends where another may be better."""
+        inverted, or forces that are not found."""
         return self._room_for(start).plan(start, objectives)
 
     def plan_again(
@@ -98,13 +99,13 @@ class PlanRoom:
         self._form = zeros(m + width + 1, m + width + 1)
         self._entries, self._slope, self._energy = zeros(len(owner.factors.places)), zeros(size), zeros(1)
         # In one piece, as it comes back: what tells whether all went as usual, the answer, and forces.
-        lengths = [4, LOOKS + 2, LOOKS, 3, HEADER + m + width, width, width, size]
+        lengths = [4, LOOKS + 2, LOOKS, 3, HEADER + m + width, width, width, width, size]
         self._made, self._ends = zeros(sum(lengths)), np.cumsum(lengths)[:-1]
         self._made_here = body.stream.pinned(len(self._made))
         verdicts, self._sizes, self._missed, self._usual, *others = self._made.split(lengths)
-        self._answer, self._forces, self._speeds_after, self._end = others
+        self._answer, self._looked, self._forces, self._speeds_after, self._end = others
         self._verdicts = verdicts.view(2, 2)
-        self._x = zeros(m + width + 1)
+        self._x, self._point = zeros(m + width + 1), Upload(body.stream, m + width + 1)
         self._search = SearchRoom(m, places, str(body.factors.device))
         self._works, self._arrived = Recordings(body.stream), None
 
@@ -144,37 +145,70 @@ class PlanRoom:
     def _search_for(self, start: StepStart, objectives: Sequence[AnyObjective], base: float) -> None:
         """The program about what lies at the ``base``, its search, and the first step of the solve, for which nobody
         waits."""
-        body, room, problem = self.body, self.room, start.problem
+        body, problem = self.body, start.problem
         dt, ratio = problem.dt, 1.0 + problem.dt * problem.drag
         time = max(HORIZON * body.body.time_unit, dt)
         with body.stream:
             self._do(self._enqueue_linear, dt, ratio, time, base)
             self._ask(start, objectives)
             self._do(self._enqueue_search, dt, ratio, time)
-            self._arrived = body.stream.mark(self._arrived)
         self.owner.factors.begun()
-        # While the host looks at the plan.
-        room.begin_onward(problem, start.shift, start.friction, base=TRIED)
-        if self._arrived is not None:
-            self._arrived.synchronize()
+        self._begin_solve(start)
 
     def _parts(self) -> list[np.ndarray]:
         return np.split(self._made_here.numpy(), self._ends)
 
     def _found(self, start: StepStart, response: DeviceResponse) -> Plan | None:
-        """What the search has found; None if that is not as usual."""
-        *_, (definite, size, missed), answer, forces, speeds, velocities = self._parts()
+        """What the search has found, the host's where it goes on with that; None if anything is not as usual."""
+        *_, (definite, size, missed), answer, looked, forces, speeds, velocities = self._parts()
         ended, count, infeasible, objective, there = answer[:5]
-        usual = definite > 0.0 and np.isfinite(size) and missed <= ASTRAY and ended == FOUND and there == 1.0
-        if not usual or (start.contacts.count > 0 and objective >= COSTLY):
+        if not (definite > 0.0 and np.isfinite(size)):
+            return None
+        contacts = start.contacts.count
+        known = ended == FOUND and there == 1.0
+        if not known or (contacts > 0 and objective >= COSTLY):
+            x = answer[HEADER : HEADER + self.m + 3 * contacts]
+            first = PieceSearch(x.copy(), objective, int(count), int(infeasible)) if known else None
+            found = self._searched_on(first, looked[: 3 * contacts].reshape(-1, 3))
+            if found.x is None:
+                return None
+            count, infeasible = found.qp_count, found.infeasible
+            self._end_at(found.x, start)
+            *_, (_, size, missed), _, _, forces, speeds, velocities = self._parts()
+            answer[HEADER : HEADER + self.m] = found.x[: self.m]
+        if missed > ASTRAY or not np.isfinite(size):
             return None
         planner, room = self.owner.planner, self.room
         activations = (planner.synergies.members @ answer[HEADER : HEADER + self.m]) * planner.muscles.bounds
         tension = MuscleTension.of(planner.muscles, activations)
-        forces = forces[: 3 * start.contacts.count].reshape(-1, 3).copy()
+        forces = forces[: 3 * contacts].reshape(-1, 3).copy()
         end = response.iterate(tension, forces, float(size), speeds, velocities, None)
         room.at_base = room.coming = end
         return Plan(activations, end.velocities, end.forces, int(count), int(infeasible))
+
+    def _searched_on(self, found: PieceSearch | None, forces: np.ndarray) -> PieceSearch:
+        """By the host, after the kernel has ``found`` that from ``forces`` (n, 3) newtons on."""
+        planner, device = self.owner.planner, self.body.body.assembly.device
+        program, begun = self._search.program()
+        foreseen = Foreseen(begun, forces / planner.body.weight, np.zeros_like(forces))
+        return search_on(program, found, foreseen, qp_limit=planner.settings.qp_limit, device=device)
+
+    def _end_at(self, x: np.ndarray, start: StepStart) -> None:
+        """The end of a search that the host has made, ``x`` (m + 3n,), and the first step of the solve from there."""
+        body, problem = self.body, start.problem
+        with body.stream:
+            self._point.take(x, np.zeros(len(self._x) - 1 - len(x)), np.ones(1))
+            self._x.copy_(self._point.there)
+            self._do(self._enqueue_end, problem.dt, 1.0 + problem.dt * problem.drag)
+        self._begin_solve(start)
+
+    def _begin_solve(self, start: StepStart) -> None:
+        """Wait for the plan, while its solve begins."""
+        with self.body.stream:
+            self._arrived = self.body.stream.mark(self._arrived)
+        self.room.begin_onward(start.problem, start.shift, start.friction, base=TRIED)
+        if self._arrived is not None:
+            self._arrived.synchronize()
 
     def _do(self, work: Callable[..., None], *given: float) -> None:
         self._works.run((work.__name__, *given), lambda: work(*given))
@@ -266,8 +300,9 @@ class PlanRoom:
 
     def _enqueue_search(self, dt: float, ratio: float, time: float) -> None:
         """The program, its search, and the step's equation at the end that it expects."""
-        body, room, owner, planner = self.body, self.room, self.owner, self.owner.planner
+        body, room, planner = self.body, self.room, self.owner.planner
         width, laws = 3 * room.places, room.coulomb
+        self._looked.copy_(room.wanted)
         self._enqueue_cost(dt, time)
         target = body.body.assembly.device
         wp.launch(
@@ -291,10 +326,15 @@ class PlanRoom:
             device=target,
         )
         self._answer.copy_(wp.to_torch(self._search.answer))
+        self._enqueue_end(dt, ratio)
+
+    def _enqueue_end(self, dt: float, ratio: float) -> None:
+        """What contact makes of the point that was found, and the step's equation there."""
+        body, room, owner = self.body, self.room, self.owner
         activations = self._x[: self.m]
         moved = torch.addmv(self._speeds[:, -1], self._speeds[:, : self.m], activations)
         torch.mul(self._x[self.m : -1], body.body.weight, out=room.wanted)
-        laws.enqueue_forces(moved, room.wanted, self._usual[2:])
+        room.coulomb.enqueue_forces(moved, room.wanted, self._usual[2:])
         torch.mul(room.wanted, 1.0 / body.body.weight, out=self._x[self.m : -1])
         velocities, _, _, forces = room.parts(room.begun)
         torch.mv(self._velocities, self._x, out=velocities)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Any
 
@@ -93,6 +94,17 @@ class SearchRoom:
     def enqueue(self) -> None:
         """The search, with nothing that waits."""
         self._launch.launch()
+
+    def program(self) -> tuple[ContactPieces, np.ndarray]:
+        """What was told, and the activations (m,) of the start."""
+        told = self.told.numpy()
+        m, n = int(told[0]), int(told[1])
+        size = m + 3 * n
+        shapes = (size, size), (size,), (3 * n, size), (3 * n,), (m,), (m,), (m,)
+        ends = np.cumsum([math.prod(shape) for shape in shapes])
+        parts = np.split(told[kernels.HEADER : kernels.HEADER + ends[-1]], ends[:-1])
+        P, q, rows, offset, *bounds, start = (each.reshape(shape) for each, shape in zip(parts, shapes, strict=True))
+        return ContactPieces(P, q, float(told[3]), rows, offset, float(told[2]), *bounds), start
 
     def search(
         self, program: ContactPieces, start: np.ndarray, modes: ContactModes, qp_limit: int

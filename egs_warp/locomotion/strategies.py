@@ -199,9 +199,7 @@ def search_program(
     if strategy is Strategy.PIECES:
         start = np.concatenate([foreseen.activations, foreseen.forces.ravel()])
         found = _searched_from(program, start, foreseen.forces, qp_limit=qp_limit, solver=solver, device=device)
-        if found.objective < COSTLY or program.contacts == 0:
-            return found
-        return _searched_elsewhere(program, found, foreseen.forces, qp_limit=qp_limit, solver=solver, device=device)
+        return _searched_on(program, found, foreseen.forces, qp_limit=qp_limit, solver=solver, device=device)
     paired = ContactProgram.of(program, directions)
     predicted = states_from_prediction(
         foreseen.forces[:, 0], foreseen.forces[:, 1:], foreseen.velocities[:, 1:], program.friction, directions
@@ -211,6 +209,33 @@ def search_program(
     )
     x = None if found.y is None else paired.forces_of(found.y)
     return PieceSearch(x, found.objective, found.qp_count, found.infeasible)
+
+
+def search_on(
+    program: ContactPieces, found: PieceSearch | None, foreseen: Foreseen, *, qp_limit: int, device: Device = None
+) -> PieceSearch:
+    """``search_program`` by ``PIECES`` and ``ADMM`` after its first search, which has ``found`` that, or was led
+    astray."""
+    if found is None:
+        start = np.concatenate([foreseen.activations, foreseen.forces.ravel()])
+        modes = ContactModes.of(foreseen.forces, program.friction)
+        found = search_pieces(program, start, modes, qp_limit=qp_limit, solver=QpSolver.OSQP)
+    return _searched_on(program, found, foreseen.forces, qp_limit=qp_limit, solver=QpSolver.ADMM, device=device)
+
+
+def _searched_on(
+    program: ContactPieces,
+    found: PieceSearch,
+    forces: np.ndarray,
+    *,
+    qp_limit: int,
+    solver: QpSolver | str,
+    device: Device,
+) -> PieceSearch:
+    """``found``, or better if that costs so much that it is doubted."""
+    if found.objective < COSTLY or program.contacts == 0:
+        return found
+    return _searched_elsewhere(program, found, forces, qp_limit=qp_limit, solver=solver, device=device)
 
 
 def _searched_from(
@@ -228,6 +253,7 @@ def _searched_from(
         found = search_at_once(program, start, modes, qp_limit=qp_limit, device=wp.get_device(device))
         if found is not None:
             return found
+        solver = QpSolver.OSQP
     return search_pieces(program, start, modes, qp_limit=qp_limit, solver=solver, device=device)
 
 
@@ -242,7 +268,9 @@ def _searched_elsewhere(
 ) -> PieceSearch:
     """The better of ``found`` and of a search from where the optimum without complementarity would end up under true
     contact; ``forces`` (n, 3) are a guess."""
-    relaxed = solve_relaxed(program, solver, device=device)
+    # Thousands of iterations, one after the other, are not for a GPU.
+    bound_by = QpSolver.OSQP if QpSolver(solver) is QpSolver.ADMM else solver
+    relaxed = solve_relaxed(program, bound_by, device=device)
     found = replace(found, qp_count=found.qp_count + 1)
     if relaxed is None or found.objective <= DOUBTFUL * relaxed[1]:
         return found

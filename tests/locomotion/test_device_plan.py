@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ from egs_warp.contact.device_response import DeviceIterate
 from egs_warp.contact.device_room import ContactRoom
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import StepProblem
-from egs_warp.locomotion import device_plan
+from egs_warp.locomotion import device_plan, strategies
+from egs_warp.locomotion.contact_pieces import ContactPieces, PieceSearch
 from egs_warp.locomotion.device_plan import DevicePlanner
-from egs_warp.locomotion.linear_step import StepStart
+from egs_warp.locomotion.linear_step import Prospect, StepStart
 from egs_warp.locomotion.objectives import (
     AnyObjective,
     LoadObjective,
@@ -26,6 +28,7 @@ from egs_warp.locomotion.objectives import (
 from egs_warp.locomotion.planner import StageClock
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory
+from egs_warp.locomotion.strategies import search_on
 from egs_warp.muscles.tension import MuscleTension
 from egs_warp.pipelines.creature import Creature
 from tests.support.creatures import coarse_pawn
@@ -145,20 +148,68 @@ def test_the_solve_goes_on_from_the_plan_s_end(
     np.testing.assert_allclose(beyond.seen.torque, ahead.seen.torque, rtol=1e-6)
 
 
-@pytest.mark.parametrize("what", ["costly", "astray", "forces"])
-def test_what_is_not_as_usual_is_left_to_the_host(
+@pytest.mark.parametrize("further", [False, True])
+def test_what_is_asked_again_is_the_host_s(creature: Creature, stepper: LocomotionStepper, further: bool) -> None:
+    """About the end of a Newton step, where the device is, or has been: it is on its way ``further``. What it has left
+    behind is the host's to plan."""
+    memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
+    start = begun(stepper, creature.start, memory)
+    found = planner_of(stepper).plan(start, objectives)
+    assert found is not None
+    response, plan = found
+    tension = MuscleTension.of(stepper.muscles, plan.activations)
+    _, _, end = response.at(tension, plan.velocities, plan.forces).onward(start.shift, start.friction, further=further)
+    prospect = Prospect(response, start.shift, plan.activations, end.velocities, end.forces)
+    again = planner_of(stepper).plan_again(prospect, memory.activations, objectives, start.friction)
+    assert again is not None
+    expected = stepper.planner.plan(prospect, memory.activations, objectives, StageClock())
+    assert again.qp_count == expected.qp_count
+    np.testing.assert_allclose(again.activations, expected.activations, rtol=0, atol=1e-7 * stepper.body.height)
+    np.testing.assert_allclose(again.velocities, expected.velocities, rtol=0, atol=1e-7 * stepper.body.speed_unit)
+    np.testing.assert_allclose(again.forces, expected.forces, rtol=0, atol=1e-6 * stepper.body.weight)
+    assert planner_of(stepper).plan_again(prospect, memory.activations, objectives, start.friction) is None
+
+
+@pytest.mark.parametrize("what", ["costly", "astray"])
+def test_the_host_goes_on_with_a_search(
     what: str, creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An end that costs too much, a search that goes astray, forces that miss their laws: the step is the host's."""
+    """That was led astray, or whose end costs so much that another may be better: from the program on the device, to
+    the host's plan, at whose end the solve begins."""
+    memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
+    start = begun(stepper, creature.start, memory)
+    searched: list[PieceSearch | None] = []
+
+    def searched_on(program: ContactPieces, found: PieceSearch | None, *given: Any, **named: Any) -> PieceSearch:
+        searched.append(found)
+        return search_on(program, found, *given, **named)
+
+    monkeypatch.setattr(device_plan, "search_on", searched_on)
+    if what == "costly":
+        monkeypatch.setattr(device_plan, "COSTLY", 0.0)
+        monkeypatch.setattr(strategies, "COSTLY", 0.0)
+    else:
+        monkeypatch.setattr(device_plan, "FOUND", -1)
+        monkeypatch.setattr(strategies, "search_at_once", lambda *_, **__: None)
+    assert is_the_host_s(stepper, start, memory, objectives)
+    assert len(searched) == 1 and (searched[0] is None) == (what == "astray")
+    found = planner_of(stepper).plan(start, objectives)
+    assert found is not None
+    forces, missed, ahead = (
+        found[0]
+        .at(MuscleTension.of(stepper.muscles, found[1].activations), found[1].velocities, found[1].forces)
+        .onward(start.shift, start.friction)
+    )
+    assert missed < 1e-9 and ahead.feasible and forces.shape == found[1].forces.shape
+
+
+def test_forces_that_miss_their_laws_are_left_to_the_host(
+    creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
+) -> None:
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
     start = begun(stepper, creature.start, memory)
     assert planner_of(stepper).plan(start, objectives) is not None
-    if what == "costly":
-        monkeypatch.setattr(device_plan, "COSTLY", 0.0)
-    elif what == "astray":
-        monkeypatch.setattr(device_plan, "FOUND", -1)
-    else:
-        monkeypatch.setattr(device_plan, "ASTRAY", -1.0)
+    monkeypatch.setattr(device_plan, "ASTRAY", -1.0)
     assert planner_of(stepper).plan(start, objectives) is None
     end, _, reports = stepper.advance(creature.start, memory, objectives, DT)
     stepper._at_once = None
