@@ -350,6 +350,11 @@ class _Spare(threading.local):
 _spare = _Spare()
 
 
+def by_steps(count: int, step: int) -> int:
+    """The least multiple of ``step`` that is at least ``count``, and 1."""
+    return -(-max(count, 1) // step) * step
+
+
 def with_room(count: int) -> int:
     """At least ``count``, at most a quarter more: counts that differ a little then ask for arrays of one size."""
     step = 1 << max(count.bit_length() - 3, 0)

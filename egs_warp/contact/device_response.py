@@ -8,12 +8,14 @@ import numpy as np
 
 from egs_warp.contact.coulomb import ASTRAY
 from egs_warp.contact.detection import ContactSet
-from egs_warp.contact.device_room import KEPT, TRIED, BodyRoom, ContactRoom
+from egs_warp.contact.device_body import BodyRoom
+from egs_warp.contact.device_room import KEPT, TRIED, ContactRoom, Tried
 from egs_warp.contact.device_sight import DeviceSight
 from egs_warp.contact.response import ContactResponse, Iterate, Seen
 from egs_warp.fem.body import SoftBody
 from egs_warp.fem.dense_factors import DenseFactors
 from egs_warp.fem.step_problem import Tangent
+from egs_warp.launching import by_steps
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleTension
 
@@ -63,7 +65,7 @@ class DeviceResponder(BodyRoom):
 
     def room_for(self, contacts: ContactSet) -> ContactRoom:
         """Memory for them."""
-        places = -(-max(contacts.count, 1) // _PLACES) * _PLACES
+        places = by_steps(contacts.count, _PLACES)
         if places not in self._rooms:
             self._rooms[places] = ContactRoom(self, places)
         return self._rooms[places]
@@ -90,19 +92,23 @@ class DeviceResponse(ContactResponse):
 
     def at(self, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray) -> DeviceIterate:
         """See ``ContactResponse``."""
-        assert self.owner.at_hand is self
-        room = self.room
-        for known in (room.at_trial, room.coming):
+        for known in (self.room.at_trial, self.room.coming):
             if known is not None and known.is_at(self, tension, velocities, forces):
                 return known
+        return self.begun_at(tension, velocities, forces)
+
+    def begun_at(self, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray) -> DeviceIterate:
+        """``at``, where the room's last trial is then."""
+        assert self.owner.at_hand is self
+        room = self.room
         found = room.begin(self.tangent.problem, tension, velocities, forces)
         room.at_base, room.at_trial, room.coming = None, self.made(tension, forces, found), None
         return room.at_trial
 
-    def made(self, tension: MuscleTension | None, forces: np.ndarray, found: tuple[np.ndarray, ...]) -> DeviceIterate:
+    def made(self, tension: MuscleTension | None, forces: np.ndarray, found: Tried) -> DeviceIterate:
         """Of what the room has ``found``."""
-        size, speeds, velocities, _, _, seen = found
-        return self.iterate(tension, forces, float(size[0]), speeds, velocities, Seen.of(seen))
+        seen = Seen.of(found.seen) if self.owner.looked_at is self.tangent.problem else None
+        return self.iterate(tension, forces, float(found.size[0]), found.speeds, found.velocities, seen)
 
     def iterate(
         self,
@@ -151,6 +157,7 @@ class DeviceIterate:
     def toward(self, forces: np.ndarray, length: float = 1.0) -> DeviceIterate:
         """See ``Iterate``."""
         room, problem = self.response.room, self.response.tangent.problem
+        assert self.response.owner.at_hand is self.response
         found = room.go(problem, length=length, push=True, wanted=forces, base=self._base())
         told = forces if length == 1.0 else self.forces + length * (forces - self.forces)
         room.at_base, room.at_trial, room.coming = self, self.response.made(self.tension, told, found), None
@@ -160,7 +167,10 @@ class DeviceIterate:
         """See ``Iterate``."""
         room, count, problem = self.response.room, self.response.contacts.count, self.response.tangent.problem
         number = room.slot
-        if room.coming is not self:
+        assert self.response.owner.at_hand is self.response
+        if room.coming is self:
+            assert room.coulomb.knows(shift, friction)
+        else:
             base = self._base()
             if base == KEPT and room.at_trial is not None:
                 # The speeds are the trial's.
@@ -170,7 +180,7 @@ class DeviceIterate:
             # The device goes on while the host looks at what has come.
             room.begin_onward(problem, shift, friction, base=TRIED)
         found = room.arrived(number)
-        missed, forces = float(found[3][0]), found[4][: 3 * count].reshape(-1, 3).copy()
+        missed, forces = float(found.missed[0]), found.forces[: 3 * count].reshape(-1, 3).copy()
         trial = self.response.made(self.tension, forces, found)
         if further:
             room.at_base, room.at_trial, room.coming = trial, None, trial
@@ -185,7 +195,7 @@ class DeviceIterate:
         """See ``Iterate``."""
         assert isinstance(response, DeviceResponse) and response.room is self.response.room
         room = response.room
-        _, speeds, *_ = room.again(base=self._base())
+        speeds = room.again(base=self._base()).speeds
         room.at_trial = room.coming = None
         room.at_base = replace(self, response=response, speeds=speeds[: len(self.speeds)].copy())
         return room.at_base
@@ -196,7 +206,6 @@ class DeviceIterate:
         if self is room.at_base:
             return KEPT
         if self is not room.at_trial:
-            assert self.response.owner.at_hand is self.response
             room.begin(self.response.tangent.problem, self.tension, self.velocities, self.forces)
             room.at_base, room.at_trial = None, self
         return TRIED

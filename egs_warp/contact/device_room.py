@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import warp as wp
 
 from egs_warp.contact.detection import ContactSet
+from egs_warp.contact.device_body import BodyRoom, vectors
 from egs_warp.contact.device_coulomb import CoulombRoom
-from egs_warp.contact.device_sight import DeviceSight
-from egs_warp.fem.body import SoftBody
-from egs_warp.fem.dense_factors import DenseFactors
-from egs_warp.fem.element_kernels import ElementKernels
 from egs_warp.fem.graphs import Recordings, Upload
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.fem.worlds import shared
 from egs_warp.kernels.contact import batch_contacts as of_worlds
 from egs_warp.kernels.contact import iterate as kernels
-from egs_warp.kernels.contact import step_start as of_start
-from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleTension
 from egs_warp.precision import Mat33, Vec3, Vec4, real
 
@@ -29,73 +24,21 @@ KEPT, TRIED, BEGUN = 0.0, 1.0, 2.0
 """Where a trial begins: at the base as it is, at the last trial, or at what was told."""
 
 
-class BodyRoom:
-    """Of one body with dense ``factors``, where its elements are: a step's start, and what keeps its momentum."""
+class Tried(NamedTuple):
+    """What is asked of a trial, in memory that the next but one takes."""
 
-    def __init__(self, factors: DenseFactors, body: SoftBody, muscles: MuscleSet, sight: DeviceSight) -> None:
-        self.factors, self.body, self.stream, self.sight = factors, body, factors.stream, sight
-        elements = body.assembly.elements
-        assert isinstance(elements, ElementKernels)
-        self.elements = elements
-        size = 3 * len(body.mesh.nodes)
-        self.turned, self.keeping = self.zeros(size, 3), self.zeros(3, size)
-        """What a solution lacks of a turn is ``turned`` times ``keeping`` times what it is the solution of."""
-        self.masses = self.tensor(body.node_mass)
-        self._start = Upload(self.stream, 2 * size)
-        self.positions, self.velocities = self._start.there.split(size)
-        self.arms, self.start, self.ballistic = self.zeros(3, size)
-        self.turns, self.rates = self.zeros(size, 3), self.zeros(1, 3, 3)
-        """See ``StepProblem``; ``ballistic`` is where the nodes would end without forces, metres."""
-        self._gravity = self.tensor(np.tile(body.gravity, len(body.mesh.nodes)))
-        self._works = Recordings(self.stream)
-        self.no_tensions = wp.zeros(0, dtype=real, device=body.assembly.device)
-        self.gradients = wp.zeros(len(body.mesh.tets), dtype=Mat33, device=body.assembly.device)
-        self.lines = elements.muscle_lines(MuscleTension.of(muscles, np.zeros(muscles.segment_count)))
-        self.segment_count = muscles.segment_count
-        self._problem: StepProblem | None = None
-
-    def zeros(self, *shape: int) -> torch.Tensor:
-        """On the device."""
-        return torch.zeros(shape, dtype=torch.float64, device=self.factors.device)
-
-    def tensor(self, values: np.ndarray) -> torch.Tensor:
-        """On the device."""
-        return torch.as_tensor(np.ascontiguousarray(values, dtype=np.float64), device=self.factors.device)
-
-    def take(self, problem: StepProblem) -> None:
-        """The step that begins there."""
-        if self._problem is problem:
-            return
-        self._problem = problem
-        self._start.write(problem.state.positions, problem.state.velocities)
-        self._works.run(problem.dt, lambda: self._enqueue_start(problem.dt))
-
-    def _enqueue_start(self, dt: float) -> None:
-        self._start.send()
-        device = self.body.assembly.device
-        lanes = 1 if device.is_cpu else of_start.BLOCK
-        wp.launch(
-            of_start.step_start_kernel,
-            lanes,
-            inputs=[dt, shared(self.masses, real), vectors(self.positions), vectors(self.velocities)],
-            outputs=[vectors(self.arms), shared(self.turns, real), shared(self.rates, Mat33), vectors(self.start)],
-            device=device,
-            block_dim=lanes,
-        )
-        self.elements.enqueue_start(vectors(self.positions), self.gradients)
-        torch.add(self.velocities, self._gravity, alpha=dt, out=self.ballistic)
-        self.ballistic.mul_(dt).add_(self.positions)
-
-    def choose(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet:
-        """Contacts of a step that begins there, see ``DeviceSight``."""
-        with self.stream:
-            self.take(problem)
-        ends = vectors(self.ballistic)
-        return self.sight.choose(vectors(self.positions), ends, before, loaded, problem.state.positions)
-
-    def enqueue_gradient(self, ends: wp.array, dt: float, tensions: wp.array, gradient: wp.array) -> None:
-        """Into ``gradient``, newtons, at the positions ``ends``, under ``tensions`` of the muscles."""
-        self.elements.enqueue_gradient(ends, self.gradients, dt, self.lines, tensions, gradient)
+    size: np.ndarray
+    """(1,) N s that the step's equation misses; not finite where an element is inverted."""
+    speeds: np.ndarray
+    """(3K,) m/s of the contacts after a Newton step from there without their forces."""
+    velocities: np.ndarray
+    """(3N,) m/s."""
+    missed: np.ndarray
+    """(1,) m/s by which the forces that were found last miss their laws."""
+    forces: np.ndarray
+    """(3K,) newtons, these."""
+    seen: np.ndarray
+    """(5,), see ``Seen``."""
 
 
 class ContactRoom:
@@ -131,8 +74,6 @@ class ContactRoom:
         """Where what was asked for last comes; one more may be on its way."""
         self.size, self.speeds_after, self.velocities, self.missed, self._found, seen = self._asked.split(parts)
         self._seen, self._torque_seen = seen.split([2, 3])
-        """Of a trial, N s, m/s; the speeds are the contacts' after a Newton step without their forces. By how much the
-        forces that were found last miss their laws, m/s."""
         self._answer_ends = np.cumsum(parts)[:-1]
         self.coulomb = CoulombRoom(owner.stream, places, count)
         self._begun = Upload(owner.stream, 3 * size + width + owner.segment_count)
@@ -209,8 +150,8 @@ class ContactRoom:
             self.take(contacts)
             self.begin_at(tension, velocities, forces)
         self._tell(0.0, False, forces, BEGUN)
-        size, _, ahead, *_ = self._ask(self._enqueue_ahead, problem.dt, 1.0 + problem.dt * problem.drag)
-        return float(size[0]), ahead
+        found = self._ask(self._enqueue_ahead, problem.dt, 1.0 + problem.dt * problem.drag)
+        return float(found.size[0]), found.velocities
 
     def _do(self, work: Callable[..., None], *given: Any) -> None:
         self._works.run((work.__name__, *given), lambda: work(*given))
@@ -249,8 +190,8 @@ class ContactRoom:
 
     def begin(
         self, problem: StepProblem, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray
-    ) -> tuple[np.ndarray, ...]:
-        """As ``go``, at the very ``velocities`` (N, 3) and ``forces`` (n, 3), under ``tension``."""
+    ) -> Tried:
+        """A trial at the very ``velocities`` (N, 3) and ``forces`` (n, 3), under ``tension``."""
         with self.owner.stream:
             self.begin_at(tension, velocities, forces)
         return self.go(problem, length=0.0, push=False, wanted=forces, base=BEGUN)
@@ -261,11 +202,8 @@ class ContactRoom:
         told = [] if tension is None else [tension.tensions]
         self._begun.take(velocities, velocities, np.zeros(velocities.size), forces, more, *told)
 
-    def go(
-        self, problem: StepProblem, *, length: float, push: bool, wanted: np.ndarray, base: float
-    ) -> tuple[np.ndarray, ...]:
-        """A trial from the ``base`` (``KEPT``, ``TRIED`` or ``BEGUN``): its size, the contacts' speeds after its
-        Newton step, its velocities."""
+    def go(self, problem: StepProblem, *, length: float, push: bool, wanted: np.ndarray, base: float) -> Tried:
+        """A trial from the ``base`` (``KEPT``, ``TRIED`` or ``BEGUN``)."""
         self._tell(length, push, wanted, base)
         return self._ask(self._enqueue_trial, problem.dt, 1.0 + problem.dt * problem.drag)
 
@@ -280,8 +218,8 @@ class ContactRoom:
             self._arrivals[self.slot] = self.owner.stream.mark(self._arrivals[self.slot])
         return self.slot
 
-    def arrived(self, number: int) -> tuple[np.ndarray, ...]:
-        """As ``go``, by how much the forces miss their laws, these (3K,), and what was seen."""
+    def arrived(self, number: int) -> Tried:
+        """What has come of ``begin_onward``."""
         if self._arrivals[number] is not None:
             self._arrivals[number].synchronize()
         return self._answer(number)
@@ -310,20 +248,20 @@ class ContactRoom:
         told[:3], told[3:] = (length, float(push), base), 0.0
         told[3 : 3 + wanted.size] = wanted.ravel()
 
-    def again(self, *, base: float) -> tuple[np.ndarray, ...]:
-        """The ``base`` by the response at hand: no number, the contacts' speeds, no numbers."""
+    def again(self, *, base: float) -> Tried:
+        """The speeds at the ``base`` by the response at hand; the rest is another trial's."""
         self._told.here[2] = base
         return self._ask(self._enqueue_again)
 
-    def _ask(self, work: Callable[..., None], *given: float) -> tuple[np.ndarray, ...]:
+    def _ask(self, work: Callable[..., None], *given: float) -> Tried:
         with self.owner.stream:
             self._do(work, *given)
             self.owner.stream.wait()
         return self._answer(0)
 
-    def _answer(self, slot: int) -> tuple[np.ndarray, ...]:
-        """What has come of what was asked of a trial: see ``go``."""
-        return tuple(np.split(self._asked_here[slot].numpy(), self._answer_ends))
+    def _answer(self, slot: int) -> Tried:
+        """What has come of what was asked of a trial."""
+        return Tried(*np.split(self._asked_here[slot].numpy(), self._answer_ends))
 
     def _enqueue_base(self) -> None:
         self._launch(
@@ -429,8 +367,3 @@ class ContactRoom:
             ],
             [vectors(free), vectors(self._rest)],
         )
-
-
-def vectors(flat: torch.Tensor) -> wp.array:
-    """(N, 3) of a ``flat`` one (3N,)."""
-    return shared(flat.view(-1, 3), Vec3)

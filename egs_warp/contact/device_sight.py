@@ -12,6 +12,7 @@ from egs_warp.contact.points import ContactPoints
 from egs_warp.fem.graphs import GraphStream, Recordings, Upload
 from egs_warp.fem.worlds import shared
 from egs_warp.kernels.contact import sight as kernels
+from egs_warp.launching import by_steps
 from egs_warp.precision import Vec4, real
 
 _KNOWN = 64
@@ -41,7 +42,7 @@ class DeviceSight:
     ) -> ContactSet:
         """The contacts of a step from ``positions`` (N,), on the host ``start`` (N, 3), which may end at ``ends`` (N,):
         ``ContactPoints.choose`` after the points ``before`` (m,), of which those ``loaded`` (m,) bool pressed."""
-        places = -(-max(len(before), 1) // _KNOWN) * _KNOWN
+        places = by_steps(len(before), _KNOWN)
         if places not in self._rooms:
             self._rooms[places] = _Room(self._stream, places, self._points.cell_count)
         room = self._rooms[places]

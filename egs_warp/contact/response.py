@@ -137,7 +137,7 @@ class Seen:
     least_gap: float
     """Metres, of all points."""
     torque: np.ndarray
-    """(3,) N m of what is internal, minus that of its forces."""
+    """(3,) N m about the centre of mass of the internal gradient at the end."""
 
     @classmethod
     def of(cls, found: np.ndarray) -> Seen:

@@ -11,8 +11,9 @@ import torch
 import warp as wp
 
 from egs_warp.contact.detection import ContactSet
+from egs_warp.contact.device_body import vectors
 from egs_warp.contact.device_response import DeviceResponder, DeviceResponse
-from egs_warp.contact.device_room import ContactRoom, vectors
+from egs_warp.contact.device_room import ContactRoom
 from egs_warp.fem.graphs import GraphStream, Recordings, Upload
 from egs_warp.fem.worlds import shared
 from egs_warp.locomotion.linear_step import LinearStep, Prospect, torques_of
@@ -141,7 +142,7 @@ class DeviceLinearSteps:
         room, dt = response.room, response.tangent.problem.dt
         width = 3 * response.contacts.count
         # Without muscles and contact.
-        response.at(None, prospect.velocities, prospect.forces)
+        response.begun_at(None, prospect.velocities, prospect.forces)
         with owner.stream:
             velocities, speeds = self._room_for(3 * len(prospect.velocities), 3 * room.places, m + width + 1)
 

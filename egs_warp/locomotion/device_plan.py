@@ -13,8 +13,9 @@ import torch
 import warp as wp
 
 from egs_warp.contact.coulomb import ASTRAY
+from egs_warp.contact.device_body import vectors
 from egs_warp.contact.device_response import DeviceResponder, DeviceResponse
-from egs_warp.contact.device_room import BEGUN, KEPT, TRIED, ContactRoom, vectors
+from egs_warp.contact.device_room import BEGUN, KEPT, TRIED, ContactRoom
 from egs_warp.contact.response import ContactResponse
 from egs_warp.fem.dense_factors import DenseFactors
 from egs_warp.fem.graphs import Recordings, Upload
@@ -30,7 +31,7 @@ from egs_warp.locomotion.linear_step import LOOKS, Prospect, StepStart, torques_
 from egs_warp.locomotion.objectives import AnyObjective, Objective
 from egs_warp.locomotion.planner import REGULAR, WORK, Plan, StepPlanner
 from egs_warp.locomotion.step_cost import EFFORT, HORIZON
-from egs_warp.locomotion.strategies import COSTLY, Foreseen, search_on
+from egs_warp.locomotion.strategies import Foreseen, is_doubted, search_on
 from egs_warp.muscles.tension import MuscleTension
 from egs_warp.precision import real
 
@@ -162,13 +163,12 @@ class PlanRoom:
         """What the search has found, the host's where it goes on with that; None if anything is not as usual."""
         *_, (definite, size, missed), answer, looked, forces, speeds, velocities = self._parts()
         ended, count, infeasible, objective, there = answer[:5]
-        if not (definite > 0.0 and np.isfinite(size)):
+        if not definite > 0.0:
             return None
         contacts = start.contacts.count
-        known = ended == FOUND and there == 1.0
-        if not known or (contacts > 0 and objective >= COSTLY):
-            x = answer[HEADER : HEADER + self.m + 3 * contacts]
-            first = PieceSearch(x.copy(), objective, int(count), int(infeasible)) if known else None
+        if ended != FOUND or there != 1.0 or is_doubted(objective, contacts):
+            x = answer[HEADER : HEADER + self.m + 3 * contacts].copy() if there == 1.0 else None
+            first = PieceSearch(x, objective, int(count), int(infeasible)) if ended == FOUND else None
             found = self._searched_on(first, looked[: 3 * contacts].reshape(-1, 3))
             if found.x is None:
                 return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from egs_warp.kernels.locomotion import piece_search as kernels
 from egs_warp.kernels.locomotion.active_set import ASTRAY
 from egs_warp.kernels.locomotion.block_active_set import Holding, UnitRows
 from egs_warp.kernels.locomotion.block_splitting import Splitting
-from egs_warp.launching import Mirror, kept_by_thread
+from egs_warp.launching import Mirror, by_steps, kept_by_thread
 from egs_warp.locomotion.contact_pieces import ContactModes, ContactPieces, PieceSearch
 from egs_warp.precision import real
 
@@ -25,7 +25,7 @@ def search_at_once(
     program: ContactPieces, start: np.ndarray, modes: ContactModes, *, qp_limit: int, device: wp.Device
 ) -> PieceSearch | None:
     """``search_pieces`` on the ``device``; None where rounding leads astray."""
-    places = -(-max(program.contacts, 1) // _PLACES) * _PLACES
+    places = by_steps(program.contacts, _PLACES)
     return _room(program.activations, places, device.alias).search(program, start, modes, qp_limit)
 
 
@@ -38,12 +38,6 @@ class SearchRoom:
         zeros = partial(wp.zeros, device=self._device)
         self.told = zeros(kernels.HEADER + size * size + size + 3 * n * (size + 1) + 3 * m + 3 * n, dtype=real)
         self.answer = zeros(kernels.HEADER + size, dtype=real)
-        self._answer_here = Mirror(self.answer)
-        # What is read is what was told for this search: the launch before has ended, since its answer was looked at.
-        self._told_here = self.told
-        if not self._device.is_cpu:
-            self._told_here = wp.zeros(self.told.shape, dtype=real, device="cpu", pinned=True)
-        self._given = self._told_here.numpy()
         further, forces, answers = 9 * n, 3 * n, 5 * n
         total = m + further
         room, rows, holding, splitting = kernels.Room(), UnitRows(), Holding(), Splitting()
@@ -91,6 +85,16 @@ class SearchRoom:
             record_cmd=True,
         )
 
+    @cached_property
+    def _told_here(self) -> wp.array:
+        """What goes there. What is read is what was told for this search: the launch before has ended, since its answer
+        was looked at."""
+        return self.told if self._device.is_cpu else wp.zeros(self.told.shape, real, "cpu", pinned=True)
+
+    @cached_property
+    def _answer_here(self) -> Mirror:
+        return Mirror(self.answer)
+
     def enqueue(self) -> None:
         """The search, with nothing that waits."""
         self._launch.launch()
@@ -111,7 +115,7 @@ class SearchRoom:
     ) -> PieceSearch | None:
         """See ``search_at_once``."""
         m, n, at = program.activations, program.contacts, kernels.HEADER
-        given = self._given
+        given = self._told_here.numpy()
         given[:at] = m, n, program.friction, program.constant, qp_limit, 0, 0, 0
         for part in (
             *(program.P, program.q, program.rows, program.offset, program.lower, program.upper),

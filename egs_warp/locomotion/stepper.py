@@ -120,12 +120,15 @@ class LocomotionStepper:
             factors_on(body.assembly.device, body.assembly.upper_pattern),
             linear_steps_by(self.solver.respond, muscles, synergies),
         )
+        # By this planner.
         self._at_once = _device_planner(self.planner, self.solver.respond)
 
     def with_friction(self, friction: float) -> LocomotionStepper:
         """The same on ground of another Coulomb coefficient, for nothing: it shares what this one works with, so the
         two are for one thread."""
-        other = copy(self)
+        # Not by ``copy``, which makes one anew.
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
         other.geometry = replace(self.geometry, friction=friction)
         other.detector = copy(self.detector)
         other.detector.geometry = other.geometry

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -211,6 +212,11 @@ def search_program(
     return PieceSearch(x, found.objective, found.qp_count, found.infeasible)
 
 
+def is_doubted(objective: float, contacts: int) -> bool:
+    """Whether an end of a step may have a better one elsewhere."""
+    return contacts > 0 and not objective < COSTLY
+
+
 def search_on(
     program: ContactPieces, found: PieceSearch | None, foreseen: Foreseen, *, qp_limit: int, device: Device = None
 ) -> PieceSearch:
@@ -218,8 +224,8 @@ def search_on(
     astray."""
     if found is None:
         start = np.concatenate([foreseen.activations, foreseen.forces.ravel()])
-        modes = ContactModes.of(foreseen.forces, program.friction)
-        found = search_pieces(program, start, modes, qp_limit=qp_limit, solver=QpSolver.OSQP)
+        given: Any = {"qp_limit": qp_limit, "solver": QpSolver.OSQP, "device": device}
+        found = _searched_from(program, start, foreseen.forces, **given)
     return _searched_on(program, found, foreseen.forces, qp_limit=qp_limit, solver=QpSolver.ADMM, device=device)
 
 
@@ -233,7 +239,7 @@ def _searched_on(
     device: Device,
 ) -> PieceSearch:
     """``found``, or better if that costs so much that it is doubted."""
-    if found.objective < COSTLY or program.contacts == 0:
+    if not is_doubted(found.objective, program.contacts):
         return found
     return _searched_elsewhere(program, found, forces, qp_limit=qp_limit, solver=solver, device=device)
 

@@ -118,7 +118,10 @@ def test_what_is_at_hand_no_more_is_told_again(
         np.testing.assert_allclose(one[0], other[0], rtol=0, atol=1e-10)
         assert_alike(one[2], other[2])
     respond(tangent, contacts)
-    with pytest.raises(AssertionError):
-        second.toward(forces)
+    for left in (first, second):
+        with pytest.raises(AssertionError):
+            left.toward(forces)
+        with pytest.raises(AssertionError):
+            left.onward(shift, 0.8)
     with pytest.raises(AssertionError):
         old.at(None, problem.start, forces)

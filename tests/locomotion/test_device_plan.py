@@ -15,8 +15,9 @@ from egs_warp.contact.device_room import ContactRoom
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion import device_plan, strategies
+from egs_warp.locomotion import stepper as stepping
 from egs_warp.locomotion.contact_pieces import ContactPieces, PieceSearch
-from egs_warp.locomotion.device_plan import DevicePlanner
+from egs_warp.locomotion.device_plan import DevicePlanner, PlanRoom
 from egs_warp.locomotion.linear_step import Prospect, StepStart
 from egs_warp.locomotion.objectives import (
     AnyObjective,
@@ -25,7 +26,7 @@ from egs_warp.locomotion.objectives import (
     centre_of_mass_velocity,
     node_velocities,
 )
-from egs_warp.locomotion.planner import StageClock
+from egs_warp.locomotion.planner import Plan, StageClock
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory
 from egs_warp.locomotion.strategies import search_on
@@ -77,7 +78,7 @@ def planner_of(stepper: LocomotionStepper) -> DevicePlanner:
 def is_the_host_s(
     stepper: LocomotionStepper, start: StepStart, memory: StepMemory, objectives: Sequence[AnyObjective]
 ) -> bool:
-    """The plan, its response, and the first look at its end; False if it is left to the host."""
+    """The plan and its response; False if it is left to the host."""
     found = planner_of(stepper).plan(start, objectives)
     if found is None:
         return False
@@ -186,7 +187,6 @@ def test_the_host_goes_on_with_a_search(
 
     monkeypatch.setattr(device_plan, "search_on", searched_on)
     if what == "costly":
-        monkeypatch.setattr(device_plan, "COSTLY", 0.0)
         monkeypatch.setattr(strategies, "COSTLY", 0.0)
     else:
         monkeypatch.setattr(device_plan, "FOUND", -1)
@@ -203,13 +203,27 @@ def test_the_host_goes_on_with_a_search(
     assert missed < 1e-9 and ahead.feasible and forces.shape == found[1].forces.shape
 
 
-def test_forces_that_miss_their_laws_are_left_to_the_host(
-    creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("what", ["verdicts", "sizes", "missed", "horizon", "end", "forces"])
+def test_what_is_not_as_usual_is_left_to_the_host(
+    what: str, creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """A matrix that is not definite, an element that is inverted, forces that miss their laws, while the contact is
+    foreseen or at the end of the search."""
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
     start = begun(stepper, creature.start, memory)
     assert planner_of(stepper).plan(start, objectives) is not None
-    monkeypatch.setattr(device_plan, "ASTRAY", -1.0)
+    place, value = {
+        **{"verdicts": ((0, 3), 0.0), "sizes": ((1, 2), np.nan), "missed": ((2, 1), 1.0)},
+        **{"horizon": ((3, 0), 0.0), "end": ((3, 1), np.inf), "forces": ((3, 2), 1.0)},
+    }[what]
+    parts = PlanRoom._parts
+
+    def other(room: PlanRoom) -> list[np.ndarray]:
+        made = [part.copy() for part in parts(room)]
+        made[place[0]][place[1]] = value
+        return made
+
+    monkeypatch.setattr(PlanRoom, "_parts", other)
     assert planner_of(stepper).plan(start, objectives) is None
     end, _, reports = stepper.advance(creature.start, memory, objectives, DT)
     stepper._at_once = None
@@ -218,8 +232,53 @@ def test_forces_that_miss_their_laws_are_left_to_the_host(
     np.testing.assert_array_equal(end.velocities, expected.velocities)
 
 
-def test_a_matrix_that_is_not_definite_is_left_to_the_host(creature: Creature, stepper: LocomotionStepper) -> None:
-    """A body that is squeezed flat."""
+def test_a_body_that_is_squeezed_flat_is_left_to_the_host(creature: Creature, stepper: LocomotionStepper) -> None:
     squeezed = creature.start.positions * np.array([1.0, 0.4, 1.0])
     memory = stepper.initial_memory()
     assert planner_of(stepper).plan(begun(stepper, BodyState(squeezed, 0.0 * squeezed), memory), []) is None
+
+
+def test_a_step_that_goes_amiss_is_planned_again_on_the_device(
+    creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every step is asked for again: what comes of it is the host's."""
+    monkeypatch.setattr(stepping, "_AMISS", 0.0)
+    monkeypatch.setattr(stepping, "_LITTLE", -1.0)
+    planned: list[bool] = []
+    again = DevicePlanner.plan_again
+
+    def counted(*given: Any) -> Plan | None:
+        planned.append((found := again(*given)) is not None)
+        return found
+
+    monkeypatch.setattr(DevicePlanner, "plan_again", counted)
+    memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
+    end, _, (report,) = stepper.advance(creature.start, memory, objectives, DT)
+    assert planned == [True] and report.converged
+    stepper._at_once = None
+    expected, _, (other,) = stepper.advance(creature.start, memory, objectives, DT)
+    assert report.qp_count == other.qp_count
+    np.testing.assert_allclose(end.positions, expected.positions, rtol=0, atol=1e-8 * stepper.body.height)
+
+
+def test_the_same_body_on_other_ground_shares_what_it_works_with(
+    creature: Creature, stepper: LocomotionStepper
+) -> None:
+    """Steps by turns on two frictions are those of each alone."""
+    slippery = stepper.with_friction(0.1)
+    assert slippery._at_once is stepper._at_once and slippery.solver.respond is stepper.solver.respond
+    memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
+    one, other = ((creature.start, memory), (creature.start, memory))
+    turns: list[np.ndarray] = []
+    for _ in range(2):
+        one = stepper.advance(*one, objectives, DT)[:2]
+        other = slippery.advance(*other, objectives, DT)[:2]
+        turns += [one[0].positions, other[0].positions]
+    alone = []
+    for each in (stepper, slippery):
+        state, known = creature.start, memory
+        for _ in range(2):
+            state, known, _ = each.advance(state, known, objectives, DT)
+            alone.append(state.positions)
+    for turn, place in zip(turns, (0, 2, 1, 3), strict=True):
+        np.testing.assert_allclose(turn, alone[place], rtol=0, atol=1e-9 * stepper.body.height)

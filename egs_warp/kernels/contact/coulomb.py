@@ -13,10 +13,10 @@ from egs_warp.kernels.contact.coulomb_block import (
     in_block,
     missed_by_block,
     speeds_by_block,
-    step_by_block,
     sweep_by_block,
 )
 from egs_warp.kernels.contact.coulomb_equations import Contacts, Newton, rate_of, solve_equations, write_equations
+from egs_warp.kernels.contact.coulomb_step import step_by_block
 from egs_warp.kernels.vectors import on_cpu
 from egs_warp.precision import Vec3, Vec4, real
 
@@ -211,8 +211,8 @@ def find_velocities(contacts: Contacts, forces: wp.array[real], newton: Newton):
 
 @wp.func
 def sweep_together(contacts: Contacts, sweeps: int, forces: wp.array[real], newton: Newton):
-    """``sweep`` by a block of threads: each contact is every lane's to work out, and each lane keeps the velocities of
-    some rows up with it."""
+    """``sweep`` by a block of threads. Of more contacts than ``sweep_by_block`` takes each is every lane's to work out,
+    and each lane keeps the velocities of some rows up with it."""
     if in_block() == 0:
         sweep(contacts, sweeps, forces)
         return

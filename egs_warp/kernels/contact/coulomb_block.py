@@ -34,7 +34,7 @@ _RECIPROCALS = """
 """
 
 
-def _on_gpu(body: str, *, otherwise: str = "") -> str:
+def on_gpu(body: str, *, otherwise: str = "") -> str:
     """``body`` by a block on a GPU, ``otherwise`` on a CPU, which never comes there."""
     given = f"{_RECIPROCALS}    constexpr int WARPS = {BLOCK // 32}, SWEPT = {SWEPT};\n    (void)WARPS, (void)SWEPT;\n"
     return by_block(f"#if defined(__CUDA_ARCH__)\n{given}{body}\n#else\n{otherwise}\n#endif\n")
@@ -53,7 +53,7 @@ def in_block() -> int:
 
 
 @wp.func_native(
-    _on_gpu("""
+    on_gpu("""
     // Eight threads take turns in a row, so that a warp has four rows.
     const double *const G = delassus.data, *const x = given.data;
     const int stride = delassus.strides[0] / 8, place = own & 7, part = own >> 3;
@@ -89,7 +89,7 @@ def speeds_by_block(delassus: wp.array2d[real], size: int, given: wp.array[real]
 
 
 @wp.func_native(
-    _on_gpu("""
+    on_gpu("""
     // The first warp finds the forces of a group of contacts one after the other, while the others work out the speeds
     // at the next group, to which the first adds what its own change of them, and lay out what it needs there.
     constexpr int GROUP = 5, ROWS = 3 * GROUP, PITCH = 17;
@@ -190,7 +190,7 @@ def sweep_by_block(
 
 
 @wp.func_native(
-    _on_gpu(
+    on_gpu(
         """
     __shared__ double parts[2][WARPS];
     const double *const G = delassus.data, *const f = forces.data, *const u = velocities.data;
@@ -258,308 +258,4 @@ def missed_by_block(
     values: wp.array[real],
 ) -> wp.vec2d:
     """See ``missed``."""
-    ...
-
-
-_TILES = """
-    constexpr int TILES = 2 * WARPS - 1, PAIRS = WARPS, PITCH = 8 * TILES + 10, EACH = 9;
-    // Tiles of eight rows and columns, in the order in which the threads of a warp have them: the unknowns' that are
-    // eliminated now or next, what the others' rows have of them; the inverse of those on the diagonal; the two of each
-    // warp in the rows of the next. Before that, rows of the equations, and sixteen of them written out.
-    __shared__ __align__(16) double room[(2 * (TILES + 1) + 2 + 2 * WARPS) * 64];
-    __shared__ int column[8 * TILES], ahead[WARPS], sound;
-    static_assert(sizeof(room) >= 8 * (EACH * 8 * TILES + 16 * PITCH), "");
-    double (*const line)[EACH] = (double (*)[EACH])room;
-    double (*const strip)[PITCH] = (double (*)[PITCH])(room + EACH * 8 * TILES);
-    double (*const lefts)[64] = (double (*)[64])room, (*const inverses)[64] = lefts + 2 * (TILES + 1);
-    double (*const tops)[64] = inverses + 2 + 2 * warp;
-    const double *const G = delassus.data, *const f = forces.data, *const u = velocities.data;
-    const int stride = delassus.strides[0] / 8;
-    double* const s = step.data;
-    if (count > lanes) return 0;
-"""
-
-_LIST = """
-    // Each thread has a contact: what is unknown of its step, and what the others' steps move.
-    const int n = 3 * lane, size = 3 * count;
-    const bool mine = lane < count;
-    bool bears = false, rubs = false;
-    double rate = 0.0, first = 0.0, second = 0.0, known[3] = {0.0, 0.0, 0.0};
-    if (mine) {
-        const double* const d = G + n * stride + n;
-        rate = 3.0 * scale * over(d[0] + d[stride + 1] + d[2 * stride + 2]);
-        first = f[n + 1] - rate * u[n + 1];
-        second = f[n + 2] - rate * u[n + 2];
-        bears = f[n] - rate * u[n] > 0.0;
-        rubs = !(f[n] <= 0.0 && first * first + second * second > 0.0);
-        if (!bears) known[0] = -values.data[n];
-        if (!rubs) {
-            known[1] = -values.data[n + 1];
-            known[2] = -values.data[n + 2];
-        }
-        for (int t = 0; t < 3; ++t) s[n + t] = known[t];
-    }
-    const unsigned bearing = __ballot_sync(0xffffffffu, bears), rubbing = __ballot_sync(0xffffffffu, rubs);
-    const unsigned below = (1u << own) - 1u;
-    if (own == 0) ahead[warp] = __popc(bearing) + 2 * __popc(rubbing);
-    if (lane == 0) sound = 1;
-    const int moves = __syncthreads_or(!(known[0] == 0.0 && known[1] == 0.0 && known[2] == 0.0));
-    int place = __popc(bearing & below) + 2 * __popc(rubbing & below), unknowns = 0;
-    #pragma unroll 1
-    for (int i = 0; i < WARPS; ++i) {
-        if (i < warp) place += ahead[i];
-        unknowns += ahead[i];
-    }
-    const int tiles = (unknowns + 7) / 8, pairs = (tiles + 1) / 2;
-    if (tiles > TILES) return 0;
-    if (moves) {
-        for (int row = warp; row < size; row += WARPS) {
-            double sum = 0.0;
-            for (int c = own; c < size; c += 32) sum += G[row * stride + c] * s[c];
-            for (int away = 16; away > 0; away >>= 1) sum += __shfl_xor_sync(0xffffffffu, sum, away);
-            if (own == 0) change.data[row] = sum;
-        }
-        WAIT;
-    }
-    // Its rows of the equations: the weights of its rows of the operator, its own entries and the right side.
-    if (mine) {
-        double moved[3] = {0.0, 0.0, 0.0};
-        if (moves)
-            for (int t = 0; t < 3; ++t) moved[t] = change.data[n + t];
-        if (bears) {
-            double* const to = line[place];
-            column[place++] = n;
-            to[0] = rate;
-            to[3] = short_step;
-            to[1] = to[2] = to[4] = to[5] = to[7] = 0.0;
-            to[6] = -values.data[n] - rate * moved[0];
-        }
-        if (rubs) {
-            const double square = first * first + second * second, radius = friction * fmax(f[n], 0.0);
-            const bool slides = square > radius * radius;
-            const double by = over_root(square), share = radius * by, d[2] = {first * by, second * by};
-            #pragma unroll
-            for (int t = 0; t < 2; ++t) {
-                double w[2], o[3] = {0.0, 0.0, 0.0};
-                #pragma unroll
-                for (int k = 0; k < 2; ++k) {
-                    // Sliding: 1 - share (1 - d d^T) (1 - rate G) - friction d by the normal force.
-                    const double same = t == k ? 1.0 : 0.0, along = share * (same - d[t] * d[k]);
-                    w[k] = rate * (slides ? along : same);
-                    o[1 + k] = same * short_step + (slides ? same - along : 0.0);
-                }
-                if (slides) o[0] = -friction * d[t];
-                double* const to = line[place];
-                column[place++] = n + 1 + t;
-                to[0] = to[7] = 0.0;
-                to[1] = w[0];
-                to[2] = w[1];
-                for (int k = 0; k < 3; ++k) to[3 + k] = o[k];
-                to[6] = -values.data[n + 1 + t] - w[0] * moved[1] - w[1] * moved[2] - o[0] * known[0];
-            }
-        }
-    }
-    for (int b = unknowns + lane; b < 8 * tiles; b += lanes) column[b] = -1;
-    WAIT;
-"""
-
-_WRITE = """
-    // Written out sixteen rows at a time, from where each warp takes its columns, at most two of tiles: in registers.
-    const int r = own >> 2, q = own & 3;
-    double part[2][PAIRS][4];
-    #pragma unroll 1
-    for (int ii = 0; ii < pairs; ++ii) {
-        const double *from[2], *g[2];
-        int base[2];
-        #pragma unroll
-        for (int h = 0; h < 2; ++h) {
-            const int a = 16 * ii + warp + WARPS * h, row = a < unknowns ? a : 0, c = unknowns > 0 ? column[row] : 0;
-            from[h] = line[row];
-            base[h] = c - c % 3;
-            g[h] = G + base[h] * stride;
-        }
-        #pragma unroll
-        for (int t = 0; t < (8 * TILES + 31) / 32; ++t) {
-            const int b = own + 32 * t;
-            if (32 * t >= 8 * tiles) break;
-            const int c = b < 8 * tiles ? column[b] : -1, at = c < 0 ? 0 : c;
-            #pragma unroll
-            for (int h = 0; h < 2; ++h) {
-                const int a = 16 * ii + warp + WARPS * h;
-                const unsigned place = c - base[h];
-                const double entry = from[h][0] * g[h][at] + from[h][1] * g[h][stride + at]
-                    + from[h][2] * g[h][2 * stride + at] + from[h][place < 3u ? 3 + place : 7];
-                if (b < 8 * tiles)
-                    strip[warp + WARPS * h][b] = a >= unknowns ? (a == b ? 1.0 : 0.0) : c < 0 ? 0.0 : entry;
-                if (b == 0) strip[warp + WARPS * h][8 * tiles] = a < unknowns ? from[h][6] : 0.0;
-            }
-        }
-        WAIT;
-        #pragma unroll
-        for (int slot = 0; slot < PAIRS; ++slot)
-            if (slot == ii) {
-                #pragma unroll
-                for (int jj = 0; jj < 2; ++jj) {
-                    const int j = warp + WARPS * jj < tiles ? warp + WARPS * jj : tiles;
-                    const double *const upper = strip[r] + 8 * j + 2 * q, *const lower = upper + 8 * PITCH;
-                    part[jj][slot][0] = upper[0];
-                    part[jj][slot][1] = upper[1];
-                    part[jj][slot][2] = lower[0];
-                    part[jj][slot][3] = lower[1];
-                }
-            }
-        WAIT;
-    }
-"""
-
-_ELIMINATE = """
-    // Eight unknowns at a time. Products of a tile's threads: the first two pairs of numbers are rows r of one side and
-    // columns r of the other, at 2q and 2q + 1 of what is summed over.
-    auto product = [](double (&to)[2], const double2& one, const double2& other) {
-        asm volatile("mma.sync.aligned.m8n8k4.row.col.f64.f64.f64.f64 {%0,%1},{%2},{%3},{%0,%1};"
-                     : "+d"(to[0]), "+d"(to[1]) : "d"(one.x), "d"(other.x));
-        asm volatile("mma.sync.aligned.m8n8k4.row.col.f64.f64.f64.f64 {%0,%1},{%2},{%3},{%0,%1};"
-                     : "+d"(to[0]), "+d"(to[1]) : "d"(one.y), "d"(other.y));
-    };
-    auto add = [&](double (&to)[4], const double2& upper, const double2& lower, const double (&by)[2]) {
-#if __CUDA_ARCH__ >= 900
-        asm volatile("mma.sync.aligned.m16n8k8.row.col.f64.f64.f64.f64 "
-                     "{%0,%1,%2,%3},{%4,%5,%6,%7},{%8,%9},{%0,%1,%2,%3};"
-                     : "+d"(to[0]), "+d"(to[1]), "+d"(to[2]), "+d"(to[3])
-                     : "d"(upper.x), "d"(lower.x), "d"(upper.y), "d"(lower.y), "d"(by[0]), "d"(by[1]));
-#else
-        const double2 other = make_double2(by[0], by[1]);
-        double above[2] = {to[0], to[1]}, under[2] = {to[2], to[3]};
-        product(above, upper, other);
-        product(under, lower, other);
-        to[0] = above[0], to[1] = above[1], to[2] = under[0], to[3] = under[1];
-#endif
-    };
-    auto store = [&](double* to, double one, double two) { *(double2*)(to + 2 * own) = make_double2(one, two); };
-    auto load = [&](const double* from) { return *(const double2*)(from + 2 * own); };
-    for (int k = -1; k < tiles; ++k) {
-        if (k >= 0) {
-            if (!sound) return 0;
-            const bool one = warp > k && warp <= tiles, two = warp + WARPS > k && warp + WARPS <= tiles;
-            const double (*const left)[64] = lefts + (k & 1) * (TILES + 1);
-            const double2 inverse = load(inverses[k & 1]);
-            double less[2][2];
-            #pragma unroll
-            for (int jj = 0; jj < 2; ++jj) {
-                const double2 top = load(tops[jj]);
-                less[jj][0] = less[jj][1] = 0.0;
-                product(less[jj], make_double2(-top.x, -top.y), inverse);
-            }
-            constexpr int SOME = 3;
-            #pragma unroll
-            for (int begin = 0; begin < PAIRS; begin += SOME)
-                if (begin < pairs && (one || two)) {
-                    double2 upper[SOME], lower[SOME];
-                    #pragma unroll
-                    for (int t = 0; t < SOME; ++t)
-                        if (begin + t < PAIRS) {
-                            upper[t] = load(left[2 * (begin + t)]);
-                            lower[t] = load(left[2 * (begin + t) + 1]);
-                        }
-                    if (one) {
-                        #pragma unroll
-                        for (int t = 0; t < SOME; ++t)
-                            if (begin + t < PAIRS) add(part[0][begin + t], upper[t], lower[t], less[0]);
-                    }
-                    if (two) {
-                        #pragma unroll
-                        for (int t = 0; t < SOME; ++t)
-                            if (begin + t < PAIRS) add(part[1][begin + t], upper[t], lower[t], less[1]);
-                    }
-                }
-        }
-        const int next = k + 1;
-        if (next < tiles) {
-            double (*const left)[64] = lefts + (next & 1) * (TILES + 1);
-            auto publish = [&](int ii) {
-                double* const to = tops[0] + 16 * q + r;
-                if (next & 1) {
-                    to[0] = part[0][ii][2], to[8] = part[0][ii][3];
-                    to[64] = part[1][ii][2], to[72] = part[1][ii][3];
-                } else {
-                    to[0] = part[0][ii][0], to[8] = part[0][ii][1];
-                    to[64] = part[1][ii][0], to[72] = part[1][ii][1];
-                }
-            };
-            #pragma unroll
-            for (int ii = 0; ii < PAIRS; ++ii)
-                if (ii == next / 2) publish(ii);
-            #pragma unroll
-            for (int jj = 0; jj < 2; ++jj)
-                if (warp + WARPS * jj == next) {
-                    #pragma unroll
-                    for (int ii = 0; ii < PAIRS; ++ii)
-                        if (ii < pairs) {
-                            store(left[2 * ii], part[jj][ii][0], part[jj][ii][1]);
-                            store(left[2 * ii + 1], part[jj][ii][2], part[jj][ii][3]);
-                        }
-                }
-            if (warp == next % WARPS) {
-                __syncwarp();
-                const double2 given = load(left[next]);
-                double d0 = given.x, d1 = given.y;
-                bool good = true;
-                #pragma unroll
-                for (int p = 0; p < 8; ++p) {
-                    const double some = p & 1 ? d1 : d0, pivot = __shfl_sync(0xffffffffu, some, 4 * p + p / 2);
-                    const double factor = __shfl_sync(0xffffffffu, some, (own & 28) | (p / 2));
-                    const double t0 = __shfl_sync(0xffffffffu, d0, 4 * p + q);
-                    const double t1 = __shfl_sync(0xffffffffu, d1, 4 * p + q);
-                    good = good && fabs(pivot) > least;
-                    const double by = over(pivot), share = (r == p ? 1.0 : -factor) * by;
-                    if (r == p) d0 = d1 = 0.0;
-                    d0 = fma(share, t0, d0);
-                    d1 = fma(share, t1, d1);
-                    if (q == p / 2) (p & 1 ? d1 : d0) = share;
-                }
-                store(inverses[next & 1], d0, d1);
-                // Of its own rows, less this leaves the inverse's product.
-                store(left[next], given.x - (r == 2 * q ? 1.0 : 0.0), given.y - (r == 2 * q + 1 ? 1.0 : 0.0));
-                if (!good) sound = 0;
-            }
-        }
-        WAIT;
-    }
-    #pragma unroll
-    for (int jj = 0; jj < 2; ++jj)
-        if (warp + WARPS * jj == tiles && q == 0) {
-            #pragma unroll
-            for (int ii = 0; ii < PAIRS; ++ii) {
-                const int a = 16 * ii + r;
-                if (a < unknowns) s[column[a]] = part[jj][ii][0];
-                if (a + 8 < unknowns) s[column[a + 8]] = part[jj][ii][2];
-            }
-        }
-    WAIT;
-    return 1;
-"""
-
-
-@wp.func_native(
-    _on_gpu(
-        f"#if __CUDA_ARCH__ < 800\n    return 0;\n#else\n{_TILES}{_LIST}{_WRITE}{_ELIMINATE}#endif\n",
-        otherwise="    return 0;",
-    )
-)
-def step_by_block(
-    delassus: wp.array2d[real],
-    friction: real,
-    count: int,
-    forces: wp.array[real],
-    velocities: wp.array[real],
-    values: wp.array[real],
-    scale: real,
-    short_step: real,
-    least: real,
-    step: wp.array[real],
-    change: wp.array[real],
-) -> int:
-    """The ``step`` that ``write_equations`` and ``solve_equations`` find, rows not exchanged, in registers; 0, and what
-    is no step, where a pivot is not larger than ``least`` or there are more unknowns than 120. ``change`` (3n,) is
-    scratch memory."""
     ...

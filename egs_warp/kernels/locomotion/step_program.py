@@ -1,4 +1,4 @@
-"""The program of a step from where it is made to where it is searched, and what was found back from there, on a device.
+"""From where a step's program is made to where it is searched, and from the answer to the point that was found.
 
 See ``egs_warp/locomotion/device_plan.py``; numbers are told as ``search_kernel`` reads them.
 """

@@ -1,0 +1,96 @@
+"""A body's step on a GPU: where it starts, its matrix, and what keeps its momentum."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import warp as wp
+
+from egs_warp.contact.detection import ContactSet
+from egs_warp.contact.device_sight import DeviceSight
+from egs_warp.fem.body import SoftBody
+from egs_warp.fem.dense_factors import DenseFactors
+from egs_warp.fem.element_kernels import ElementKernels
+from egs_warp.fem.graphs import Recordings, Upload
+from egs_warp.fem.step_problem import StepProblem
+from egs_warp.fem.worlds import shared
+from egs_warp.kernels.contact import step_start as kernels
+from egs_warp.muscles.muscle_set import MuscleSet
+from egs_warp.muscles.tension import MuscleTension
+from egs_warp.precision import Mat33, Vec3, real
+
+
+class BodyRoom:
+    """Of one body with dense ``factors``, where its elements are: a step's start, and what keeps its momentum."""
+
+    def __init__(self, factors: DenseFactors, body: SoftBody, muscles: MuscleSet, sight: DeviceSight) -> None:
+        self.factors, self.body, self.stream, self.sight = factors, body, factors.stream, sight
+        elements = body.assembly.elements
+        assert isinstance(elements, ElementKernels)
+        self.elements = elements
+        size = 3 * len(body.mesh.nodes)
+        self.turned, self.keeping = self.zeros(size, 3), self.zeros(3, size)
+        """What a solution lacks of a turn is ``turned`` times ``keeping`` times what it is the solution of."""
+        self.masses = self.tensor(body.node_mass)
+        self._start = Upload(self.stream, 2 * size)
+        self.positions, self.velocities = self._start.there.split(size)
+        self.arms, self.start, self.ballistic = self.zeros(3, size)
+        self.turns, self.rates = self.zeros(size, 3), self.zeros(1, 3, 3)
+        """See ``StepProblem``; ``ballistic`` is where the nodes would end without forces, metres."""
+        self._gravity = self.tensor(np.tile(body.gravity, len(body.mesh.nodes)))
+        self._works = Recordings(self.stream)
+        self.no_tensions = wp.zeros(0, dtype=real, device=body.assembly.device)
+        self.gradients = wp.zeros(len(body.mesh.tets), dtype=Mat33, device=body.assembly.device)
+        self.lines = elements.muscle_lines(MuscleTension.of(muscles, np.zeros(muscles.segment_count)))
+        self.segment_count = muscles.segment_count
+        self._problem: StepProblem | None = None
+        self.looked_at: StepProblem | None = None
+        """Whose gaps at the start are known to ``sight``."""
+
+    def zeros(self, *shape: int) -> torch.Tensor:
+        """On the device."""
+        return torch.zeros(shape, dtype=torch.float64, device=self.factors.device)
+
+    def tensor(self, values: np.ndarray) -> torch.Tensor:
+        """On the device."""
+        return torch.as_tensor(np.ascontiguousarray(values, dtype=np.float64), device=self.factors.device)
+
+    def take(self, problem: StepProblem) -> None:
+        """The step that begins there."""
+        if self._problem is problem:
+            return
+        self._problem = problem
+        self._start.write(problem.state.positions, problem.state.velocities)
+        self._works.run(problem.dt, lambda: self._enqueue_start(problem.dt))
+
+    def _enqueue_start(self, dt: float) -> None:
+        self._start.send()
+        device = self.body.assembly.device
+        lanes = 1 if device.is_cpu else kernels.BLOCK
+        wp.launch(
+            kernels.step_start_kernel,
+            lanes,
+            inputs=[dt, shared(self.masses, real), vectors(self.positions), vectors(self.velocities)],
+            outputs=[vectors(self.arms), shared(self.turns, real), shared(self.rates, Mat33), vectors(self.start)],
+            device=device,
+            block_dim=lanes,
+        )
+        self.elements.enqueue_start(vectors(self.positions), self.gradients)
+        torch.add(self.velocities, self._gravity, alpha=dt, out=self.ballistic)
+        self.ballistic.mul_(dt).add_(self.positions)
+
+    def choose(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet:
+        """Contacts of a step that begins there, see ``DeviceSight``."""
+        with self.stream:
+            self.take(problem)
+        self.looked_at, ends = problem, vectors(self.ballistic)
+        return self.sight.choose(vectors(self.positions), ends, before, loaded, problem.state.positions)
+
+    def enqueue_gradient(self, ends: wp.array, dt: float, tensions: wp.array, gradient: wp.array) -> None:
+        """Into ``gradient``, newtons, at the positions ``ends``, under ``tensions`` of the muscles."""
+        self.elements.enqueue_gradient(ends, self.gradients, dt, self.lines, tensions, gradient)
+
+
+def vectors(flat: torch.Tensor) -> wp.array:
+    """(N, 3) of a ``flat`` one (3N,)."""
+    return shared(flat.view(-1, 3), Vec3)
