@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -198,9 +197,8 @@ def search_program(
     """
     strategy = Strategy(strategy)
     if strategy is Strategy.PIECES:
-        start = np.concatenate([foreseen.activations, foreseen.forces.ravel()])
-        found = _searched_from(program, start, foreseen.forces, qp_limit=qp_limit, solver=solver, device=device)
-        return _searched_on(program, found, foreseen.forces, qp_limit=qp_limit, solver=solver, device=device)
+        how = _How(qp_limit, QpSolver(solver), device)
+        return _searched_on(program, _searched_first(program, foreseen, how), foreseen.forces, how)
     paired = ContactProgram.of(program, directions)
     predicted = states_from_prediction(
         foreseen.forces[:, 0], foreseen.forces[:, 1:], foreseen.velocities[:, 1:], program.friction, directions
@@ -223,66 +221,55 @@ def search_on(
     """``search_program`` by ``PIECES`` and ``ADMM`` after its first search, which has ``found`` that, or was led
     astray."""
     if found is None:
-        start = np.concatenate([foreseen.activations, foreseen.forces.ravel()])
-        given: Any = {"qp_limit": qp_limit, "solver": QpSolver.OSQP, "device": device}
-        found = _searched_from(program, start, foreseen.forces, **given)
-    return _searched_on(program, found, foreseen.forces, qp_limit=qp_limit, solver=QpSolver.ADMM, device=device)
+        found = _searched_first(program, foreseen, _How(qp_limit, QpSolver.OSQP, device))
+    return _searched_on(program, found, foreseen.forces, _How(qp_limit, QpSolver.ADMM, device))
 
 
-def _searched_on(
-    program: ContactPieces,
-    found: PieceSearch,
-    forces: np.ndarray,
-    *,
-    qp_limit: int,
-    solver: QpSolver | str,
-    device: Device,
-) -> PieceSearch:
+@dataclass(frozen=True)
+class _How:
+    """Pieces are searched."""
+
+    qp_limit: int
+    solver: QpSolver
+    device: Device
+
+
+def _searched_first(program: ContactPieces, foreseen: Foreseen, how: _How) -> PieceSearch:
+    """From what is foreseen."""
+    start = np.concatenate([foreseen.activations, foreseen.forces.ravel()])
+    return _searched_from(program, start, foreseen.forces, how)
+
+
+def _searched_on(program: ContactPieces, found: PieceSearch, forces: np.ndarray, how: _How) -> PieceSearch:
     """``found``, or better if that costs so much that it is doubted."""
     if not is_doubted(found.objective, program.contacts):
         return found
-    return _searched_elsewhere(program, found, forces, qp_limit=qp_limit, solver=solver, device=device)
+    return _searched_elsewhere(program, found, forces, how)
 
 
-def _searched_from(
-    program: ContactPieces,
-    start: np.ndarray,
-    forces: np.ndarray,
-    *,
-    qp_limit: int,
-    solver: QpSolver | str,
-    device: Device,
-) -> PieceSearch:
+def _searched_from(program: ContactPieces, start: np.ndarray, forces: np.ndarray, how: _How) -> PieceSearch:
     """From ``start`` (m + 3n,), in the piece of ``forces`` (n, 3), which are those of it or near them."""
-    modes = ContactModes.of(forces, program.friction)
-    if QpSolver(solver) is QpSolver.ADMM:
-        found = search_at_once(program, start, modes, qp_limit=qp_limit, device=wp.get_device(device))
+    modes, solver = ContactModes.of(forces, program.friction), how.solver
+    if solver is QpSolver.ADMM:
+        found = search_at_once(program, start, modes, qp_limit=how.qp_limit, device=wp.get_device(how.device))
         if found is not None:
             return found
         solver = QpSolver.OSQP
-    return search_pieces(program, start, modes, qp_limit=qp_limit, solver=solver, device=device)
+    return search_pieces(program, start, modes, qp_limit=how.qp_limit, solver=solver, device=how.device)
 
 
-def _searched_elsewhere(
-    program: ContactPieces,
-    found: PieceSearch,
-    forces: np.ndarray,
-    *,
-    qp_limit: int,
-    solver: QpSolver | str,
-    device: Device,
-) -> PieceSearch:
+def _searched_elsewhere(program: ContactPieces, found: PieceSearch, forces: np.ndarray, how: _How) -> PieceSearch:
     """The better of ``found`` and of a search from where the optimum without complementarity would end up under true
     contact; ``forces`` (n, 3) are a guess."""
     # Thousands of iterations, one after the other, are not for a GPU.
-    bound_by = QpSolver.OSQP if QpSolver(solver) is QpSolver.ADMM else solver
-    relaxed = solve_relaxed(program, bound_by, device=device)
+    bound_by = QpSolver.OSQP if how.solver is QpSolver.ADMM else how.solver
+    relaxed = solve_relaxed(program, bound_by, device=how.device)
     found = replace(found, qp_count=found.qp_count + 1)
     if relaxed is None or found.objective <= DOUBTFUL * relaxed[1]:
         return found
     start = program.under(relaxed[0], forces)
     answered = start[program.activations :].reshape(-1, 3)
-    other = _searched_from(program, start, answered, qp_limit=qp_limit, solver=solver, device=device)
+    other = _searched_from(program, start, answered, how)
     best = min(found, other, key=lambda search: search.objective)
     return replace(best, qp_count=found.qp_count + other.qp_count, infeasible=found.infeasible + other.infeasible)
 
