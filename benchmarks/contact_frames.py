@@ -128,7 +128,7 @@ def animation_frames(
     body, muscles = bench.stepper.body, bench.stepper.muscles
     stepper = LocomotionStepper(body, muscles, bench.stepper.geometry, device=bench.device)
     synergies = grouped_segments(muscles, body.mesh.nodes, activations, seed)
-    steps = linear_steps_by(stepper.solver.respond, muscles, synergies)
+    steps = linear_steps_by(stepper.respond, muscles, synergies)
     stepper.planner = replace(stepper.planner, synergies=synergies, linear_steps=steps)
     # No point joins those that were chosen, however deep.
     stepper.solver = replace(stepper.solver, penetration_tolerance=np.inf)

@@ -12,12 +12,16 @@ from egs_warp.fem.body import SoftBody
 from egs_warp.fem.dense_factors import DenseFactors
 from egs_warp.fem.element_kernels import ElementKernels
 from egs_warp.fem.graphs import Recordings, Upload
-from egs_warp.fem.step_problem import StepProblem
+from egs_warp.fem.step_problem import NEGLIGIBLE, StepProblem
 from egs_warp.fem.worlds import shared
 from egs_warp.kernels.contact import step_start as kernels
+from egs_warp.launching import by_steps
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleTension
 from egs_warp.precision import Mat33, Vec3, real
+
+_DIRECTIONS = 64
+"""Of muscles' stiffness so many are added at a time."""
 
 
 class BodyRoom:
@@ -43,6 +47,8 @@ class BodyRoom:
         self.gradients = wp.zeros(len(body.mesh.tets), dtype=Mat33, device=body.assembly.device)
         self.lines = elements.muscle_lines(MuscleTension.of(muscles, np.zeros(muscles.segment_count)))
         self.segment_count = muscles.segment_count
+        self._rows = self.tensor(muscles.difference_rows.toarray())
+        self._ways = Upload(self.stream, 4 * (3 * self.segment_count + 2 * _DIRECTIONS))
         self._problem: StepProblem | None = None
         self.looked_at: StepProblem | None = None
         """Whose gaps at the start are known to ``sight``."""
@@ -85,6 +91,27 @@ class BodyRoom:
             self.take(problem)
         self.looked_at, ends = problem, vectors(self.ballistic)
         return self.sight.choose(vectors(self.positions), ends, before, loaded, problem.state.positions)
+
+    def enqueue_factors(self, ends: wp.array, dt: float) -> None:
+        """Of the step's matrix at the positions ``ends``, without muscles."""
+        made = self.elements.enqueue_entries(ends, self.gradients, dt, factor=dt**2, projected=False)
+        self.factors.enqueue(wp.to_torch(made))
+
+    def enqueue_stiffness(self, problem: StepProblem, tension: MuscleTension, velocities: np.ndarray) -> None:
+        """Add that of muscles under ``tension`` at the end of ``velocities`` (N, 3) to the matrix that is factored."""
+        segments, ways, rates = tension.hessian(problem.end_positions(velocities)).ways(least=NEGLIGIBLE)
+        # What pulls adds to it, what pushes takes away; what is there in between adds nothing.
+        of_signs = [(sign, np.flatnonzero(sign * rates > 0.0)) for sign in (1.0, -1.0)]
+        told = [np.zeros((by_steps(len(chosen), _DIRECTIONS), 4)) for _, chosen in of_signs]
+        for (_, chosen), part in zip(of_signs, told, strict=True):
+            part[: len(chosen), 0] = segments[chosen]
+            part[: len(chosen), 1:] = problem.dt * np.sqrt(np.abs(rates[chosen]))[:, None] * ways[chosen]
+        self._ways.take(*told)
+        parts = self._ways.there[: sum(part.size for part in told)].view(-1, 4).split([len(part) for part in told])
+        for (sign, chosen), part in zip(of_signs, parts, strict=True):
+            if len(chosen) > 0:
+                directions = self._rows[part[:, 0].long()][:, :, None] * part[:, None, 1:]
+                self.factors.enqueue_sum(directions.view(len(part), -1), sign)
 
     def enqueue_gradient(self, ends: wp.array, dt: float, tensions: wp.array, gradient: wp.array) -> None:
         """Into ``gradient``, newtons, at the positions ``ends``, under ``tensions`` of the muscles."""

@@ -191,13 +191,22 @@ class DeviceIterate:
         forces, missed = self.response.forces(self.speeds, shift, friction, self.forces)
         return forces, missed, self.toward(forces)
 
-    def by(self, response: ContactResponse) -> Iterate:
-        """See ``Iterate``."""
-        assert isinstance(response, DeviceResponse) and response.room is self.response.room
-        room = response.room
-        speeds = room.again(base=self._base()).speeds
+    def anew(self) -> DeviceIterate:
+        """See ``Iterate``. No response but that is at hand then."""
+        old, owner, room = self.response, self.response.owner, self.response.room
+        assert owner.at_hand is old
+        problem, base = old.tangent.problem, self._base()
+        found = room.anew(problem, self.tension, self.velocities, base=base)
+        if found is None:
+            # A sum may be definite where its first part is not.
+            response = owner(problem.tangent(owner.factors, self.velocities, self.tension), old.contacts)
+            found = room.again(base=base)
+        else:
+            tangent = Tangent(problem, owner.factors)
+            response = DeviceResponse.there(tangent, old.contacts, owner, room, room.delassus_here())
+            owner.at_hand = response
         room.at_trial = room.coming = None
-        room.at_base = replace(self, response=response, speeds=speeds[: len(self.speeds)].copy())
+        room.at_base = replace(self, response=response, speeds=found.speeds[: len(self.speeds)].copy())
         return room.at_base
 
     def _base(self) -> float:

@@ -253,6 +253,34 @@ class ContactRoom:
         self._told.here[2] = base
         return self._ask(self._enqueue_again)
 
+    def anew(
+        self, problem: StepProblem, tension: MuscleTension | None, velocities: np.ndarray, *, base: float
+    ) -> Tried | None:
+        """Factors and response by the tangent at the ``base``, where these ``velocities`` (N, 3) are, with the muscles'
+        stiffness, and the speeds there; None if it is not definite."""
+        owner, ratio = self.owner, 1.0 + problem.dt * problem.drag
+        self._told.here[2] = base
+        with owner.stream:
+            owner.factors.tell(ratio * np.repeat(owner.body.node_mass, 3))
+            self._do(self._enqueue_factors, problem.dt)
+            if tension is not None:
+                owner.enqueue_stiffness(problem, tension, velocities)
+            self._do(self._enqueue_anew, problem.dt, ratio)
+        owner.factors.begun()
+        return self._answer(0) if owner.factors.ready else None
+
+    def _enqueue_factors(self, dt: float) -> None:
+        owner = self.owner
+        self._told.send()
+        self._enqueue_base()
+        torch.add(owner.positions, self.parts(self._base)[0], alpha=dt, out=self.ends)
+        owner.enqueue_factors(vectors(self.ends), dt)
+
+    def _enqueue_anew(self, dt: float, ratio: float) -> None:
+        self.enqueue_response(dt, ratio)
+        self._enqueue_newton(self._base)
+        self._give()
+
     def _ask(self, work: Callable[..., None], *given: float) -> Tried:
         with self.owner.stream:
             self._do(work, *given)

@@ -192,8 +192,8 @@ class Iterate(Protocol):
         by which they miss that, and the end of a Newton step with them, from which it will go ``further``, likely."""
         ...
 
-    def by(self, response: ContactResponse) -> Iterate:
-        """The same place, of which the Newton step is by another ``response`` of the same contacts."""
+    def anew(self) -> Iterate:
+        """The same place, of which the Newton step is by a tangent made there, with the muscles' stiffness."""
         ...
 
 
@@ -201,6 +201,14 @@ def _onward(now: VectorIterate | HostIterate, shift: np.ndarray, friction: float
     """``Iterate.onward``, one after the other."""
     forces, missed = now.response.forces(now.speeds, shift, friction, now.forces)
     return forces, missed, now.toward(forces)
+
+
+def _response_at(place: VectorIterate | HostIterate) -> ContactResponse:
+    """Of the same contacts, by a tangent made at that ``place``."""
+    old = place.response.tangent
+    return ContactResponse.of(
+        old.problem.tangent(old.factors, place.velocities, place.tension), place.response.contacts
+    )
 
 
 def _elements_are_here(tangent: Tangent) -> bool:
@@ -263,9 +271,9 @@ class VectorIterate:
         """See ``Iterate``."""
         return _onward(self, shift, friction)
 
-    def by(self, response: ContactResponse) -> Self:
+    def anew(self) -> Self:
         """See ``Iterate``."""
-        return replace(self, response=response, state=self.state.copy())
+        return replace(self, response=_response_at(self), state=self.state.copy())
 
 
 def _room_of(response: ContactResponse) -> NewtonRoom:
@@ -330,8 +338,8 @@ class HostIterate:
         """See ``Iterate``."""
         return _onward(self, shift, friction)
 
-    def by(self, response: ContactResponse) -> Self:
+    def anew(self) -> Self:
         """See ``Iterate``."""
-        other = replace(self, response=response)
+        other = replace(self, response=_response_at(self))
         vars(other)["_free"] = self._free
         return other

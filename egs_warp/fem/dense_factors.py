@@ -75,6 +75,12 @@ class DenseFactors:
         self._entries.copy_(entries)
         self._factor()
 
+    def enqueue_sum(self, directions: torch.Tensor, sign: float) -> None:
+        """From now on solve with S + ``sign`` U^T U, ``directions`` U (k, n), where that is definite; ``verdict`` and
+        ``ready`` say so. S must be, and a sign of less than 0 comes last."""
+        self.verdict[1].mul_(self._root.add(directions, sign))
+        self._told.copy_(self.verdict, non_blocking=True)
+
     def begun(self) -> None:
         """Factors are on their way."""
         self._begun = True
@@ -220,6 +226,8 @@ class _InverseRoot:
         self._across, self._far = self._made.new_zeros((2, len(slabs.between), ends[-1]))
         self._definite = torch.zeros(len(self._parts) + 1, dtype=torch.bool, device=device)
         self._definite[-1] = True
+        # Of each number of directions that were added at once.
+        self._small: dict[int, tuple[_Triangle, _Triangle]] = {}
 
     @cached_property
     def _last(self) -> _Triangle:
@@ -257,6 +265,25 @@ class _InverseRoot:
             torch.mm(self.matrix[last, part], triangle.inverse.T, out=self._across[:, part])
             torch.mm(self._across[:, part], triangle.inverse, out=self._far[:, part])
 
+    def add(self, directions: torch.Tensor, sign: float) -> torch.Tensor:
+        """R of S + ``sign`` U^T U, ``directions`` U (k, n); () bool, whether that is definite.
+
+        With W = R U^T and K K^T = 1 + sign W^T W that is (1 - sign W K^-T (K + 1)^-1 W^T)^T R: the square root of a
+        sum by the one of a matrix (Andrews, AIAA Journal 6(6), 1968), so that n is not factored anew.
+        """
+        count = len(directions)
+        if count not in self._small:
+            self._small[count] = _Triangle(count, self._stream.device), _Triangle(count, self._stream.device)
+        plain, raised = self._small[count]
+        through = torch.mm(self.inverse, directions.T)
+        one = torch.eye(count, dtype=torch.float64, device=through.device)
+        factor, info = torch.linalg.cholesky_ex(torch.addmm(one, through.T, through, alpha=sign))
+        plain.invert(factor)
+        raised.invert(factor + one)
+        gain = torch.mm(raised.inverse.T, plain.inverse)
+        self.inverse.addmm_(through, gain @ (through.T @ self.inverse), alpha=-sign)
+        return info == 0
+
     def make_with(self, across: torch.Tensor, rates: torch.Tensor) -> bool:
         """R of the ``matrix`` and ``across`` (n, m) diag(``rates``) across^T, if that is definite; else it stays."""
         directions = across[self.order]
@@ -285,10 +312,11 @@ class _Triangle:
     def factor(self, matrix: torch.Tensor) -> torch.Tensor:
         """``inverse`` of the factor of the lower triangle of a ``matrix`` (n, n); () bool, whether it has one."""
         factor, info = torch.linalg.cholesky_ex(matrix)
-        self._invert(factor)
+        self.invert(factor)
         return info == 0
 
-    def _invert(self, lower: torch.Tensor) -> None:
+    def invert(self, lower: torch.Tensor) -> None:
+        """``inverse`` of a ``lower`` triangle (n, n)."""
         self._given[: self._count, : self._count] = lower
         side = self._side
         # Torch would take one block after the other.

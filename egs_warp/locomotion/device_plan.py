@@ -255,10 +255,8 @@ class PlanRoom:
 
     def _enqueue_factors(self, dt: float, which: int) -> None:
         """Of the step's matrix where the last trial ends."""
-        body = self.body
-        made = body.elements.enqueue_entries(vectors(self.room.ends), body.gradients, dt, factor=dt**2, projected=False)
-        body.factors.enqueue(wp.to_torch(made))
-        self._verdicts[which].copy_(body.factors.verdict)
+        self.body.enqueue_factors(vectors(self.room.ends), dt)
+        self._verdicts[which].copy_(self.body.factors.verdict)
 
     def _enqueue_linear(self, dt: float, ratio: float, time: float, base: float) -> None:
         """The linear step about what is foreseen, and factors of its horizon, see ``Horizon``."""

@@ -94,21 +94,19 @@ class LocomotionStepper:
         self.points = ContactPoints(
             geometry, near=self.settings.near * body.height, lower=0.1 * self.settings.near * body.height
         )
-        self._factors = factors_on(body.assembly.device, body.assembly.upper_pattern)
         self.solver = CoupledSolver(
             self.detector,
             self.points,
-            self._factors,
             push_out_cap=self.settings.push_out_cap * body.speed_unit,
             penetration_tolerance=self.settings.penetration_tolerance * body.height,
         )
-        respond = _responder_by(self._factors, body, muscles, self.solver)
-        self.solver = replace(self.solver, respond=respond)
+        self.factors = factors_on(body.assembly.device, body.assembly.upper_pattern)
+        self.respond = _responder_by(self.factors, body, muscles, self.solver)
         rest = BodyState(body.mesh.nodes, np.zeros_like(body.mesh.nodes))
         # On one thread: what is found here must not hang on how many there are.
         with one_blas_thread():
             problem = StepProblem(body, rest, body.time_unit / STEPS_A_UNIT)
-            tangent = problem.tangent(self._factors, rest.velocities, None)
+            tangent = problem.tangent(self.factors, rest.velocities, None)
             full = muscle_columns(muscles, rest.positions).toarray() * muscles.bounds
             synergies = find_synergies(muscles, tangent.solve(full), body.node_mass)
         self.planner = StepPlanner(
@@ -118,10 +116,10 @@ class LocomotionStepper:
             geometry.friction,
             self.settings,
             factors_on(body.assembly.device, body.assembly.upper_pattern),
-            linear_steps_by(self.solver.respond, muscles, synergies),
+            linear_steps_by(self.respond, muscles, synergies),
         )
         # By this planner.
-        self._at_once = _device_planner(self.planner, self.solver.respond)
+        self._at_once = _device_planner(self.planner, self.respond)
 
     def with_friction(self, friction: float) -> LocomotionStepper:
         """The same on ground of another Coulomb coefficient, for nothing: it shares what this one works with, so the
@@ -150,7 +148,7 @@ class LocomotionStepper:
         """A step of ``dt`` s without muscles."""
         problem = StepProblem(self.body, state, dt)
         contacts = self._detect(problem, memory)
-        response = self.solver.respond(problem.tangent(self._factors, problem.start, None), contacts)
+        response = self.respond(problem.tangent(self.factors, problem.start, None), contacts)
         forces = self.points.matched(contacts.points, memory.points, memory.forces)
         return self.solver.solve(response, None, velocities=problem.start, forces=forces)
 
@@ -165,7 +163,7 @@ class LocomotionStepper:
         whole of it: under the same activations, and under those of the step before. Of the two ends the one that costs
         the objectives less: where muscles go so far that no end is found, nobody has seen what they do.
         """
-        with one_blas_thread(), self._factors.stream:
+        with one_blas_thread(), self.factors.stream:
             end, after, report = self.step(state, memory, objectives, dt)
             if report.converged:
                 return end, after, [report]
@@ -190,7 +188,7 @@ class LocomotionStepper:
         self, state: BodyState, memory: StepMemory, activations: np.ndarray, dt: float
     ) -> tuple[BodyState, StepMemory, list[StepReport]]:
         """As ``advance``, under given ``activations`` (M,) metres."""
-        with one_blas_thread(), self._factors.stream:
+        with one_blas_thread(), self.factors.stream:
             end, after, report = self.held_step(state, memory, activations, dt)
             if report.converged:
                 return end, after, [report]
@@ -304,7 +302,7 @@ class LocomotionStepper:
 
     def _detect(self, problem: StepProblem, memory: StepMemory) -> ContactSet:
         loaded = memory.forces[:, 0] > 0.0
-        contacts = self.solver.respond.choose(problem, memory.points, loaded)
+        contacts = self.respond.choose(problem, memory.points, loaded)
         if contacts is not None:
             return contacts
         ballistic = problem.state.velocities + problem.dt * self.body.gravity
@@ -319,12 +317,12 @@ class LocomotionStepper:
         tension = MuscleTension.of(self.muscles, activations)
         shift = self.solver.shift(contacts, problem.dt)
         # What tension adds to the stiffness is left to the solve: what is foreseen serves no better with it.
-        tangent = problem.tangent(self._factors, velocities, None)
-        ahead = self.solver.respond.ahead(tangent, contacts, tension, velocities, known)
+        tangent = problem.tangent(self.factors, velocities, None)
+        ahead = self.respond.ahead(tangent, contacts, tension, velocities, known)
         if ahead is not None:
             velocities = ahead
-            tangent = problem.tangent(self._factors, velocities, None)
-        response = self.solver.respond(tangent, contacts)
+            tangent = problem.tangent(self.factors, velocities, None)
+        response = self.respond(tangent, contacts)
         now = response.at(tension, velocities, known)
         forces = known
         for _ in range(LOOKS):

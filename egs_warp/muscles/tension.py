@@ -162,8 +162,14 @@ class TensionHessian:
     """(M,) s, how much more tension a metre of length gives, N/m; 0 where none is so short that it loses any."""
 
     def factors(self, *, least: float) -> tuple[np.ndarray, np.ndarray]:
-        """U (3N, n) and rates (n,) with K = U diag(rates) U^T: of each segment two directions across it and the one
-        along it, where its rate is above ``least`` of the largest.
+        """U (3N, n) and rates (n,) with K = U diag(rates) U^T, of the ``ways``."""
+        segments, ways, rates = self.ways(least=least)
+        rows = self.rows[segments].toarray()
+        return np.einsum("mn,mi->nim", rows, ways).reshape(3 * rows.shape[1], len(segments)), rates
+
+    def ways(self, *, least: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Segments (n,), unit vectors (n, 3) and rates (n,) of which K is the sum: of each segment two directions
+        across it and the one along it, where its rate is above ``least`` of the largest.
         """
         axis = np.eye(3)[np.argmin(np.abs(self.directions), axis=1)]
         first = np.cross(self.directions, axis)
@@ -171,6 +177,4 @@ class TensionHessian:
         frames = np.stack([first, np.cross(self.directions, first), self.directions], axis=1)
         rates = np.stack([self.across, self.across, self.along], axis=1)
         segments, which = np.nonzero(np.abs(rates) > least * np.abs(rates).max(initial=1e-300))
-        rows = self.rows[segments].toarray()
-        U = np.einsum("mn,mi->nim", rows, frames[segments, which]).reshape(3 * rows.shape[1], len(segments))
-        return U, rates[segments, which]
+        return segments, frames[segments, which], rates[segments, which]

@@ -226,7 +226,7 @@ def on_one_corner(falling: PassiveBody) -> tuple[StepProblem, CoupledResult]:
     x, solver = falling.state.positions, falling.solver
     problem = StepProblem(falling.body, BodyState(x, np.tile([0.0, 0.0, -1.0], (len(x), 1))), DT)
     contacts = solver.detector.contact_set(np.array([0]), x)
-    response = ContactResponse.of(problem.tangent(solver.factors, problem.start, None), contacts)
+    response = ContactResponse.of(problem.tangent(falling.factors, problem.start, None), contacts)
     return problem, solver.solve(response, None, velocities=problem.start, forces=np.zeros((1, 3)))
 
 
@@ -265,7 +265,7 @@ def test_a_tangent_that_leads_nowhere_is_made_anew() -> None:
     assert light.update(masses)
     contacts = solver.detector.contact_set(np.arange(25), squashed.positions)
     ends = []
-    for tangent in (problem.tangent(solver.factors, problem.start, None), Tangent(problem, light)):
+    for tangent in (problem.tangent(standing.factors, problem.start, None), Tangent(problem, light)):
         response = ContactResponse.of(tangent, contacts)
         ends.append(solver.solve(response, None, velocities=problem.start, forces=np.zeros((25, 3))))
     assert ends[0].converged and ends[1].converged and ends[1].tangents >= 1
@@ -277,7 +277,7 @@ def test_a_response_is_the_linear_answer_of_the_step() -> None:
     standing = block()
     x, solver = standing.state.positions @ Rotation.from_rotvec([0.0, 0.1, 0.2]).as_matrix().T, standing.solver
     problem = StepProblem(standing.body, BodyState(x, np.zeros_like(x)), DT)
-    tangent = problem.tangent(solver.factors, problem.start, None)
+    tangent = problem.tangent(standing.factors, problem.start, None)
     contacts = solver.detector.contact_set(np.array([0, 7, 13, 24]), x)
     response = ContactResponse.of(tangent, contacts)
     forces = np.random.default_rng(0).standard_normal((4, 3))
@@ -297,7 +297,7 @@ def test_foreseen_forces_press_and_rub_no_more_than_they_may() -> None:
     solver, x = standing.solver, standing.state.positions
     problem = StepProblem(standing.body, standing.state, DT)
     contacts = solver.detector.contact_set(np.arange(0, 25, 3), x)
-    response = ContactResponse.of(problem.tangent(solver.factors, problem.start, None), contacts)
+    response = ContactResponse.of(problem.tangent(standing.factors, problem.start, None), contacts)
     kinds = set()
     for seed in range(8):
         pace = 0.6 if seed % 2 else 0.02

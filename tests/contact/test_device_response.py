@@ -50,7 +50,7 @@ def test_iterates_go_the_host_s_way(
     """Begun, tried in whole and in part, from there on, by another tangent with the muscles' stiffness in it, and on:
     twice, for what a GPU has recorded the first time it plays the second."""
     stepper = on_device(creature, device, monkeypatch)
-    respond, factors = stepper.solver.respond, stepper.solver.factors
+    respond, factors = stepper.respond, stepper.factors
     assert isinstance(respond, DeviceResponder)
     for number, problem in enumerate(problems(stepper, creature)):
         contacts = creature.stepper.solver.detector.contact_set(points, problem.state.positions)
@@ -68,20 +68,20 @@ def test_iterates_go_the_host_s_way(
         assert_alike(one, other)
         one, other = one.toward(second), other.toward(second)
         assert_alike(one, other)
-        stiff = problem.tangent(factors, one.velocities, tension)
-        host, there = ContactResponse.of(stiff, contacts), respond(stiff, contacts)
-        one, moved = one.by(host), other.by(there)
+        one, moved = one.anew(), other.anew()
         assert_alike(one, moved)
         assert_alike(one.toward(first), moved.toward(first))
+        host, there = one.response, moved.response
+        np.testing.assert_allclose(there.delassus, host.delassus, rtol=1e-9, atol=1e-15)
         assert_alike(host.at(None, problem.start, third), there.at(None, problem.start, third))
 
 
 def test_what_inverts_an_element_is_no_number(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """And the place before it is still there to go on from."""
     stepper = on_device(creature, device, monkeypatch)
-    respond, (problem, *_) = stepper.solver.respond, problems(stepper, creature)
+    respond, (problem, *_) = stepper.respond, problems(stepper, creature)
     contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
-    tangent = problem.tangent(stepper.solver.factors, problem.start, None)
+    tangent = problem.tangent(stepper.factors, problem.start, None)
     forces = np.zeros((6, 3))
     assert respond.ahead(tangent, contacts, pulled(creature, 1, 1e4), problem.start, forces) is None
     there, crushed = respond(tangent, contacts), np.full((6, 3), 1e4 * creature.body.weight)
@@ -98,9 +98,9 @@ def test_what_is_at_hand_no_more_is_told_again(
     """Memory is there for two places: from others a step goes on as it did the first time. And it is there for one
     response: another fails, in place of going on from what is not its own."""
     stepper = on_device(creature, device, monkeypatch)
-    respond, (problem, *_) = stepper.solver.respond, problems(stepper, creature)
+    respond, (problem, *_) = stepper.respond, problems(stepper, creature)
     contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
-    tangent = problem.tangent(stepper.solver.factors, problem.start, None)
+    tangent = problem.tangent(stepper.factors, problem.start, None)
     old, forces = respond(tangent, contacts), np.zeros((6, 3))
     first = old.at(None, problem.start, forces)
     second = first.toward(forces)

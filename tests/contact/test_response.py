@@ -59,18 +59,22 @@ def test_a_newton_step_solves_the_linear_equation(creature: Creature) -> None:
     assert missing.size == pytest.approx(push, rel=1e-6)
 
 
-def test_another_response_changes_the_newton_step_alone(creature: Creature) -> None:
+def test_another_tangent_changes_the_newton_step_alone(creature: Creature) -> None:
+    """Made where the iterate is, with the muscles' stiffness in it."""
     problem, tension, random = falling(creature)
     contacts = creature.stepper.solver.detector.contact_set(np.arange(5), problem.state.positions)
     first, second = (
         ContactResponse.of(
-            problem.tangent(SparseFactors(creature.body.assembly.upper_pattern), velocities, None), contacts
+            problem.tangent(SparseFactors(creature.body.assembly.upper_pattern), problem.start, stiff), contacts
         )
-        for velocities in (problem.start, problem.start + 0.05 * random.standard_normal(problem.start.shape))
+        for stiff in (None, tension)
     )
     forces = random.standard_normal((5, 3))
     place = first.at(tension, problem.start, forces)
-    other, fresh = place.by(second), second.at(tension, problem.start, forces)
+    fresh = second.at(tension, problem.start, forces)
+    speeds = place.speeds.copy()
+    other = place.anew()
+    assert np.array_equal(place.speeds, speeds)
     assert other.size == place.size == fresh.size and np.array_equal(other.speeds, fresh.speeds)
     assert np.abs(other.speeds - place.speeds).max() > 1e-6
     assert np.array_equal(other.toward(forces).velocities, fresh.toward(forces).velocities)

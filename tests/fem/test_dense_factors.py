@@ -13,6 +13,8 @@ from egs_warp.fem.sparse_factors import SparseFactors
 
 pytest.importorskip("torch")
 
+import torch
+
 from egs_warp.fem.dense_factors import DenseFactors
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)]
@@ -129,6 +131,31 @@ def test_dense_and_sparse_factors_agree(diagonal: float, device: str) -> None:
         assert dense.add(np.eye(60), np.full(60, 40.0)) and thin.add(np.eye(60), np.full(60, 40.0)) and dense.ready
         assert np.abs(dense.solve(right) - thin.solve(right)).max() < 1e-10
         assert np.abs((matrix + 40.0 * np.eye(60)) @ dense.solve(right) - right).max() < 1e-10
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("count", [1, 70])
+def test_directions_are_added_without_another_factor(count: int, device: str) -> None:
+    """What pulls, then what pushes; where they take too much away the sum is not definite, until the next matrix."""
+    upper, random = pattern(60), np.random.default_rng(5)
+    factors, right = DenseFactors(upper, device=device), random.normal(size=(60, 4))
+    directions = np.vstack([random.normal(size=(count, 60)), np.zeros((3, 60))])
+    for seed, strengths, definite in [(0, (3.0, 0.1), True), (1, (1e3, 0.0), True), (2, (0.1, 90.0), False)]:
+        entries = entries_of(upper, seed, 30.0)
+        half = sparse.csc_matrix((entries, upper.indices, upper.indptr), upper.shape).toarray()
+        matrix = half + np.triu(half, 1).T
+        with factors.stream:
+            factors.enqueue(torch.from_numpy(entries).to(device))
+            for sign, strength in zip((1.0, -1.0), strengths, strict=True):
+                told = np.sqrt(strength / count) * directions
+                matrix = matrix + sign * told.T @ told
+                factors.enqueue_sum(torch.from_numpy(told).to(device), sign)
+        factors.begun()
+        assert factors.ready == definite == (np.linalg.eigvalsh(matrix).min() > 0.0)
+        if definite:
+            found = factors.solve(right)
+            assert np.abs(matrix @ found - right).max() < 1e-11
+            np.testing.assert_allclose(found, np.linalg.solve(matrix, right), rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("device", DEVICES)

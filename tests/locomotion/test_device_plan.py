@@ -266,7 +266,7 @@ def test_the_same_body_on_other_ground_shares_what_it_works_with(
 ) -> None:
     """Steps by turns on two frictions are those of each alone."""
     slippery = stepper.with_friction(0.1)
-    assert slippery._at_once is stepper._at_once and slippery.solver.respond is stepper.solver.respond
+    assert slippery._at_once is stepper._at_once and slippery.respond is stepper.respond
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
     one, other = ((creature.start, memory), (creature.start, memory))
     turns: list[np.ndarray] = []

@@ -27,6 +27,7 @@ class PassiveBody:
 
     body: SoftBody
     solver: CoupledSolver
+    factors: SparseFactors
     state: BodyState
     points: np.ndarray = field(default_factory=lambda: np.zeros(0, int))
     """(n,) of the last step."""
@@ -42,7 +43,7 @@ class PassiveBody:
         gaps, _ = solver.detector.gaps(problem.end_positions(state.velocities + dt * body.gravity))
         chosen = solver.points.choose(self.points, self.forces[:, 0] > 0.0, gaps)
         contacts = solver.detector.contact_set(chosen, state.positions)
-        tangent = problem.tangent(solver.factors, problem.start, tension)
+        tangent = problem.tangent(self.factors, problem.start, tension)
         start = solver.points.matched(chosen, self.points, self.forces)
         response = ContactResponse.of(tangent, contacts)
         result = solver.solve(response, tension, velocities=problem.start, forces=start)
@@ -72,12 +73,12 @@ def passive_body(
     solver = CoupledSolver(
         ContactDetector(geometry, device=device),
         ContactPoints(geometry, near=0.01 * height, lower=1e-3 * height),
-        SparseFactors(body.assembly.upper_pattern),
         push_out_cap=0.05 * float(np.sqrt(np.linalg.norm(body.gravity) * height)),
         penetration_tolerance=5e-3 * height,
         tolerance=tolerance,
     )
-    return PassiveBody(body, solver, state or BodyState(nodes, np.zeros_like(nodes)))
+    factors = SparseFactors(body.assembly.upper_pattern)
+    return PassiveBody(body, solver, factors, state or BodyState(nodes, np.zeros_like(nodes)))
 
 
 def base_places(body: SoftBody, count: int = 5) -> np.ndarray:
