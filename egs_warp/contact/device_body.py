@@ -8,7 +8,7 @@ import warp as wp
 
 from egs_warp.contact.detection import ContactSet
 from egs_warp.contact.device_sight import DeviceSight
-from egs_warp.fem.body import SoftBody
+from egs_warp.fem.body import BodyState, SoftBody
 from egs_warp.fem.dense_factors import DenseFactors
 from egs_warp.fem.element_kernels import ElementKernels
 from egs_warp.fem.graphs import Recordings, Upload
@@ -49,7 +49,10 @@ class BodyRoom:
         self.segment_count = muscles.segment_count
         self._rows = self.tensor(muscles.difference_rows.toarray())
         self._ways = Upload(self.stream, 4 * (3 * self.segment_count + 2 * _DIRECTIONS))
-        self._problem: StepProblem | None = None
+        self._begun: tuple[BodyState, float] | None = None
+        """What lies there: the state that a step of so many seconds begins from."""
+        self._looked_for: np.ndarray | None = None
+        """(m,) points of the step before with which contacts are being chosen."""
         self.looked_at: StepProblem | None = None
         """Whose gaps at the start are known to ``sight``."""
 
@@ -63,11 +66,15 @@ class BodyRoom:
 
     def take(self, problem: StepProblem) -> None:
         """The step that begins there."""
-        if self._problem is problem:
+        self._take(problem.state, problem.dt)
+
+    def _take(self, state: BodyState, dt: float) -> None:
+        if self._begun is not None and self._begun[0] is state and self._begun[1] == dt:
             return
-        self._problem = problem
-        self._start.write(problem.state.positions, problem.state.velocities)
-        self._works.run(problem.dt, lambda: self._enqueue_start(problem.dt))
+        self._leave()
+        self._begun, self.looked_at = (state, dt), None
+        self._start.write(state.positions, state.velocities)
+        self._works.run(dt, lambda: self._enqueue_start(dt))
 
     def _enqueue_start(self, dt: float) -> None:
         self._start.send()
@@ -85,12 +92,28 @@ class BodyRoom:
         torch.add(self.velocities, self._gravity, alpha=dt, out=self.ballistic)
         self.ballistic.mul_(dt).add_(self.positions)
 
+    def look_ahead(self, state: BodyState, dt: float, before: np.ndarray) -> None:
+        """Begin ``choose`` for a step of ``dt`` seconds from ``state``; nobody waits."""
+        with self.stream:
+            self._leave()
+            self._take(state, dt)
+            self.sight.look(vectors(self.positions), vectors(self.ballistic), before)
+        self._looked_for = before
+
     def choose(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet:
         """Contacts of a step that begins there, see ``DeviceSight``."""
         with self.stream:
             self.take(problem)
-        self.looked_at, ends = problem, vectors(self.ballistic)
-        return self.sight.choose(vectors(self.positions), ends, before, loaded, problem.state.positions)
+        if self._looked_for is None or not np.array_equal(self._looked_for, before):
+            self.look_ahead(problem.state, problem.dt, before)
+        self.looked_at, self._looked_for = problem, None
+        return self.sight.choose(before, loaded, problem.state.positions)
+
+    def _leave(self) -> None:
+        """What was begun and nobody has asked for: what was told for it may still be on its way."""
+        if self._looked_for is not None:
+            self._looked_for = None
+            self.stream.wait()
 
     def enqueue_factors(self, ends: wp.array, dt: float) -> None:
         """Of the step's matrix at the positions ``ends``, without muscles."""

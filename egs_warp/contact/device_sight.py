@@ -37,15 +37,10 @@ class DeviceSight:
         self._rooms: dict[int, _Room] = {}
         self._works = Recordings(stream)
 
-    def choose(
-        self, positions: wp.array, ends: wp.array, before: np.ndarray, loaded: np.ndarray, start: np.ndarray
-    ) -> ContactSet:
-        """The contacts of a step from ``positions`` (N,), on the host ``start`` (N, 3), which may end at ``ends`` (N,):
-        ``ContactPoints.choose`` after the points ``before`` (m,), of which those ``loaded`` (m,) bool pressed."""
-        places = by_steps(len(before), _KNOWN)
-        if places not in self._rooms:
-            self._rooms[places] = _Room(self._stream, places, self._points.cell_count)
-        room = self._rooms[places]
+    def look(self, positions: wp.array, ends: wp.array, before: np.ndarray) -> None:
+        """Begin to ``choose`` for a step from ``positions`` (N,), which may end at ``ends`` (N,), after the points
+        ``before`` (m,); nobody waits."""
+        room = self._room_for(before)
         room.told.write(before)
 
         def look() -> None:
@@ -55,9 +50,19 @@ class DeviceSight:
             self._enqueue_choice(room)
 
         with self._stream:
-            self._works.run((places, positions.ptr, ends.ptr), look)
-            self._stream.wait()
-        lowest, known = room.found()
+            self._works.run((len(room.known), positions.ptr, ends.ptr), look)
+
+    def _room_for(self, before: np.ndarray) -> _Room:
+        places = by_steps(len(before), _KNOWN)
+        if places not in self._rooms:
+            self._rooms[places] = _Room(self._stream, places, self._points.cell_count)
+        return self._rooms[places]
+
+    def choose(self, before: np.ndarray, loaded: np.ndarray, start: np.ndarray) -> ContactSet:
+        """The contacts of the step for which ``look`` was begun, on the host from ``start`` (N, 3): those of
+        ``ContactPoints.choose`` after the points ``before`` (m,), of which those ``loaded`` (m,) bool pressed."""
+        self._stream.wait()
+        lowest, known = self._room_for(before).found()
         known = known[: len(before)]
         low = lowest[lowest[:, 0] >= 0.0]
         points = self._points.among(before, loaded, known[:, 1], low[:, 0].astype(int), low[:, 1])

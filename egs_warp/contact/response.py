@@ -11,6 +11,7 @@ import numpy as np
 from egs_warp.contact.coulomb import coulomb_forces
 from egs_warp.contact.detection import ContactSet
 from egs_warp.contact.newton_room import NewtonRoom, NewtonState, address_of, newton_room
+from egs_warp.fem.body import BodyState
 from egs_warp.fem.element_vectors import ElementVectors
 from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.muscles.tension import MuscleTension
@@ -84,6 +85,11 @@ class Responder(Protocol):
         if the gaps are on the host."""
         ...
 
+    def look_ahead(self, state: BodyState, dt: float, before: np.ndarray) -> None:
+        """Begin to ``choose`` for a step of ``dt`` seconds from ``state``, after the points ``before`` (m,), which
+        comes next, likely."""
+        ...
+
     def ahead(
         self,
         tangent: Tangent,
@@ -107,6 +113,9 @@ class HostResponder:
     def choose(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet | None:
         """See ``Responder``."""
         return None
+
+    def look_ahead(self, state: BodyState, dt: float, before: np.ndarray) -> None:
+        """See ``Responder``: the host has nobody who would look meanwhile."""
 
     def ahead(
         self,

@@ -337,6 +337,7 @@ class LocomotionStepper:
     ) -> tuple[BodyState, StepMemory, StepReport]:
         end = problem.end_positions(result.velocities)
         after = BodyState(end, result.velocities, problem.state.time + problem.dt)
+        self.respond.look_ahead(after, problem.dt, result.contacts.points)
         if result.seen is None:
             least_gap = float(self.detector.gaps(end)[0].min())
             internal = problem.internal_gradient(result.velocities, MuscleTension.of(self.muscles, plan.activations))

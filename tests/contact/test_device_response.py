@@ -125,3 +125,28 @@ def test_what_is_at_hand_no_more_is_told_again(
             left.onward(shift, 0.8)
     with pytest.raises(AssertionError):
         old.at(None, problem.start, forces)
+
+
+def test_a_step_has_the_same_contacts_whatever_was_looked_ahead_for(
+    creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That very step, one from another state, of another length, or after other points."""
+    stepper = on_device(creature, device, monkeypatch)
+    first, second, _ = problems(stepper, creature)
+    lifted = BodyState(creature.start.positions + [0.0, 0.0, 0.004], first.state.velocities)
+    steps = [
+        (first, np.array([3, 8])),
+        (StepProblem(stepper.body, lifted, 0.01), np.arange(20)),
+        (second, np.arange(5)),
+    ]
+    seen = set()
+    for problem, before in steps:
+        ballistic = problem.end_positions(problem.state.velocities + problem.dt * stepper.body.gravity)
+        loaded, (gaps, _) = np.ones(len(before), bool), stepper.detector.gaps(ballistic)
+        expected = stepper.points.choose(before, loaded, gaps)
+        for ahead, points in [*steps, (problem, np.arange(2))]:
+            stepper.respond.look_ahead(ahead.state, ahead.dt, points)
+            found = stepper.respond.choose(problem, before, loaded)
+            assert found is not None and np.array_equal(found.points, expected)
+        seen.add(tuple(expected))
+    assert len(seen) == 3
