@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -14,6 +14,7 @@ import warp as wp
 from egs_warp.fem.graphs import GraphStream, Recordings, Upload
 from egs_warp.fem.kept import Kept
 from egs_warp.fem.slabs import Slabs
+from egs_warp.fem.tiled_root import TiledRoot
 from egs_warp.fem.worlds import shared
 from egs_warp.kernels.fem import triangles as kernels
 from egs_warp.precision import real
@@ -205,8 +206,8 @@ class _InverseRoot:
     """R of S^-1 = R^T R for symmetric matrices S (n, n) of one pattern: L^-1 of S in the order of its slabs, columns in
     that of S.
 
-    With parts D_i, what is between them C and what joins them B_i, L_i = chol(D_i) are factored at once, then
-    chol(C - sum B_i D_i^-1 B_i^T).
+    With parts D_i, what is between them C and what joins them B_i, L_i = chol(D_i) are factored, then
+    chol(C - sum B_i D_i^-1 B_i^T): on a GPU by tiles, parts at once.
     """
 
     def __init__(self, slabs: Slabs, stream: GraphStream) -> None:
@@ -216,18 +217,23 @@ class _InverseRoot:
         place[order] = np.arange(count)
         self._place_here, self._stream = place, stream
         self._place, self.order = (torch.from_numpy(each).to(device) for each in (place, order.astype(np.int64)))
-        self.matrix, self.inverse, self._made = torch.zeros((3, count, count), dtype=torch.float64, device=device)
-        """Of these the lower triangle of S in the order of the slabs, R, and R whose columns are in that order, too."""
+        self.matrix, self.inverse = torch.zeros((2, count, count), dtype=torch.float64, device=device)
+        """Of these the lower triangle of S in the order of the slabs, and R."""
+        # Of each number of directions that were added at once.
+        self._small: dict[int, tuple[_Triangle, _Triangle]] = {}
+        self._tiled = TiledRoot(slabs, self.matrix, self.inverse) if device.type == "cuda" else None
+        if self._tiled is not None:
+            return
         ends = np.cumsum([0, *(len(part) for part in slabs.parts)]).tolist()
         self._parts = [slice(first, last) for first, last in pairwise(ends)]
         self._between = slice(ends[-1], count)
         self._triangles = [_Triangle(part.stop - part.start, device) for part in self._parts]
-        # What joins a part to those between them, by its factor, and that by its factor once more.
+        # R whose columns are in the order of the slabs, too; what joins a part to those between them, by its factor,
+        # and that by its factor once more.
+        self._made = torch.zeros_like(self.matrix)
         self._across, self._far = self._made.new_zeros((2, len(slabs.between), ends[-1]))
         self._definite = torch.zeros(len(self._parts) + 1, dtype=torch.bool, device=device)
         self._definite[-1] = True
-        # Of each number of directions that were added at once.
-        self._small: dict[int, tuple[_Triangle, _Triangle]] = {}
 
     @cached_property
     def _last(self) -> _Triangle:
@@ -246,7 +252,10 @@ class _InverseRoot:
 
     def make(self) -> torch.Tensor:
         """R of what lies in the ``matrix``; () bool, whether that is definite."""
-        self._stream.at_once([partial(self._factor_part, number) for number in range(len(self._parts))])
+        if self._tiled is not None:
+            return self._tiled.make()
+        for number in range(len(self._parts)):
+            self._factor_part(number)
         last = self._between
         if last.stop > last.start:
             left = torch.addmm(self.matrix[last, last], self._across, self._across.T, alpha=-1.0)

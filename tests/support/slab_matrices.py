@@ -1,0 +1,19 @@
+"""Matrices of bodies in slabs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+
+def slab_matrix(parts: Sequence[int], between: int, *, seed: int) -> np.ndarray:
+    """(n, n) random, positive definite: ``parts`` of so many unknowns, none of which an entry joins to another, then so
+    many ``between`` them."""
+    count = sum(parts) + between
+    half = np.random.default_rng(seed).normal(size=(count, count))
+    matrix = (half + half.T) / 2.0
+    group = np.repeat(np.arange(len(parts) + 1), [*parts, between])
+    apart = (group[:, None] != group) & (np.maximum(group[:, None], group) < len(parts))
+    matrix[apart] = 0.0
+    return matrix + 2.2 * np.sqrt(count) * np.eye(count)
