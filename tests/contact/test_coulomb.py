@@ -152,6 +152,31 @@ def test_a_block_of_threads_finds_the_forces_of_one(friction: float) -> None:
     np.testing.assert_allclose(block.cpu().numpy(), one.numpy(), rtol=0, atol=1e-9 * float(one.abs().max()))
 
 
+@pytest.mark.cuda
+@pytest.mark.parametrize("friction", [0.0, 0.4, 5.0])
+def test_a_block_of_threads_finds_the_forces_of_many_contacts_that_press(friction: float) -> None:
+    """Of more unknowns than registers have room for: in full passes of columns and not, with full tiles and not, and of
+    more than there are passes for; of more contacts than are swept together."""
+    counts, room = [41, 42, 43, 50, 53, 62, 64, 65, 80, 85, 86, 100, 130], 130
+    random = np.random.default_rng(4)
+    delassus, free = np.zeros((len(counts), 3 * room, 3 * room)), random.normal(size=(len(counts), 3 * room))
+    free[:, ::3] -= 3.0
+    shifts, starts = 0.1 * random.normal(size=(len(counts), room)), np.abs(random.normal(size=(len(counts), room, 3)))
+    for world, count in enumerate(counts):
+        half = random.normal(size=(3 * count, 12 * count))
+        delassus[world, : 3 * count, : 3 * count] = half @ half.T / (12 * count)
+    frictions = np.full(len(counts), friction)
+    given = [torch.from_numpy(each) for each in (delassus, free, shifts, frictions, starts)]
+    numbers = torch.tensor(counts, dtype=torch.int32)
+    one, _ = coulomb_forces_of_many(numbers, *given)
+    block, missed = coulomb_forces_of_many(numbers.cuda(), *(each.cuda() for each in given))
+    assert float(missed.max()) < 1e-12
+    for world, count in enumerate(counts):
+        expected, got = one[world, :count].numpy(), block[world, :count].cpu().numpy()
+        assert (expected[:, 0] > 0.0).mean() > 0.9
+        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
 def test_many_points_under_a_soft_base_are_solved_from_rest() -> None:
     """25 points that move as 12 unknowns do, made unique as a step makes them, pressed, pushed and turned: their
     equations hold, and no force is large.

@@ -12,11 +12,13 @@ from egs_warp.kernels.contact.coulomb_block import (
     SWEPT,
     in_block,
     missed_by_block,
+    shared_room,
     speeds_by_block,
     sweep_by_block,
 )
 from egs_warp.kernels.contact.coulomb_equations import Contacts, Newton, rate_of, solve_equations, write_equations
 from egs_warp.kernels.contact.coulomb_step import step_by_block
+from egs_warp.kernels.contact.coulomb_wide_step import wide_step_by_block
 from egs_warp.kernels.vectors import on_cpu
 from egs_warp.precision import Vec3, Vec4, real
 
@@ -24,6 +26,7 @@ wp.set_module_options({"enable_backward": False})
 
 _FEW_SWEEPS, _MORE_SWEEPS = wp.constant(3), wp.constant(20)
 """Before the first attempt, and before each further one."""
+_ATTEMPTS = wp.constant(7)
 _Rates = wp.types.vector(7, real)
 _RATES = wp.constant(_Rates(1.0, 0.3, 3.0, 0.1, 10.0, 0.03, 30.0))
 """Of the attempts. Where the kinks of the projections keep the steps of one rate from making them smaller, whole steps
@@ -175,9 +178,14 @@ def find_step(contacts: Contacts, forces: wp.array[real], scale: real, short: re
     solved = int(0)
     if in_block() == 1:
         solved = step_by_block(
-            contacts.delassus, contacts.friction, contacts.count, forces, newton.velocities, newton.values, scale,
-            short, _LEAST, newton.step, newton.change,
+            shared_room(), contacts.delassus, contacts.friction, contacts.count, forces, newton.velocities,
+            newton.values, scale, short, _LEAST, newton.step, newton.change,
         )  # fmt: skip
+        if solved == 0:
+            solved = wide_step_by_block(
+                shared_room(), contacts.delassus, contacts.friction, contacts.count, forces, newton.velocities,
+                newton.values, scale, short, _LEAST, newton.step, newton.change, newton.matrix,
+            )  # fmt: skip
     if solved == 0:
         unknowns = write_equations(contacts, forces, scale, short, newton)
         solve_equations(unknowns, newton)
@@ -220,8 +228,9 @@ def sweep_together(contacts: Contacts, sweeps: int, forces: wp.array[real], newt
         return
     if contacts.count <= _SWEPT:
         sweep_by_block(
-            contacts.delassus, contacts.free, contacts.shifts, contacts.friction, contacts.count, sweeps, forces
-        )
+            shared_room(), contacts.delassus, contacts.free, contacts.shifts, contacts.friction, contacts.count, sweeps,
+            forces,
+        )  # fmt: skip
         return
     find_velocities(contacts, forces, newton)
     size = 3 * contacts.count
@@ -269,59 +278,65 @@ def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp
     """Of one problem, see ``coulomb_kernel``; its residual."""
     least = real(wp.inf)
     keep(contacts, forces, newton.best, newton)
-    for attempt in range(7):
-        scale = _RATES[attempt]
-        sweeps = _MORE_SWEEPS
-        steps = _BOLD
-        if attempt == 0:
-            sweeps = _FEW_SWEEPS
-            steps = iterations
-        sweep_together(contacts, sweeps, forces, newton)
+    for attempt in range(_ATTEMPTS + 1):
+        # The last begins at the best, once they are near enough, and takes them to rounding.
+        last = least < tolerance
+        if attempt == _ATTEMPTS and not last:
+            keep(contacts, newton.best, forces, newton)
+            break
+        scale = real(1.0)
+        short = _FINEST
+        steps = _POLISHES
+        if last:
+            keep(contacts, newton.best, forces, newton)
+        else:
+            scale = _RATES[attempt]
+            sweeps = _MORE_SWEEPS
+            steps = _BOLD
+            if attempt == 0:
+                sweeps = _FEW_SWEEPS
+                steps = iterations
+            sweep_together(contacts, sweeps, forces, newton)
         find_velocities(contacts, forces, newton)
         for number in range(steps):
-            short = _SHORT
-            if attempt > 0 and number < _CAREFUL:
-                short = _SHORTER
-            if attempt % 2 == 1:
-                scale = _RATES[(attempt + number) % 7]
+            if not last:
+                short = _SHORT
+                if attempt > 0 and number < _CAREFUL:
+                    short = _SHORTER
+                if attempt % 2 == 1:
+                    scale = _RATES[(attempt + number) % _ATTEMPTS]
             size = missed(contacts, forces, scale, real(0.0), newton)
-            if size[0] < least:
+            near = tolerance
+            if last:
+                near = _POLISHED * tolerance
+                least = size[0]
+            elif size[0] < least:
                 least = size[0]
                 keep(contacts, forces, newton.best, newton)
-            if size[0] < tolerance:
+            if size[0] < near:
                 break
             find_step(contacts, forces, scale, short, newton)
             length = real(1.0)
-            if attempt == 0:
+            if last or attempt == 0:
                 found = int(0)
                 halvings = int(0)
                 while found == 0 and halvings < _HALVINGS:
                     trial = missed(contacts, forces, scale, length, newton)
-                    if trial[1] < (real(1.0) - _LESS * length) * size[1]:
+                    halvings += 1
+                    if last:
+                        halvings = _HALVINGS
+                        if trial[0] < tolerance:
+                            found = 1
+                            least = trial[0]
+                    elif trial[1] < (real(1.0) - _LESS * length) * size[1]:
                         found = 1
                     else:
                         length *= real(0.5)
-                    halvings += 1
                 if found == 0:
                     break
             move(contacts, forces, length, newton)
-        if least < tolerance:
+        if last:
             break
-    keep(contacts, newton.best, forces, newton)
-    if least < tolerance:
-        one = real(1.0)
-        find_velocities(contacts, forces, newton)
-        for _ in range(_POLISHES):
-            now = missed(contacts, forces, one, real(0.0), newton)
-            least = now[0]
-            if least < _POLISHED * tolerance:
-                break
-            find_step(contacts, forces, one, _FINEST, newton)
-            size = missed(contacts, forces, one, one, newton)
-            if not size[0] < tolerance:
-                break
-            least = size[0]
-            move(contacts, forces, one, newton)
     for i in range(newton.lane, contacts.count, wp.block_dim()):
         n = 3 * i
         normal = wp.max(forces[n], real(0.0))

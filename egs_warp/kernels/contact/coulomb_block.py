@@ -13,8 +13,10 @@ wp.set_module_options({"enable_backward": False})
 
 BLOCK = 256
 """Threads for each problem on a GPU."""
-SWEPT = 64
+SWEPT = 128
 """Contacts at most that ``sweep_by_block`` sweeps."""
+ROOM = 5264
+"""Numbers in the memory that a block shares: all that it may have, which one after the other has to itself."""
 
 _RECIPROCALS = """
     // Of normal numbers: to rounding, and without ways for what is none.
@@ -36,7 +38,8 @@ _RECIPROCALS = """
 
 def on_gpu(body: str, *, otherwise: str = "") -> str:
     """``body`` by a block on a GPU, ``otherwise`` on a CPU, which never comes there."""
-    given = f"{_RECIPROCALS}    constexpr int WARPS = {BLOCK // 32}, SWEPT = {SWEPT};\n    (void)WARPS, (void)SWEPT;\n"
+    given = f"{_RECIPROCALS}    constexpr int WARPS = {BLOCK // 32}, SWEPT = {SWEPT}, ROOM = {ROOM};\n"
+    given += "    (void)WARPS, (void)SWEPT, (void)ROOM;\n"
     return by_block(f"#if defined(__CUDA_ARCH__)\n{given}{body}\n#else\n{otherwise}\n#endif\n")
 
 
@@ -49,6 +52,20 @@ def on_gpu(body: str, *, otherwise: str = "") -> str:
 """)
 def in_block() -> int:
     """Whether this is a GPU, known while it is compiled: what is another's way is left out."""
+    ...
+
+
+@wp.func_native(
+    on_gpu(
+        """
+    __shared__ __align__(16) double room[ROOM];
+    return static_cast<unsigned>(__cvta_generic_to_shared(room));
+""",
+        otherwise="    return 0;",
+    )
+)
+def shared_room() -> wp.uint32:
+    """Where ``ROOM`` numbers lie that the threads of a block share."""
     ...
 
 
@@ -93,7 +110,11 @@ def speeds_by_block(delassus: wp.array2d[real], size: int, given: wp.array[real]
     // The first warp finds the forces of a group of contacts one after the other, while the others work out the speeds
     // at the next group, to which the first adds what its own change of them, and lay out what it needs there.
     constexpr int GROUP = 5, ROWS = 3 * GROUP, PITCH = 17;
-    __shared__ double all[3 * SWEPT], fresh[2][16], speeds[2][16], window[2][2 * ROWS * PITCH], by[SWEPT][4];
+    double* const all = (double*)__cvta_shared_to_generic(room);
+    double (*const fresh)[16] = (double (*)[16])(all + 3 * SWEPT), (*const speeds)[16] = fresh + 2;
+    double (*const window)[2 * ROWS * PITCH] = (double (*)[2 * ROWS * PITCH])(speeds + 2);
+    double (*const by)[4] = (double (*)[4])(window + 2);
+    static_assert(7 * SWEPT + 4 * (16 + ROWS * PITCH) <= ROOM, "");
     const int size = 3 * count, groups = (count + GROUP - 1) / GROUP, turns = sweeps * groups;
     const int stride = delassus.strides[0] / 8;
     const double* const G = delassus.data;
@@ -177,6 +198,7 @@ def speeds_by_block(delassus: wp.array2d[real], size: int, given: wp.array[real]
 """)
 )
 def sweep_by_block(
+    room: wp.uint32,
     delassus: wp.array2d[real],
     free: wp.array[real],
     shifts: wp.array[real],
@@ -185,7 +207,7 @@ def sweep_by_block(
     sweeps: int,
     forces: wp.array[real],
 ) -> None:
-    """``sweep`` over ``count`` contacts, 1 to ``SWEPT``."""
+    """``sweep`` over ``count`` contacts, 1 to ``SWEPT``; ``room`` is the block's."""
     ...
 
 

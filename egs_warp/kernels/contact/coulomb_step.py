@@ -8,25 +8,29 @@ from egs_warp.precision import real
 
 wp.set_module_options({"enable_backward": False})
 
-_TILES = """
-    constexpr int TILES = 2 * WARPS - 1, PAIRS = WARPS, PITCH = 8 * TILES + 10, EACH = 9;
+TILES = 15
+"""Eights of unknowns that registers have room for."""
+
+_TILES = f"""
+    constexpr int TILES = {TILES}, FEWEST = 0, PAIRS = WARPS, PITCH = 8 * TILES + 10, EACH = 9;
     // Tiles of eight rows and columns, in the order in which the threads of a warp have them: the unknowns' that are
     // eliminated now or next, what the others' rows have of them; the inverse of those on the diagonal; the two of each
     // warp in the rows of the next. Before that, rows of the equations, and sixteen of them written out.
-    __shared__ __align__(16) double room[(2 * (TILES + 1) + 2 + 2 * WARPS) * 64];
-    __shared__ int column[8 * TILES], ahead[WARPS], sound;
-    static_assert(sizeof(room) >= 8 * (EACH * 8 * TILES + 16 * PITCH), "");
-    double (*const line)[EACH] = (double (*)[EACH])room;
-    double (*const strip)[PITCH] = (double (*)[PITCH])(room + EACH * 8 * TILES);
-    double (*const lefts)[64] = (double (*)[64])room, (*const inverses)[64] = lefts + 2 * (TILES + 1);
+    double* const shared = (double*)__cvta_shared_to_generic(room);
+    double (*const line)[EACH] = (double (*)[EACH])shared;
+    double (*const strip)[PITCH] = (double (*)[PITCH])(line + 8 * TILES);
+    double (*const lefts)[64] = (double (*)[64])shared, (*const inverses)[64] = lefts + 2 * (TILES + 1);
     double (*const tops)[64] = inverses + 2 + 2 * warp;
+    static_assert(8 * EACH * TILES + 16 * PITCH <= ROOM && (2 * (TILES + 1) + 2 + 2 * WARPS) * 64 <= ROOM, "");
+"""
+
+LIST = """
+    // A row of the equations has EACH numbers of its line.
+    __shared__ int column[8 * TILES], ahead[WARPS], sound[2];
     const double *const G = delassus.data, *const f = forces.data, *const u = velocities.data;
     const int stride = delassus.strides[0] / 8;
     double* const s = step.data;
     if (count > lanes) return 0;
-"""
-
-_LIST = """
     // Each thread has a contact: what is unknown of its step, and what the others' steps move.
     const int n = 3 * lane, size = 3 * count;
     const bool mine = lane < count;
@@ -49,7 +53,7 @@ _LIST = """
     const unsigned bearing = __ballot_sync(0xffffffffu, bears), rubbing = __ballot_sync(0xffffffffu, rubs);
     const unsigned below = (1u << own) - 1u;
     if (own == 0) ahead[warp] = __popc(bearing) + 2 * __popc(rubbing);
-    if (lane == 0) sound = 1;
+    if (lane < 2) sound[lane] = 1;
     const int moves = __syncthreads_or(!(known[0] == 0.0 && known[1] == 0.0 && known[2] == 0.0));
     int place = __popc(bearing & below) + 2 * __popc(rubbing & below), unknowns = 0;
     #pragma unroll 1
@@ -58,7 +62,7 @@ _LIST = """
         unknowns += ahead[i];
     }
     const int tiles = (unknowns + 7) / 8, pairs = (tiles + 1) / 2;
-    if (tiles > TILES) return 0;
+    if (tiles < FEWEST || tiles > TILES) return 0;
     if (moves) {
         for (int row = warp; row < size; row += WARPS) {
             double sum = 0.0;
@@ -159,9 +163,9 @@ _WRITE = """
     }
 """
 
-_ELIMINATE = """
-    // Eight unknowns at a time. Products of a tile's threads: the first two pairs of numbers are rows r of one side and
-    // columns r of the other, at 2q and 2q + 1 of what is summed over.
+PRODUCTS = """
+    // Products of a tile's threads: the first two pairs of numbers are rows r of one side and columns r of the other,
+    // at 2q and 2q + 1 of what is summed over.
     auto product = [](double (&to)[2], const double2& one, const double2& other) {
         asm volatile("mma.sync.aligned.m8n8k4.row.col.f64.f64.f64.f64 {%0,%1},{%2},{%3},{%0,%1};"
                      : "+d"(to[0]), "+d"(to[1]) : "d"(one.x), "d"(other.x));
@@ -184,9 +188,36 @@ _ELIMINATE = """
     };
     auto store = [&](double* to, double one, double two) { *(double2*)(to + 2 * own) = make_double2(one, two); };
     auto load = [&](const double* from) { return *(const double2*)(from + 2 * own); };
+    // By a warp: the inverse of a tile on the diagonal, and whether it has pivots.
+    auto invert = [&](double* to, double* inverse) {
+        const double2 given = load(to);
+        double d0 = given.x, d1 = given.y;
+        bool good = true;
+        #pragma unroll
+        for (int p = 0; p < 8; ++p) {
+            const double some = p & 1 ? d1 : d0, pivot = __shfl_sync(0xffffffffu, some, 4 * p + p / 2);
+            const double factor = __shfl_sync(0xffffffffu, some, (own & 28) | (p / 2));
+            const double t0 = __shfl_sync(0xffffffffu, d0, 4 * p + q);
+            const double t1 = __shfl_sync(0xffffffffu, d1, 4 * p + q);
+            good = good && fabs(pivot) > least;
+            const double by = over(pivot), share = (r == p ? 1.0 : -factor) * by;
+            if (r == p) d0 = d1 = 0.0;
+            d0 = fma(share, t0, d0);
+            d1 = fma(share, t1, d1);
+            if (q == p / 2) (p & 1 ? d1 : d0) = share;
+        }
+        store(inverse, d0, d1);
+        // Of its own rows, less this leaves the inverse's product.
+        store(to, given.x - (r == 2 * q ? 1.0 : 0.0), given.y - (r == 2 * q + 1 ? 1.0 : 0.0));
+        return good;
+    };
+"""
+
+_ELIMINATE = """
+    // Eight unknowns at a time.
     for (int k = -1; k < tiles; ++k) {
         if (k >= 0) {
-            if (!sound) return 0;
+            if (!sound[k & 1]) return 0;
             const bool one = warp > k && warp <= tiles, two = warp + WARPS > k && warp + WARPS <= tiles;
             const double (*const left)[64] = lefts + (k & 1) * (TILES + 1);
             const double2 inverse = load(inverses[k & 1]);
@@ -248,26 +279,7 @@ _ELIMINATE = """
                 }
             if (warp == next % WARPS) {
                 __syncwarp();
-                const double2 given = load(left[next]);
-                double d0 = given.x, d1 = given.y;
-                bool good = true;
-                #pragma unroll
-                for (int p = 0; p < 8; ++p) {
-                    const double some = p & 1 ? d1 : d0, pivot = __shfl_sync(0xffffffffu, some, 4 * p + p / 2);
-                    const double factor = __shfl_sync(0xffffffffu, some, (own & 28) | (p / 2));
-                    const double t0 = __shfl_sync(0xffffffffu, d0, 4 * p + q);
-                    const double t1 = __shfl_sync(0xffffffffu, d1, 4 * p + q);
-                    good = good && fabs(pivot) > least;
-                    const double by = over(pivot), share = (r == p ? 1.0 : -factor) * by;
-                    if (r == p) d0 = d1 = 0.0;
-                    d0 = fma(share, t0, d0);
-                    d1 = fma(share, t1, d1);
-                    if (q == p / 2) (p & 1 ? d1 : d0) = share;
-                }
-                store(inverses[next & 1], d0, d1);
-                // Of its own rows, less this leaves the inverse's product.
-                store(left[next], given.x - (r == 2 * q ? 1.0 : 0.0), given.y - (r == 2 * q + 1 ? 1.0 : 0.0));
-                if (!good) sound = 0;
+                if (!invert(left[next], inverses[next & 1])) sound[next & 1] = 0;
             }
         }
         WAIT;
@@ -289,11 +301,12 @@ _ELIMINATE = """
 
 @wp.func_native(
     on_gpu(
-        f"#if __CUDA_ARCH__ < 800\n    return 0;\n#else\n{_TILES}{_LIST}{_WRITE}{_ELIMINATE}#endif\n",
+        f"#if __CUDA_ARCH__ < 800\n    return 0;\n#else\n{_TILES}{LIST}{_WRITE}{PRODUCTS}{_ELIMINATE}#endif\n",
         otherwise="    return 0;",
     )
 )
 def step_by_block(
+    room: wp.uint32,
     delassus: wp.array2d[real],
     friction: real,
     count: int,
@@ -307,6 +320,6 @@ def step_by_block(
     change: wp.array[real],
 ) -> int:
     """The ``step`` that ``write_equations`` and ``solve_equations`` find, rows not exchanged, in registers; 0, and what
-    is no step, where a pivot is not larger than ``least`` or there are more unknowns than 120. ``change`` (3n,) is
-    scratch memory."""
+    is no step, where a pivot is not larger than ``least`` or there are more unknowns than 120. ``room`` is the block's,
+    ``change`` (3n,) is scratch memory."""
     ...
