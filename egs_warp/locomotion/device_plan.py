@@ -24,14 +24,16 @@ from egs_warp.fem.worlds import shared
 from egs_warp.kernels.locomotion import step_program as kernels
 from egs_warp.kernels.locomotion.active_set import FOUND
 from egs_warp.kernels.locomotion.piece_search import HEADER
-from egs_warp.locomotion.contact_pieces import PieceSearch
+from egs_warp.kernels.locomotion.relaxed_contact import start_kernel
+from egs_warp.locomotion.contact_pieces import PieceSearch, search_pieces, solve_relaxed
 from egs_warp.locomotion.device_linear_step import DeviceLinearSteps, Transfers, squares_of
-from egs_warp.locomotion.device_search import SearchRoom
+from egs_warp.locomotion.device_search import RelaxedRoom, SearchRoom
 from egs_warp.locomotion.linear_step import LOOKS, Prospect, StepStart, torques_of
 from egs_warp.locomotion.objectives import AnyObjective, Objective
 from egs_warp.locomotion.planner import REGULAR, WORK, Plan, StepPlanner
+from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.step_cost import EFFORT, HORIZON
-from egs_warp.locomotion.strategies import Foreseen, is_doubted, search_on
+from egs_warp.locomotion.strategies import better_elsewhere, is_doubted
 from egs_warp.muscles.tension import MuscleTension
 from egs_warp.precision import real
 
@@ -108,6 +110,9 @@ class PlanRoom:
         self._verdicts = verdicts.view(2, 2)
         self._x, self._point = zeros(m + width + 1), Upload(body.stream, m + width + 1)
         self._search = SearchRoom(m, places, str(body.factors.device))
+        self._relaxed = RelaxedRoom(m, places, self._search)
+        # What contact answers where a second search begins, and by how much that misses its laws: it is only a start.
+        self._answered, self._answered_missed = zeros(width), zeros(1)
         self._works, self._arrived = Recordings(body.stream), None
 
     def plan(self, start: StepStart, objectives: Sequence[AnyObjective]) -> tuple[ContactResponse, Plan] | None:
@@ -157,22 +162,23 @@ class PlanRoom:
         self._begin_solve(start)
 
     def _found(self, start: StepStart, response: DeviceResponse) -> Plan | None:
-        """What the search has found, the host's where it goes on with that; None if anything is not as usual."""
-        *_, (definite, size, missed), answer, looked, forces, speeds, velocities = self._parts
+        """What the search has found, or a second one if that is doubted; None if anything is not as usual."""
+        *_, (definite, size, missed), answer, _, forces, speeds, velocities = self._parts
         ended, count, infeasible, objective, there = answer[:5]
         if not definite > 0.0:
             return None
         contacts = start.contacts.count
         if ended != FOUND or there != 1.0 or is_doubted(objective, contacts):
             x = answer[HEADER : HEADER + self.m + 3 * contacts].copy() if there == 1.0 else None
-            first = PieceSearch(x, objective, int(count), int(infeasible)) if ended == FOUND else None
-            found = self._searched_on(first, looked[: 3 * contacts].reshape(-1, 3))
+            first = PieceSearch(x, objective, int(count), int(infeasible)) if ended == FOUND else self._by_host()
+            found = self._searched_on(first, contacts)
             if found.x is None:
                 return None
             count, infeasible = found.qp_count, found.infeasible
-            self._end_at(found.x, start)
-            *_, (_, size, missed), _, _, forces, speeds, velocities = self._parts
-            answer[HEADER : HEADER + self.m] = found.x[: self.m]
+            if found.x is not x:
+                self._end_at(found.x, start)
+                *_, (_, size, missed), _, _, forces, speeds, velocities = self._parts
+                answer[HEADER : HEADER + self.m] = found.x[: self.m]
         if missed > ASTRAY or not np.isfinite(size):
             return None
         planner, room = self.owner.planner, self.room
@@ -183,15 +189,43 @@ class PlanRoom:
         room.at_base = room.coming = end
         return Plan(activations, end.velocities, end.forces, int(count), int(infeasible))
 
-    def _searched_on(self, found: PieceSearch | None, forces: np.ndarray) -> PieceSearch:
-        """By the host, after the kernel has ``found`` that from ``forces`` (n, 3) newtons on."""
-        planner, device = self.owner.planner, self.body.body.assembly.device
-        program, begun = self._search.program()
-        foreseen = Foreseen(begun, forces / planner.body.weight, np.zeros_like(forces))
-        return search_on(program, found, foreseen, qp_limit=planner.settings.qp_limit, device=device)
+    def _searched_on(self, found: PieceSearch, contacts: int) -> PieceSearch:
+        """``found``, or better if that costs so much that it is doubted."""
+        if not is_doubted(found.objective, contacts):
+            return found
+        relaxed = self._relaxed.solve() or solve_relaxed(self._search.asked()[0], QpSolver.OSQP)
+
+        def search(activations: np.ndarray) -> PieceSearch:
+            with self.body.stream:
+                self._point.take(activations)
+                self._do(self._enqueue_elsewhere)
+            return self._search.found(self.m + 3 * contacts) or self._by_host()
+
+        return better_elsewhere(found, relaxed, search)
+
+    def _by_host(self) -> PieceSearch:
+        """The search that was told, where rounding has led the kernel astray."""
+        program, start, modes = self._search.asked()
+        limit = self.owner.planner.settings.qp_limit
+        return search_pieces(program, start, modes, qp_limit=limit, solver=QpSolver.OSQP)
+
+    def _enqueue_elsewhere(self) -> None:
+        """A search from other activations and what contact answers to them."""
+        body, room, activations = self.body, self.room, self._point.there[: self.m]
+        moved = torch.addmv(self._speeds[:, -1], self._speeds[:, : self.m], activations)
+        self._answered.copy_(self._looked)
+        room.coulomb.enqueue_forces(moved, self._answered, self._answered_missed)
+        wp.launch(
+            start_kernel,
+            self.m + room.places,
+            inputs=[body.body.weight, shared(activations, real), vectors(self._answered)],
+            outputs=[self._search.told],
+            device=body.body.assembly.device,
+        )
+        self._search.enqueue()
 
     def _end_at(self, x: np.ndarray, start: StepStart) -> None:
-        """The end of a search that the host has made, ``x`` (m + 3n,), and the first step of the solve from there."""
+        """The end of another search than the first, ``x`` (m + 3n,), and the first step of the solve from there."""
         body, problem = self.body, start.problem
         with body.stream:
             self._point.take(x, np.zeros(len(self._x) - 1 - len(x)), np.ones(1))

@@ -10,10 +10,12 @@ import numpy as np
 import warp as wp
 
 from egs_warp.kernels.locomotion import piece_search as kernels
-from egs_warp.kernels.locomotion.active_set import ASTRAY
+from egs_warp.kernels.locomotion.active_set import ASTRAY, FOUND
 from egs_warp.kernels.locomotion.block_active_set import Holding, UnitRows
 from egs_warp.kernels.locomotion.block_splitting import Splitting
-from egs_warp.launching import Mirror, by_steps, kept_by_thread
+from egs_warp.kernels.locomotion.pieces import FACES
+from egs_warp.kernels.locomotion.relaxed_contact import Relaxed, relax_kernel
+from egs_warp.launching import Mirror, by_steps, device_of, kept_by_thread
 from egs_warp.locomotion.contact_pieces import ContactModes, ContactPieces, PieceSearch
 from egs_warp.precision import real
 
@@ -40,7 +42,7 @@ class SearchRoom:
         self.answer = zeros(kernels.HEADER + size, dtype=real)
         further, forces, answers = 9 * n, 3 * n, 5 * n
         total = m + further
-        room, rows, holding, splitting = kernels.Room(), UnitRows(), Holding(), Splitting()
+        room = kernels.Room()
         for name, shape in {
             **dict.fromkeys(("held_place", "first"), n),
             **dict.fromkeys(("touching", "held", "speeds"), forces),
@@ -61,29 +63,9 @@ class SearchRoom:
             **dict.fromkeys(("values", "trial"), size),
         }.items():
             setattr(room, name, zeros(shape, dtype=real))
-        rows.units = zeros((total, m), dtype=real)
-        for name in ("free", "lower", "upper", "slack"):
-            setattr(rows, name, zeros(total, dtype=real))
-        holding.side, holding.active = zeros(total, dtype=int), zeros(m, dtype=int)
-        for name in ("held", "held_across", "products", "root", "inverse"):
-            setattr(holding, name, zeros((m, m), dtype=real))
-        holding.at = zeros(total, dtype=real)
-        for name in ("pulls", "place", "ways", "beside", "between", "outside"):
-            setattr(holding, name, zeros(m, dtype=real))
-        splitting.begun, splitting.held_by = zeros(total, dtype=real), zeros(total, dtype=real)
-        for name in ("rows", "near", "pushes", "sums", "right", "between", "step"):
-            setattr(splitting, name, zeros(m, dtype=real))
         # The launch has where these lie.
-        self._held = room, rows, holding, splitting
-        self._launch: Any = wp.launch(
-            kernels.search_kernel,
-            dim=1 if self._device.is_cpu else kernels.BLOCK,
-            inputs=[self.told, room, rows, holding, splitting],
-            outputs=[self.answer],
-            device=self._device,
-            block_dim=kernels.BLOCK,
-            record_cmd=True,
-        )
+        self._held = room, *_active_set(total, m, self._device)
+        self._launch: Any = _launch(kernels.search_kernel, [self.told, *self._held], self.answer)
 
     @cached_property
     def _told_here(self) -> wp.array:
@@ -99,16 +81,19 @@ class SearchRoom:
         """The search, with nothing that waits."""
         self._launch.launch()
 
-    def program(self) -> tuple[ContactPieces, np.ndarray]:
-        """What was told, and the activations (m,) of the start."""
+    def asked(self) -> tuple[ContactPieces, np.ndarray, ContactModes]:
+        """What was told: the program, activations (m,) of the start and how contacts move there."""
         told = self.told.numpy()
         m, n = int(told[0]), int(told[1])
         size = m + 3 * n
-        shapes = (size, size), (size,), (3 * n, size), (3 * n,), (m,), (m,), (m,)
+        shapes = (size, size), (size,), (3 * n, size), (3 * n,), (m,), (m,), (m,), (n,), (n, 2)
         ends = np.cumsum([math.prod(shape) for shape in shapes])
         parts = np.split(told[kernels.HEADER : kernels.HEADER + ends[-1]], ends[:-1])
-        P, q, rows, offset, *bounds, start = (each.reshape(shape) for each, shape in zip(parts, shapes, strict=True))
-        return ContactPieces(P, q, float(told[3]), rows, offset, float(told[2]), *bounds), start
+        P, q, rows, offset, lower, upper, *start = (
+            each.reshape(shape) for each, shape in zip(parts, shapes, strict=True)
+        )
+        program = ContactPieces(P, q, float(told[3]), rows, offset, float(told[2]), lower, upper)
+        return program, start[0], ContactModes(start[1].astype(int), start[2])
 
     def search(
         self, program: ContactPieces, start: np.ndarray, modes: ContactModes, qp_limit: int
@@ -126,12 +111,79 @@ class SearchRoom:
         if self._told_here is not self.told:
             wp.copy(self.told, self._told_here, count=at)
         self.enqueue()
+        return self.found(m + 3 * n)
+
+    def found(self, size: int) -> PieceSearch | None:
+        """What has come of the search, a point (size,); None where rounding leads astray."""
         answer = self._answer_here.get()
         ended, count, infeasible, objective, there = answer[:5].tolist()
         if ended == ASTRAY:
             return None
-        x = answer[kernels.HEADER : kernels.HEADER + m + 3 * n] if there else None
+        x = answer[kernels.HEADER : kernels.HEADER + size] if there else None
         return PieceSearch(x, objective, int(count), int(infeasible))
+
+
+class RelaxedRoom:
+    """Memory for the optimum without complementarity of the program that a ``search`` of m activations and n contacts
+    at most was told, and its launch."""
+
+    def __init__(self, m: int, n: int, search: SearchRoom) -> None:
+        device, size, total = device_of(search.told), m + 3 * n, m + (2 + FACES) * n
+        self._answer = wp.zeros(kernels.HEADER + m, dtype=real, device=device)
+        relaxed = Relaxed()
+        for name, shape in {
+            **{"cost": (size, size), "root": (size, size), "leaving": (n, size), "speeds": n},
+            **dict.fromkeys(("minimum", "found", "slope", "values"), size),
+            **{"lengths": total, "bounds": (2, total)},
+        }.items():
+            setattr(relaxed, name, wp.zeros(shape, dtype=real, device=device))
+        # The launch has where these lie.
+        self._held = search.told, relaxed, *_active_set(total, size, device)
+        self._launch: Any = _launch(relax_kernel, list(self._held), self._answer)
+
+    @cached_property
+    def _answer_here(self) -> Mirror:
+        return Mirror(self._answer)
+
+    def solve(self) -> tuple[np.ndarray, float] | None:
+        """See ``solve_relaxed``; None where rounding leads astray."""
+        self._launch.launch()
+        answer = self._answer_here.get()
+        # Contact can always push so hard that nothing sinks in: where no point is found there is one all the same.
+        return (answer[kernels.HEADER :], float(answer[1])) if answer[0] == FOUND else None
+
+
+def _active_set(rows: int, unknowns: int, device: wp.Device) -> tuple[Any, Any, Any]:
+    """``UnitRows``, ``Holding`` and ``Splitting`` for so many at most."""
+    zeros = partial(wp.zeros, device=device)
+    units, holding, splitting = UnitRows(), Holding(), Splitting()
+    units.units = zeros((rows, unknowns), dtype=real)
+    for name in ("free", "lower", "upper", "slack"):
+        setattr(units, name, zeros(rows, dtype=real))
+    holding.side, holding.active = zeros(rows, dtype=int), zeros(unknowns, dtype=int)
+    for name in ("held", "held_across", "products", "root", "inverse"):
+        setattr(holding, name, zeros((unknowns, unknowns), dtype=real))
+    holding.at = zeros(rows, dtype=real)
+    for name in ("pulls", "place", "ways", "beside", "between", "outside"):
+        setattr(holding, name, zeros(unknowns, dtype=real))
+    splitting.begun, splitting.held_by = zeros(rows, dtype=real), zeros(rows, dtype=real)
+    for name in ("rows", "near", "pushes", "sums", "right", "between", "step"):
+        setattr(splitting, name, zeros(unknowns, dtype=real))
+    return units, holding, splitting
+
+
+def _launch(kernel: Any, inputs: list[Any], answer: wp.array) -> Any:
+    """By one block."""
+    device = device_of(answer)
+    return wp.launch(
+        kernel,
+        dim=1 if device.is_cpu else kernels.BLOCK,
+        inputs=inputs,
+        outputs=[answer],
+        device=device,
+        block_dim=kernels.BLOCK,
+        record_cmd=True,
+    )
 
 
 _room = kept_by_thread(16)(SearchRoom)

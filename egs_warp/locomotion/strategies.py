@@ -215,16 +215,6 @@ def is_doubted(objective: float, contacts: int) -> bool:
     return contacts > 0 and not objective < COSTLY
 
 
-def search_on(
-    program: ContactPieces, found: PieceSearch | None, foreseen: Foreseen, *, qp_limit: int, device: Device = None
-) -> PieceSearch:
-    """``search_program`` by ``PIECES`` and ``ADMM`` after its first search, which has ``found`` that, or was led
-    astray."""
-    if found is None:
-        found = _searched_first(program, foreseen, _How(qp_limit, QpSolver.OSQP, device))
-    return _searched_on(program, found, foreseen.forces, _How(qp_limit, QpSolver.ADMM, device))
-
-
 @dataclass(frozen=True)
 class _How:
     """Pieces are searched."""
@@ -259,18 +249,29 @@ def _searched_from(program: ContactPieces, start: np.ndarray, forces: np.ndarray
 
 
 def _searched_elsewhere(program: ContactPieces, found: PieceSearch, forces: np.ndarray, how: _How) -> PieceSearch:
-    """The better of ``found`` and of a search from where the optimum without complementarity would end up under true
-    contact; ``forces`` (n, 3) are a guess."""
+    """See ``better_elsewhere``; ``forces`` (n, 3) are a guess."""
     # Thousands of iterations, one after the other, are not for a GPU.
     bound_by = QpSolver.OSQP if how.solver is QpSolver.ADMM else how.solver
-    relaxed = solve_relaxed(program, bound_by, device=how.device)
+
+    def search(activations: np.ndarray) -> PieceSearch:
+        start = program.under(activations, forces)
+        return _searched_from(program, start, start[program.activations :].reshape(-1, 3), how)
+
+    return better_elsewhere(found, solve_relaxed(program, bound_by, device=how.device), search)
+
+
+def better_elsewhere(
+    found: PieceSearch,
+    relaxed: tuple[np.ndarray, float] | None,
+    search: Callable[[np.ndarray], PieceSearch],
+) -> PieceSearch:
+    """The better of ``found`` and of a ``search`` from where the optimum without complementarity, ``relaxed`` (see
+    ``solve_relaxed``), would end up under true contact: from its activations (m,)."""
     found = replace(found, qp_count=found.qp_count + 1)
     if relaxed is None or found.objective <= DOUBTFUL * relaxed[1]:
         return found
-    start = program.under(relaxed[0], forces)
-    answered = start[program.activations :].reshape(-1, 3)
-    other = _searched_from(program, start, answered, how)
-    best = min(found, other, key=lambda search: search.objective)
+    other = search(relaxed[0])
+    best = min(found, other, key=lambda one: one.objective)
     return replace(best, qp_count=found.qp_count + other.qp_count, infeasible=found.infeasible + other.infeasible)
 
 

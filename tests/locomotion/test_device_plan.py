@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,9 @@ from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion import device_plan, strategies
 from egs_warp.locomotion import stepper as stepping
-from egs_warp.locomotion.contact_pieces import ContactPieces, PieceSearch
-from egs_warp.locomotion.device_plan import DevicePlanner
+from egs_warp.locomotion.contact_pieces import search_pieces, solve_relaxed
+from egs_warp.locomotion.device_plan import DevicePlanner, PlanRoom
+from egs_warp.locomotion.device_search import RelaxedRoom, SearchRoom
 from egs_warp.locomotion.linear_step import Prospect, StepStart
 from egs_warp.locomotion.objectives import (
     AnyObjective,
@@ -29,7 +30,6 @@ from egs_warp.locomotion.objectives import (
 from egs_warp.locomotion.planner import Plan, StageClock
 from egs_warp.locomotion.settings import LocomotionSettings
 from egs_warp.locomotion.stepper import LocomotionStepper, StepMemory
-from egs_warp.locomotion.strategies import search_on
 from egs_warp.muscles.tension import MuscleTension
 from egs_warp.pipelines.creature import Creature
 from tests.support.creatures import coarse_pawn
@@ -171,28 +171,50 @@ def test_what_is_asked_again_is_the_host_s(creature: Creature, stepper: Locomoti
     assert planner_of(stepper).plan_again(prospect, memory.activations, objectives, start.friction) is None
 
 
-@pytest.mark.parametrize("what", ["costly", "astray"])
-def test_the_host_goes_on_with_a_search(
+@pytest.mark.parametrize("what", ["costly", "kept", "better", "astray", "no bound", "second astray"])
+def test_a_search_goes_on_as_the_host_s(
     what: str, creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """That was led astray, or whose end costs so much that another may be better: from the program on the device, to
-    the host's plan, at whose end the solve begins."""
+    """Where its end costs so much that another may be better, and where that is: to the host's plan, at whose end the
+    solve begins. Only what is led astray the host searches itself."""
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
     start = begun(stepper, creature.start, memory)
-    searched: list[PieceSearch | None] = []
+    asked: list[str] = []
 
-    def searched_on(program: ContactPieces, found: PieceSearch | None, *given: Any, **named: Any) -> PieceSearch:
-        searched.append(found)
-        return search_on(program, found, *given, **named)
+    def noted(module: Any, name: str, given: Callable[..., Any]) -> None:
+        monkeypatch.setattr(module, name, lambda *a, **b: asked.append(name) or given(*a, **b))
 
-    monkeypatch.setattr(device_plan, "search_on", searched_on)
-    if what == "costly":
+    noted(device_plan, "search_pieces", search_pieces)
+    noted(device_plan, "solve_relaxed", solve_relaxed)
+    noted(PlanRoom, "_enqueue_elsewhere", PlanRoom._enqueue_elsewhere)
+    noted(PlanRoom, "_end_at", PlanRoom._end_at)
+    if what != "astray":
         monkeypatch.setattr(strategies, "COSTLY", 0.0)
-    else:
+        monkeypatch.setattr(strategies, "DOUBTFUL", 0.0)
+    if what not in ("costly", "astray"):
+        for module in (strategies, device_plan):
+            monkeypatch.setattr(
+                module,
+                "better_elsewhere",
+                lambda found, relaxed, search: (search(relaxed[0]), found)[what == "kept"],
+            )
+    if what == "astray":
         monkeypatch.setattr(device_plan, "FOUND", -1)
         monkeypatch.setattr(strategies, "search_at_once", lambda *_, **__: None)
+    elif what == "no bound":
+        monkeypatch.setattr(RelaxedRoom, "solve", lambda _: None)
+    elif what == "second astray":
+        monkeypatch.setattr(SearchRoom, "found", lambda *_: None)
     assert is_the_host_s(stepper, start, memory, objectives)
-    assert len(searched) == 1 and (searched[0] is None) == (what == "astray")
+    expected = {
+        "costly": ["_enqueue_elsewhere", "_end_at"],
+        "better": ["_enqueue_elsewhere", "_end_at"],
+        "kept": ["_enqueue_elsewhere"],
+        "astray": ["search_pieces", "_end_at"],
+        "no bound": ["solve_relaxed", "_enqueue_elsewhere", "_end_at"],
+        "second astray": ["_enqueue_elsewhere", "search_pieces", "_end_at"],
+    }
+    assert asked == expected[what]
     found = planner_of(stepper).plan(start, objectives)
     assert found is not None
     forces, missed, ahead = (

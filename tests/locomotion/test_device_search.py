@@ -9,14 +9,22 @@ import pytest
 import warp as wp
 
 from egs_warp.contact.coulomb import coulomb_forces
-from egs_warp.kernels.locomotion import block_active_set, block_pieces, piece_search
+from egs_warp.kernels.locomotion import block_active_set, block_pieces, piece_search, pieces
 from egs_warp.kernels.locomotion.active_set import FOUND, INFEASIBLE
 from egs_warp.kernels.locomotion.block_active_set import Holding, UnitRows
 from egs_warp.kernels.locomotion.block_splitting import Splitting
 from egs_warp.locomotion import active_set, solvers, strategies
 from egs_warp.locomotion.active_set import ReducedRows, optimum_near
-from egs_warp.locomotion.contact_pieces import SLIDE, STICK, ContactModes, ContactPieces, PieceSearch, search_pieces
-from egs_warp.locomotion.device_search import search_at_once
+from egs_warp.locomotion.contact_pieces import (
+    SLIDE,
+    STICK,
+    ContactModes,
+    ContactPieces,
+    PieceSearch,
+    search_pieces,
+    solve_relaxed,
+)
+from egs_warp.locomotion.device_search import RelaxedRoom, SearchRoom, search_at_once
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.splitting import OsqpSplitting
 from egs_warp.locomotion.strategies import Foreseen, Strategy, search_program
@@ -137,14 +145,47 @@ def test_the_default_strategy_goes_by_it_and_by_the_host_where_it_is_led_astray(
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_contacts_without_a_pivot_are_left_to_the_host(device: str) -> None:
-    """No row is exchanged for another: a contact whose own force does nothing against its speed ends the launch."""
+@pytest.mark.parametrize("own", [-1.0, 0.0])
+def test_contacts_without_a_pivot_are_left_to_the_host(own: float, device: str) -> None:
+    """No row is exchanged for another: a contact whose own force does nothing against its speed ends the launch. One
+    whose force does the opposite, as friction on the way of others has it, does not."""
     program = body_program(2, 3, 2, bias=1.0)
-    program.rows[3, :] = 0.0
+    speeds = program.rows[:, 3:]
+    speeds[3, :] = 0.0
+    # What is added to the diagonal is taken off again.
+    speeds[3, 3] = own or -pieces.SINGULAR * np.abs(np.delete(np.diag(speeds), 3)).sum() / 6.0
     start = np.concatenate([np.zeros(3), [1.0, 0.0, 0.0, 1.0, 0.0, 0.0]])
     modes = ContactModes(np.full(2, STICK), np.tile([1.0, 0.0], (2, 1)))
-    program.rows[3, 3 + 3] = -1.0
-    assert search_at_once(program, start, modes, qp_limit=3, device=wp.get_device(device)) is None
+    there = search_at_once(program, start, modes, qp_limit=3, device=wp.get_device(device))
+    if own == 0.0:
+        assert there is None
+        return
+    here = search_pieces(program, start, modes, qp_limit=3, solver=QpSolver.OSQP)
+    assert there is not None and there.qp_count == here.qp_count and there.infeasible == here.infeasible
+    assert there.objective == pytest.approx(here.objective, rel=1e-7)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("activations", "contacts"), [(1, 1), (5, 3), (9, 8), (23, 11)])
+def test_one_launch_finds_the_optimum_without_complementarity(activations: int, contacts: int, device: str) -> None:
+    """What the host finds, of the program that the search was told, in a room for more; no search ends lower."""
+    search = SearchRoom(activations, contacts + 2, device)
+    room = RelaxedRoom(activations, contacts + 2, search)
+    alike = apart = 0
+    for seed in range(12):
+        program = body_program(seed, activations, contacts, bias=0.5 * (seed % 3))
+        found = search.search(program, *entered(program), 12)
+        there, here = room.solve(), solve_relaxed(program, QpSolver.OSQP)
+        assert here is not None
+        if there is None:
+            continue
+        assert there[1] == pytest.approx(here[1], rel=1e-6, abs=1e-6)
+        np.testing.assert_allclose(there[0][:activations], here[0], atol=1e-5)
+        alike += 1
+        if found is not None:
+            assert there[1] <= found.objective + 1e-6 * program.constant
+            apart += there[1] < 0.99 * found.objective
+    assert alike >= 11 and apart >= 3
 
 
 @pytest.mark.parametrize("device", DEVICES)

@@ -17,7 +17,6 @@ from egs_warp.kernels.locomotion.active_set import (
     MISSED,
     PULLS,
     REDUNDANT,
-    REVISIONS,
 )
 from egs_warp.kernels.locomotion.block_algebra import (
     add_product,
@@ -186,21 +185,6 @@ def let_go_of_wrong(rows: UnitRows, holding: Holding, count: int):
     wrong = sum_of_block(wrong)
     wait_for_block()
     return int(wrong)
-
-
-@wp.func
-def hold_broken(rows: UnitRows, holding: Holding):
-    """How many rows without a side break their bounds; they are given one."""
-    broken = real(0.0)
-    for row in range(lane_of_block(), rows.count, wp.block_dim()):
-        at = holding.at[row]
-        breach = wp.max(rows.lower[row] - at, at - rows.upper[row]) - rows.slack[row]
-        if holding.side[row] == 0 and breach > real(0.0):
-            holding.side[row] = wp.where(at < rows.lower[row], 1, -1)
-            broken += real(1.0)
-    broken = sum_of_block(broken)
-    wait_for_block()
-    return int(broken)
 
 
 @wp.func
@@ -405,26 +389,23 @@ def find_optimum(rows: UnitRows, holding: Holding):
     """From the sides, a guess: how it ended. See ``active_set.optimum_kernel``.
 
     Of the guess those rows stay that pull the right way; then broken ones join one at a time. A round in which all that
-    is wrong changes at once, as there, costs more here than the joins that it saves: 2.3 rows join less without any.
+    is wrong changes at once, as there, costs more here than the joins that it saves: 2.3 rows join less without any. Of
+    3,459 recorded pieces none is wrong at the end, and of 1,025 programs without complementarity 12, where rows are too
+    near to each other: to begin anew from there took these five times as long, and four of them to no end.
     """
-    # Not a range, which would be written out.
-    revisions = int(0)
-    while revisions < REVISIONS:
-        revisions += 1
-        count = int(0)
-        wrong = int(1)
-        while wrong > 0:
-            count = hold(rows, holding)
-            if count < 0:
-                let_go_of_all(rows, holding)
-            else:
-                wrong = let_go_of_wrong(rows, holding, count)
-        count = descend(rows, holding, count)
-        if count == -1:
-            return INFEASIBLE
+    count = int(0)
+    wrong = int(1)
+    while wrong > 0:
+        count = hold(rows, holding)
         if count < 0:
-            return ASTRAY
+            let_go_of_all(rows, holding)
+        else:
+            wrong = let_go_of_wrong(rows, holding, count)
+    count = descend(rows, holding, count)
+    if count == -1:
+        return INFEASIBLE
+    if count >= 0:
         refine(rows, holding, count)
-        if let_go_of_wrong(rows, holding, count) + hold_broken(rows, holding) == 0:
+        if let_go_of_wrong(rows, holding, count) == 0 and most_broken(rows, holding) < 0:
             return FOUND
     return ASTRAY

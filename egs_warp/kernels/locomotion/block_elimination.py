@@ -82,7 +82,7 @@ _TAKE_OFF = """
             bool there = true;
             #pragma unroll
             for (int p = 0; p < B; ++p) {
-                there = there && (D[p][p] > least || begin + p >= end);
+                there = there && (wp::abs(D[p][p]) > least || begin + p >= end);
                 const double by = 1.0 / D[p][p];
                 D[p][p] = 1.0;
                 #pragma unroll
@@ -132,7 +132,8 @@ _TAKE_OFF = """
 )
 def eliminate(matrix: wp.array2d[real], unknowns: int, columns: int, singular: real) -> int:
     """Of a ``matrix`` (unknowns, columns) the right sides, behind the unknowns, become the solution, and what is before
-    them is lost; 0 where a pivot on the diagonal is less than a ``singular`` share of the diagonal's mean."""
+    them is lost; 0 where a pivot on the diagonal is smaller, of whatever sign, than a ``singular`` share of the
+    diagonal's mean."""
     ...
 
 

@@ -40,7 +40,7 @@ _LEAVES, _SLIPS, _TURNS, _LANDS = wp.constant(LEAVES), wp.constant(SLIPS), wp.co
 _FACES = wp.constant(FACES)
 _Faces = wp.types.vector(FACES, real)
 _ANGLES = [2.0 * math.pi * face / FACES for face in range(FACES)]
-_COSINES, _SINES = (wp.constant(_Faces(*map(each, _ANGLES))) for each in (math.cos, math.sin))
+COSINES, SINES = (wp.constant(_Faces(*map(each, _ANGLES))) for each in (math.cos, math.sin))
 _FACE_COSINE = wp.constant(real(math.cos(math.pi / FACES)))
 _WEDGE_SINE, _WEDGE_COSINE = wp.constant(real(math.sin(WEDGE))), wp.constant(real(math.cos(WEDGE)))
 _SINGULAR, _BROKEN, _ROUNDING = (wp.constant(real(each)) for each in (SINGULAR, BROKEN, ROUNDING))
@@ -198,7 +198,7 @@ def list_contacts(program: Program, room: Room, sticks: int, slides: int):
                 room.held[held + 2] = 3 * i + 2
                 for face in range(_FACES):
                     row = sticks + slides + face * sticks + order
-                    share = wp.vec3d(mu * _FACE_COSINE, -_COSINES[face], -_SINES[face])
+                    share = wp.vec3d(mu * _FACE_COSINE, -COSINES[face], -SINES[face])
                     last = write_row(room, last, row, i, _SLIPS, parts, share)
             else:
                 room.speeds[speed] = 3 * i + 1

@@ -1,0 +1,265 @@
+"""The optimum of a step's program without complementarity: a block of threads on a GPU, one thread on a CPU.
+
+What ``contact_pieces.solve_relaxed`` does on a host: see there, and docs/concepts/locomotion.md.
+"""
+
+import warp as wp
+
+from egs_warp.kernels.block import sum_of_block, wait_for_block
+from egs_warp.kernels.locomotion.active_set import ASTRAY, FOUND
+from egs_warp.kernels.locomotion.block_active_set import Holding, UnitRows, find_optimum
+from egs_warp.kernels.locomotion.block_algebra import (
+    add_product,
+    apply_root,
+    lane_of_block,
+    multiply,
+    multiply_at,
+    normalise,
+)
+from egs_warp.kernels.locomotion.block_elimination import invert_root
+from egs_warp.kernels.locomotion.block_pieces import COSINES, LEFT, ROOM, SINES, Program
+from egs_warp.kernels.locomotion.block_splitting import Splitting, iterate
+from egs_warp.kernels.locomotion.piece_search import BLOCK, HEADER, HOPELESS, guess, program_in
+from egs_warp.kernels.locomotion.pieces import FACES, SINGULAR
+from egs_warp.kernels.locomotion.step_program import tell_contact
+from egs_warp.precision import Vec3, real
+
+wp.set_module_options({"enable_backward": False})
+
+_HEADER, _OF_FORCES = wp.constant(HEADER), wp.constant(1 + FACES)
+_SINGULAR = wp.constant(real(SINGULAR))
+
+
+@wp.struct
+class Relaxed:
+    """Scratch memory for N = m + 3n unknowns, m activations and the forces of n contacts, at most. Of k = m + 10n rows
+    the first n are how fast contacts leave the ground, the next m the activations, then come the forces."""
+
+    cost: wp.array2d[real]
+    """(N, N)."""
+    root: wp.array2d[real]
+    """(N, N) of its inverse."""
+    leaving: wp.array2d[real]
+    """(n, N) the first rows."""
+    minimum: wp.array[real]
+    found: wp.array[real]
+    slope: wp.array[real]
+    values: wp.array[real]
+    """(N,)."""
+    speeds: wp.array[real]
+    """(n,)."""
+    lengths: wp.array[real]
+    """(k,)."""
+    bounds: wp.array2d[real]
+    """(2, k)."""
+
+
+@wp.func
+def share_of(friction: real, part: int):
+    """Of a force, what is not negative: the normal one, or what a face around the cone leaves."""
+    if part == 0:
+        return wp.vec3d(real(1.0), real(0.0), real(0.0))
+    return wp.vec3d(friction, -COSINES[part - 1], -SINES[part - 1])
+
+
+@wp.func
+def regular(program: Program):
+    """What is added to the diagonal of the cost."""
+    mean = real(0.0)
+    for i in range(lane_of_block(), program.size, wp.block_dim()):
+        mean += program.told[program.cost + i * (program.size + 1)] / real(program.size)
+    mean = sum_of_block(mean)
+    wait_for_block()
+    return _SINGULAR * mean
+
+
+@wp.func
+def write_root(program: Program, relaxed: Relaxed, added: real):
+    """Of the cost with so much ``added`` to its diagonal, and its minimum; by how much that is lower, -1 where there is
+    no root."""
+    lane = lane_of_block()
+    size = program.size
+    for e in range(lane, size * size, wp.block_dim()):
+        value = program.told[program.cost + e]
+        if e % (size + 1) == 0:
+            value += added
+        relaxed.cost[e / size, e % size] = value
+    for i in range(lane, size, wp.block_dim()):
+        relaxed.slope[i] = program.told[program.slope + i]
+    wait_for_block()
+    if invert_root(relaxed.cost, size, relaxed.root) == 0:
+        return real(-1.0)
+    apply_root(relaxed.root, size, relaxed.slope, relaxed.values, relaxed.minimum)
+    worth = real(0.0)
+    for i in range(lane, size, wp.block_dim()):
+        relaxed.minimum[i] = -relaxed.minimum[i]
+        worth -= real(0.5) * relaxed.slope[i] * relaxed.minimum[i]
+    worth = wp.max(sum_of_block(worth), real(1.0))
+    wait_for_block()
+    return worth
+
+
+@wp.func
+def see_speeds(program: Program, relaxed: Relaxed, point: wp.array[real]):
+    """How fast contacts leave the ground at the ``point``, but for the program's ``offset``."""
+    multiply(relaxed.leaving, program.n, program.size, point, relaxed.speeds)
+
+
+@wp.func
+def at_row(program: Program, relaxed: Relaxed, row: int, point: wp.array[real]):
+    """What a row is at the ``point``, whose speeds were seen last."""
+    if row < program.n:
+        return relaxed.speeds[row]
+    k = row - program.n
+    if k < program.m:
+        return point[k]
+    k -= program.m
+    share = share_of(program.friction, k % _OF_FORCES)
+    value = real(0.0)
+    for t in range(3):
+        value += share[t] * point[program.m + 3 * (k / _OF_FORCES) + t]
+    return value
+
+
+@wp.func
+def write_rows(program: Program, relaxed: Relaxed, rows: UnitRows, begun: wp.array[real]):
+    """In coordinates whose squares are costs, from whose origin the search begins."""
+    lane = lane_of_block()
+    m = program.m
+    n = program.n
+    size = program.size
+    for e in range(lane, n * size, wp.block_dim()):
+        relaxed.leaving[e / size, e % size] = program.told[program.rows + 3 * (e / size) * size + e % size]
+        rows.units[e / size, e % size] = real(0.0)
+    wait_for_block()
+    add_product(rows.units, relaxed.leaving, relaxed.root, n, size, size, 0)
+    for e in range(lane, (rows.count - n) * size, wp.block_dim()):
+        k = e / size
+        c = e % size
+        value = real(0.0)
+        if k < m:
+            value = relaxed.root[k, c]
+        else:
+            share = share_of(program.friction, (k - m) % _OF_FORCES)
+            for t in range(3):
+                value += share[t] * relaxed.root[m + 3 * ((k - m) / _OF_FORCES) + t, c]
+        rows.units[n + k, c] = value
+    wait_for_block()
+    normalise(rows.units, rows.count, size, relaxed.lengths)
+    see_speeds(program, relaxed, relaxed.minimum)
+    for row in range(lane, rows.count, wp.block_dim()):
+        least = real(0.0)
+        most = real(wp.inf)
+        if row < n:
+            least = -program.told[program.offset + 3 * row]
+        elif row < n + m:
+            least = program.told[program.lower + row - n]
+            most = program.told[program.upper + row - n]
+        relaxed.bounds[0, row] = least - ROOM
+        relaxed.bounds[1, row] = most + ROOM
+        length = relaxed.lengths[row]
+        rows.free[row] = at_row(program, relaxed, row, relaxed.minimum) / length
+        rows.lower[row] = relaxed.bounds[0, row] / length
+        rows.upper[row] = relaxed.bounds[1, row] / length
+        rows.slack[row] = LEFT * wp.max(real(1.0), length) / length
+        begun[row] = real(0.0)
+    wait_for_block()
+
+
+@wp.func
+def misses(program: Program, relaxed: Relaxed, count: int):
+    """How many rows the point that was found breaks."""
+    see_speeds(program, relaxed, relaxed.found)
+    missed = real(0.0)
+    for row in range(lane_of_block(), count, wp.block_dim()):
+        at = at_row(program, relaxed, row, relaxed.found)
+        slack = real(10.0) * LEFT * wp.max(real(1.0), relaxed.lengths[row])
+        if not (at > relaxed.bounds[0, row] - slack and at < relaxed.bounds[1, row] + slack):
+            missed += real(1.0)
+    missed = sum_of_block(missed)
+    wait_for_block()
+    return int(missed)
+
+
+@wp.func
+def objective_at(program: Program, relaxed: Relaxed, added: real):
+    """What the point that was found costs."""
+    size = program.size
+    multiply_at(program.told, program.cost, size, size, size, relaxed.found, relaxed.values)
+    total = real(0.0)
+    for k in range(lane_of_block(), size, wp.block_dim()):
+        at = relaxed.found[k]
+        total += at * (real(0.5) * (relaxed.values[k] + added * at) + relaxed.slope[k])
+    total = sum_of_block(total)
+    wait_for_block()
+    return total + program.constant
+
+
+@wp.kernel(launch_bounds=BLOCK)
+def relax_kernel(
+    # In:
+    told: wp.array[real],
+    # Scratch:
+    relaxed: Relaxed,
+    rows: UnitRows,
+    holding: Holding,
+    splitting: Splitting,
+    # Out:
+    answer: wp.array[real],
+):
+    """``solve_relaxed`` of what is ``told``, as ``search_kernel`` reads it. ``answer``: how it ended, the objective;
+    from ``HEADER`` on the activations (m,)."""
+    lane = lane_of_block()
+    program = program_in(told)
+    size = program.size
+    added = regular(program)
+    worth = write_root(program, relaxed, added)
+    ended = ASTRAY
+    if worth > real(0.0):
+        rows.unknowns = size
+        rows.count = program.m + (1 + _OF_FORCES) * program.n
+        rows.most = HOPELESS * worth
+        write_rows(program, relaxed, rows, splitting.begun)
+        ended = FOUND
+        for k in range(lane, size, wp.block_dim()):
+            relaxed.found[k] = real(0.0)
+        wait_for_block()
+        if guess(rows, holding) > 0:
+            iterate(rows, holding, splitting)
+            ended = find_optimum(rows, holding)
+            multiply(relaxed.root, size, size, holding.place, relaxed.found)
+        for k in range(lane, size, wp.block_dim()):
+            relaxed.found[k] = relaxed.found[k] + relaxed.minimum[k]
+        wait_for_block()
+    if ended == FOUND:
+        if misses(program, relaxed, rows.count) > 0:
+            ended = ASTRAY
+        objective = objective_at(program, relaxed, added)
+        for k in range(lane, program.m, wp.block_dim()):
+            answer[_HEADER + k] = wp.clamp(relaxed.found[k], told[program.lower + k], told[program.upper + k])
+        if lane == 0:
+            answer[1] = objective
+    if lane == 0:
+        answer[0] = real(ended)
+
+
+@wp.kernel
+def start_kernel(
+    # Model:
+    weight: real,
+    # In:
+    activations: wp.array[real],
+    forces: wp.array[Vec3],
+    # Out:
+    told_out: wp.array[real],
+):
+    """A search from these ``activations`` (m,), to which contact answers ``forces`` (K,) newtons, in place of the one
+    that was told; ``weight`` is newtons. m + K threads."""
+    k = wp.tid()
+    program = program_in(told_out)
+    begin = program.upper + program.m
+    kinds = begin + program.m
+    if k < program.m:
+        told_out[begin + k] = activations[k]
+    if k < program.n:
+        tell_contact(told_out, kinds, kinds + program.n, k, forces[k] / weight, program.friction)
