@@ -41,6 +41,7 @@ class BodyRoom:
         self.arms, self.start, self.ballistic = self.zeros(3, size)
         self.turns, self.rates = self.zeros(size, 3), self.zeros(1, 3, 3)
         """See ``StepProblem``; ``ballistic`` is where the nodes would end without forces, metres."""
+        self._ends = vectors(self.positions), vectors(self.ballistic)
         self._gravity = self.tensor(np.tile(body.gravity, len(body.mesh.nodes)))
         self._works = Recordings(self.stream)
         self.no_tensions = wp.zeros(0, dtype=real, device=body.assembly.device)
@@ -97,7 +98,7 @@ class BodyRoom:
         with self.stream:
             self._leave()
             self._take(state, dt)
-            self.sight.look(vectors(self.positions), vectors(self.ballistic), before)
+            self.sight.look(*self._ends, before)
         self._looked_for = before
 
     def choose(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet:

@@ -74,7 +74,7 @@ class ContactRoom:
         """Where what was asked for last comes; one more may be on its way."""
         self.size, self.speeds_after, self.velocities, self.missed, self._found, seen = self._asked.split(parts)
         self._seen, self._torque_seen = seen.split([2, 3])
-        self._answer_ends = np.cumsum(parts)[:-1]
+        self._answers = [Tried(*np.split(each.numpy(), np.cumsum(parts)[:-1])) for each in self._asked_here]
         self.coulomb = CoulombRoom(owner.stream, places, count)
         self._begun = Upload(owner.stream, 3 * size + width + owner.segment_count)
         self.begun, self.tensions = self._begun.there.split([3 * size + width, owner.segment_count])
@@ -289,7 +289,7 @@ class ContactRoom:
 
     def _answer(self, slot: int) -> Tried:
         """What has come of what was asked of a trial."""
-        return Tried(*np.split(self._asked_here[slot].numpy(), self._answer_ends))
+        return self._answers[slot]
 
     def _enqueue_base(self) -> None:
         self._launch(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sparse
@@ -42,7 +43,7 @@ class SoftBody:
     height: float
     """H, metres: extent along the plane's normal."""
 
-    @property
+    @cached_property
     def mass(self) -> float:
         """Kilograms."""
         return float(self.node_mass.sum())
@@ -57,17 +58,17 @@ class SoftBody:
         """E over that of a column of the same height with the default sag."""
         return self.young_modulus * DEFAULT_SAG / (self.assembly.material.density * GRAVITY * self.height)
 
-    @property
+    @cached_property
     def weight(self) -> float:
         """Newtons."""
         return self.mass * float(np.linalg.norm(self.gravity))
 
-    @property
+    @cached_property
     def time_unit(self) -> float:
         """sqrt(H / g), seconds."""
         return float(np.sqrt(self.height / np.linalg.norm(self.gravity)))
 
-    @property
+    @cached_property
     def speed_unit(self) -> float:
         """sqrt(g H), m/s."""
         return float(np.sqrt(np.linalg.norm(self.gravity) * self.height))

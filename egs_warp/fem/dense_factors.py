@@ -221,13 +221,13 @@ class _InverseRoot:
         """Of these the lower triangle of S in the order of the slabs, and R."""
         # Of each number of directions that were added at once.
         self._small: dict[int, tuple[_Triangle, _Triangle]] = {}
-        self._tiled = TiledRoot(slabs, self.matrix, self.inverse) if device.type == "cuda" else None
+        self._tiled = TiledRoot(slabs, self.matrix, self.inverse, stream) if device.type == "cuda" else None
         if self._tiled is not None:
             return
         ends = np.cumsum([0, *(len(part) for part in slabs.parts)]).tolist()
         self._parts = [slice(first, last) for first, last in pairwise(ends)]
         self._between = slice(ends[-1], count)
-        self._triangles = [_Triangle(part.stop - part.start, device) for part in self._parts]
+        self._triangles = [_Triangle(part.stop - part.start, stream) for part in self._parts]
         # R whose columns are in the order of the slabs, too; what joins a part to those between them, by its factor,
         # and that by its factor once more.
         self._made = torch.zeros_like(self.matrix)
@@ -238,11 +238,11 @@ class _InverseRoot:
     @cached_property
     def _last(self) -> _Triangle:
         """Of what lies between."""
-        return _Triangle(self._between.stop - self._between.start, self._stream.device)
+        return _Triangle(self._between.stop - self._between.start, self._stream)
 
     @cached_property
     def _whole(self) -> _Triangle:
-        return _Triangle(len(self.order), self._stream.device)
+        return _Triangle(len(self.order), self._stream)
 
     def places_of(self, rows: np.ndarray, columns: np.ndarray) -> torch.Tensor:
         """Where the entries at ``rows`` and ``columns`` of one triangle lie in the flat ``matrix``."""
@@ -282,7 +282,7 @@ class _InverseRoot:
         """
         count = len(directions)
         if count not in self._small:
-            self._small[count] = _Triangle(count, self._stream.device), _Triangle(count, self._stream.device)
+            self._small[count] = _Triangle(count, self._stream), _Triangle(count, self._stream)
         plain, raised = self._small[count]
         through = torch.mm(self.inverse, directions.T)
         one = torch.eye(count, dtype=torch.float64, device=through.device)
@@ -308,13 +308,13 @@ class _InverseRoot:
 class _Triangle:
     """Inverses of Cholesky factors of one size: of small blocks on the diagonal at once, then of pairs of them."""
 
-    def __init__(self, count: int, device: torch.device) -> None:
+    def __init__(self, count: int, stream: GraphStream) -> None:
         pairs = max(0, math.ceil(math.log2(count / kernels.LARGEST)))
         # Even, for what loads two numbers at once.
         side = 2 * math.ceil(count / 2 ** (pairs + 1))
         size = side * 2**pairs
-        self._count, self._side, self._size = count, side, size
-        self._given = torch.eye(size, dtype=torch.float64, device=device)
+        self._count, self._side, self._size, self._stream = count, side, size, stream
+        self._given = torch.eye(size, dtype=torch.float64, device=stream.device)
         self._made = torch.zeros_like(self._given)
         self.inverse = self._made[:count, :count]
 
@@ -336,7 +336,7 @@ class _Triangle:
             inputs=[shared(self._given, real), side],
             outputs=[shared(self._made, real)],
             device=wp.device_from_torch(lower.device),
-            stream=wp.stream_from_torch(torch.cuda.current_stream(lower.device)) if lower.is_cuda else None,
+            stream=self._stream.current(),
             block_dim=lanes,
         )
         while side < self._size:

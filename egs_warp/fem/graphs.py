@@ -36,6 +36,9 @@ class GraphStream:
         if device.type == "cuda":
             self._stream = wp.stream_to_torch(wp.get_device(str(device)).stream)
         self._others: list[Any] = []
+        self._of_warp: dict[int, wp.Stream] = {}
+        if self._stream is not None:
+            self._of_warp[self._stream.cuda_stream] = wp.get_device(str(device)).stream
         self._pool: Any = None
         self._first: Any = None
 
@@ -52,6 +55,16 @@ class GraphStream:
 
     def __exit__(self, *raised: Any) -> None:
         _entered.contexts.pop()[1].__exit__(*raised)
+
+    def current(self) -> wp.Stream | None:
+        """Warp's name of the stream on which torch works: this one, or one of those that are ``at_once``."""
+        if self._stream is None:
+            return None
+        stream = torch.cuda.current_stream(self.device)
+        # Kept: with a name goes what Warp holds for that stream, whoever else has a name of it.
+        if stream.cuda_stream not in self._of_warp:
+            self._of_warp[stream.cuda_stream] = wp.stream_from_torch(stream)
+        return self._of_warp[stream.cuda_stream]
 
     def wait(self) -> None:
         """Until all is done that was begun."""

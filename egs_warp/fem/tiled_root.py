@@ -6,6 +6,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from egs_warp.fem.graphs import GraphStream
 from egs_warp.fem.root_tasks import RootTasks
 from egs_warp.fem.slabs import Slabs
 from egs_warp.fem.worlds import shared
@@ -20,10 +21,10 @@ class TiledRoot:
     """R of S^-1 = R^T R for symmetric matrices S (n, n) by one kernel: L^-1 of S in the order of its slabs, columns in
     that of S."""
 
-    def __init__(self, slabs: Slabs, matrix: torch.Tensor, inverse: torch.Tensor) -> None:
+    def __init__(self, slabs: Slabs, matrix: torch.Tensor, inverse: torch.Tensor, stream: GraphStream) -> None:
         """``matrix``: the lower triangle of S in the order of the slabs; ``inverse``: where R comes."""
         tasks = RootTasks([len(part) for part in slabs.parts], len(slabs.between))
-        device = matrix.device
+        device, self._stream = matrix.device, stream
         order = slabs.order.astype(np.int32)
         place = np.empty_like(order)
         place[order] = np.arange(len(order))
@@ -47,7 +48,7 @@ class TiledRoot:
             inputs=self._given,
             outputs=self._made,
             device=self._device,
-            stream=wp.stream_from_torch(torch.cuda.current_stream(self._definite.device)),
+            stream=self._stream.current(),
             block_dim=BLOCK,
         )
         return self._definite[0]

@@ -103,8 +103,8 @@ class PlanRoom:
         self._entries, self._slope, self._energy = zeros(len(owner.factors.places)), zeros(size), zeros(1)
         # In one piece, as it comes back: what tells whether all went as usual, the answer, and forces.
         lengths = [4, LOOKS + 2, LOOKS, 3, HEADER + m + width, width, width, width, size]
-        self._made, self._ends = zeros(sum(lengths)), np.cumsum(lengths)[:-1]
-        self._made_here = body.stream.pinned(len(self._made))
+        self._made, self._made_here = zeros(sum(lengths)), body.stream.pinned(sum(lengths))
+        self._parts = np.split(self._made_here.numpy(), np.cumsum(lengths)[:-1])
         verdicts, self._sizes, self._missed, self._usual, *others = self._made.split(lengths)
         self._answer, self._looked, self._forces, self._speeds_after, self._end = others
         self._verdicts = verdicts.view(2, 2)
@@ -127,7 +127,7 @@ class PlanRoom:
             self._do(self._enqueue_foresight, problem.dt, 1.0 + problem.dt * problem.drag)
         body.factors.begun()
         self._search_for(start, objectives, TRIED)
-        verdicts, sizes, missed, *_ = self._parts()
+        verdicts, sizes, missed, *_ = self._parts
         if not (verdicts.min() > 0.0 and np.isfinite(sizes).all() and missed.max() <= ASTRAY):
             return None
         tangent = Tangent(problem, body.factors)
@@ -161,12 +161,9 @@ class PlanRoom:
         self.owner.factors.begun()
         self._begin_solve(start)
 
-    def _parts(self) -> list[np.ndarray]:
-        return np.split(self._made_here.numpy(), self._ends)
-
     def _found(self, start: StepStart, response: DeviceResponse) -> Plan | None:
         """What the search has found, or a second one if that is doubted; None if anything is not as usual."""
-        *_, (definite, size, missed), answer, _, forces, speeds, velocities = self._parts()
+        *_, (definite, size, missed), answer, _, forces, speeds, velocities = self._parts
         ended, count, infeasible, objective, there = answer[:5]
         if not definite > 0.0:
             return None
@@ -180,7 +177,7 @@ class PlanRoom:
             count, infeasible = found.qp_count, found.infeasible
             if found.x is not x:
                 self._end_at(found.x, start)
-                *_, (_, size, missed), _, _, forces, speeds, velocities = self._parts()
+                *_, (_, size, missed), _, _, forces, speeds, velocities = self._parts
                 answer[HEADER : HEADER + self.m] = found.x[: self.m]
         if missed > ASTRAY or not np.isfinite(size):
             return None

@@ -136,7 +136,8 @@ def roll_out(
     replay = Replay(resume, recorder.start, stepper.detector) if resume is not None else None
     for frame in range(frames):
         for part in range(per_frame):
-            objectives = motion.objectives(state, reports[-1] if reports else None, dt)
+            with one_blas_thread():
+                objectives = motion.objectives(state, reports[-1] if reports else None, dt)
             kick = kicks(state.time, dt)
             held = None if activations is None else activations[frame * per_frame + part]
             asked = digest([*objectives, *(given for given in (kick, held) if given is not None)])

@@ -18,6 +18,7 @@ import numpy as np
 from egs_warp.errors import UserError
 from egs_warp.fem.body import DEFAULT_SAG, BodyState
 from egs_warp.locomotion.rollout import solver_steps
+from egs_warp.locomotion.threads import one_blas_thread
 from egs_warp.motions.script import MOST_MOTIONS
 from egs_warp.pipelines.creature import Creature, changed_creature, first_place
 from egs_warp.pipelines.drawn import DrawnCreature
@@ -147,7 +148,8 @@ class Session:
         self._single_steps = max(self._single_steps - 1, 0)
         before = self.state
         try:
-            objectives = self.steering.objectives(before, self.report, self._dt)
+            with one_blas_thread():
+                objectives = self.steering.objectives(before, self.report, self._dt)
             kick = self._touches.kick(self._place, before, self._dt)
             stepper, start = self.creature.stepper, before.kicked(kick)
             self.state, self._memory, reports = stepper.advance(start, self._memory, objectives, self._dt)

@@ -176,3 +176,15 @@ def test_a_gpu_gets_dense_factors() -> None:
 
 def test_a_cpu_gets_sparse_factors() -> None:
     assert isinstance(factors_on(wp.get_device("cpu"), pattern(20)), SparseFactors)
+
+
+@pytest.mark.cuda
+def test_factors_leave_what_warp_holds_for_its_stream() -> None:
+    """Memory for sorts, which would go while a graph is recorded."""
+    upper = band(150)
+    factors, count = DenseFactors(upper, device="cuda:0"), 1000
+    for seed in range(3):
+        keys, values = (wp.array(np.arange(2 * count)[::-1].astype(np.int32), dtype=int, device="cuda:0") for _ in "kv")
+        wp.utils.radix_sort_pairs(keys, values, count)
+        assert factors.update(entries_of(upper, seed, 12.0))
+        assert np.array_equal(keys.numpy()[:count], np.arange(count, 2 * count))

@@ -12,6 +12,7 @@ pytest.importorskip("torch")
 
 import torch
 
+from egs_warp.fem.graphs import GraphStream
 from egs_warp.fem.tiled_root import TiledRoot
 
 SIZES = [
@@ -39,7 +40,7 @@ def test_tiles_make_the_inverse_of_a_factor(parts: list[int], between: int) -> N
     *slabs, rest = np.split(order, cuts)
     given = slab_matrix(parts, between, seed=count)
     matrix, inverse = torch.zeros((2, count, count), dtype=torch.float64, device="cuda")
-    tiled = TiledRoot(Slabs(slabs, rest), matrix, inverse)
+    tiled = TiledRoot(Slabs(slabs, rest), matrix, inverse, GraphStream(matrix.device))
 
     def make(entries: np.ndarray) -> bool:
         inverse.fill_(3.0)

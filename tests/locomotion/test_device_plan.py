@@ -238,14 +238,10 @@ def test_what_is_not_as_usual_is_left_to_the_host(
         **{"verdicts": ((0, 3), 0.0), "sizes": ((1, 2), np.nan), "missed": ((2, 1), 1.0)},
         **{"horizon": ((3, 0), 0.0), "end": ((3, 1), np.inf), "forces": ((3, 2), 1.0)},
     }[what]
-    parts = PlanRoom._parts
-
-    def other(room: PlanRoom) -> list[np.ndarray]:
-        made = [part.copy() for part in parts(room)]
-        made[place[0]][place[1]] = value
-        return made
-
-    monkeypatch.setattr(PlanRoom, "_parts", other)
+    room = planner_of(stepper)._room_for(start)
+    told = [part.copy() for part in room._parts]
+    told[place[0]][place[1]] = value
+    monkeypatch.setattr(room, "_parts", told)
     assert planner_of(stepper).plan(start, objectives) is None
     end, _, reports = stepper.advance(creature.start, memory, objectives, DT)
     stepper._at_once = None
