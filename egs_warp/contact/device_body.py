@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 import warp as wp
@@ -50,10 +52,12 @@ class BodyRoom:
         self.segment_count = muscles.segment_count
         self._rows = self.tensor(muscles.difference_rows.toarray())
         self._ways = Upload(self.stream, 4 * (3 * self.segment_count + 2 * _DIRECTIONS))
-        self._begun: tuple[BodyState, float] | None = None
+        self._taken: tuple[BodyState, float] | None = None
         """What lies there: the state that a step of so many seconds begins from."""
         self._looked_for: np.ndarray | None = None
         """(m,) points of the step before with which contacts are being chosen."""
+        self.begun: Any = None
+        """What has been begun there with this start, nothing else since."""
         self.looked_at: StepProblem | None = None
         """Whose gaps at the start are known to ``sight``."""
 
@@ -70,10 +74,10 @@ class BodyRoom:
         self._take(problem.state, problem.dt)
 
     def _take(self, state: BodyState, dt: float) -> None:
-        if self._begun is not None and self._begun[0] is state and self._begun[1] == dt:
+        if self._taken is not None and self._taken[0] is state and self._taken[1] == dt:
             return
         self._leave()
-        self._begun, self.looked_at = (state, dt), None
+        self._taken, self.looked_at, self.begun = (state, dt), None, None
         self._start.write(state.positions, state.velocities)
         self._works.run(dt, lambda: self._enqueue_start(dt))
 

@@ -43,6 +43,10 @@ class StepProblem:
     drag: float = 0.0
     """alpha of Rayleigh damping (drag against the air), 1/s."""
 
+    def is_of(self, state: BodyState, dt: float) -> bool:
+        """Whether it is the step of ``dt`` seconds from that very ``state``."""
+        return self.state is state and self.dt == dt
+
     @cached_property
     def damping(self) -> Damping:
         """What the body's damping resists."""

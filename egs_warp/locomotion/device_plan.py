@@ -55,10 +55,16 @@ class DevicePlanner:
         self.masses = np.repeat(body.node_mass, 3)
         self._rooms: dict[int, PlanRoom] = {}
 
+    def begin(self, start: StepStart) -> None:
+        """What of a ``plan`` hangs on nothing that is asked; nobody waits for it."""
+        self._room_for(start).begin(start)
+
     def plan(self, start: StepStart, objectives: Sequence[AnyObjective]) -> tuple[ContactResponse, Plan] | None:
         """The response that is at hand then, and the plan for what the ``objectives`` ask, on the way to whose end the
         solve's first step is; None where something is not as usual: a matrix that is not definite, an element that is
         inverted, or forces that are not found."""
+        if self.owner.begun is not start:
+            self.begin(start)
         return self._room_for(start).plan(start, objectives)
 
     def plan_again(
@@ -115,7 +121,7 @@ class PlanRoom:
         self._answered, self._answered_missed = zeros(width), zeros(1)
         self._works, self._arrived = Recordings(body.stream), None
 
-    def plan(self, start: StepStart, objectives: Sequence[AnyObjective]) -> tuple[ContactResponse, Plan] | None:
+    def begin(self, start: StepStart) -> None:
         """See ``DevicePlanner``."""
         body, room, problem = self.body, self.room, start.problem
         body.at_hand = room.at_base = room.at_trial = room.coming = None
@@ -126,7 +132,14 @@ class PlanRoom:
             self._tell(start, start.activations)
             self._do(self._enqueue_foresight, problem.dt, 1.0 + problem.dt * problem.drag)
         body.factors.begun()
-        self._search_for(start, objectives, TRIED)
+        self._begin_linear(start, TRIED)
+        body.begun = start
+
+    def plan(self, start: StepStart, objectives: Sequence[AnyObjective]) -> tuple[ContactResponse, Plan] | None:
+        """See ``DevicePlanner``; it has begun."""
+        body, room, problem = self.body, self.room, start.problem
+        body.begun = None
+        self._search_for(start, objectives)
         verdicts, sizes, missed, *_ = self._parts
         if not (verdicts.min() > 0.0 and np.isfinite(sizes).all() and missed.max() <= ASTRAY):
             return None
@@ -143,23 +156,30 @@ class PlanRoom:
             self._tell(start, prospect.activations)
             self._told.send()
             self.room.wanted.copy_(self._known)
-        self.room.at_base = self.room.at_trial = self.room.coming = None
-        self._search_for(start, objectives, base)
+        self.body.begun = self.room.at_base = self.room.at_trial = self.room.coming = None
+        self._begin_linear(start, base)
+        self._search_for(start, objectives)
         assert isinstance(prospect.response, DeviceResponse)
         return self._found(start, prospect.response)
 
-    def _search_for(self, start: StepStart, objectives: Sequence[AnyObjective], base: float) -> None:
-        """The program about what lies at the ``base``, its search, and the first step of the solve, for which nobody
-        waits."""
-        body, problem = self.body, start.problem
-        dt, ratio = problem.dt, 1.0 + problem.dt * problem.drag
-        time = max(HORIZON * body.body.time_unit, dt)
-        with body.stream:
-            self._do(self._enqueue_linear, dt, ratio, time, base)
-            self._ask(start, objectives)
-            self._do(self._enqueue_search, dt, ratio, time)
+    def _begin_linear(self, start: StepStart, base: float) -> None:
+        """The linear step about what lies at the ``base``, for which nobody waits."""
+        dt, ratio = start.problem.dt, 1.0 + start.problem.dt * start.problem.drag
+        with self.body.stream:
+            self._do(self._enqueue_linear, dt, ratio, self._horizon(dt), base)
         self.owner.factors.begun()
+
+    def _search_for(self, start: StepStart, objectives: Sequence[AnyObjective]) -> None:
+        """The program about the linear step, its search, and the first step of the solve, for which nobody waits."""
+        dt, ratio = start.problem.dt, 1.0 + start.problem.dt * start.problem.drag
+        with self.body.stream:
+            self._ask(start, objectives)
+            self._do(self._enqueue_search, dt, ratio, self._horizon(dt))
         self._begin_solve(start)
+
+    def _horizon(self, dt: float) -> float:
+        """Seconds."""
+        return max(HORIZON * self.body.body.time_unit, dt)
 
     def _found(self, start: StepStart, response: DeviceResponse) -> Plan | None:
         """What the search has found, or a second one if that is doubted; None if anything is not as usual."""

@@ -51,6 +51,10 @@ class StepMemory:
         """What the step of ``report`` hands on."""
         return cls(report.contacts.points, report.forces, report.activations)
 
+    def is_same(self, other: StepMemory) -> bool:
+        """Whether it has the very arrays of the ``other``."""
+        return self.points is other.points and self.forces is other.forces and self.activations is other.activations
+
 
 @dataclass(frozen=True)
 class StepReport:
@@ -118,8 +122,9 @@ class LocomotionStepper:
             factors_on(body.assembly.device, body.assembly.upper_pattern),
             linear_steps_by(self.respond, muscles, synergies),
         )
-        # By this planner.
+        # By this planner; and how the step begins that comes next, likely.
         self._at_once = _device_planner(self.planner, self.respond)
+        self._ahead: tuple[StepMemory, StepStart] | None = None
 
     def with_friction(self, friction: float) -> LocomotionStepper:
         """The same on ground of another Coulomb coefficient, for nothing: it shares what this one works with, so the
@@ -131,7 +136,7 @@ class LocomotionStepper:
         other.detector = copy(self.detector)
         other.detector.geometry = other.geometry
         other.solver = replace(self.solver, detector=other.detector)
-        other.planner = replace(self.planner, friction=friction)
+        other.planner, other._ahead = replace(self.planner, friction=friction), None
         return other
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -223,12 +228,12 @@ class LocomotionStepper:
     def step(
         self, state: BodyState, memory: StepMemory, objectives: Sequence[AnyObjective], dt: float
     ) -> tuple[BodyState, StepMemory, StepReport]:
-        """Detect, foresee, plan, solve, report."""
+        """Detect, foresee, plan, solve, report, and begin the next."""
         clock = StageClock()
-        problem = StepProblem(self.body, state, dt, self.settings.drag)
-        contacts = self._detect(problem, memory)
+        start = self._start(state, memory, dt)
+        problem = start.problem
         clock.lap("detect")
-        response, plan = self._plan(problem, contacts, memory, objectives, clock)
+        response, plan = self._plan(start, memory, objectives, clock)
         # A GPU is on its way to the end meanwhile.
         expected = self._missed(problem, objectives, response.contacts, plan)
         result = self._solve(response, plan)
@@ -238,26 +243,36 @@ class LocomotionStepper:
             and self._missed(problem, objectives, result.contacts, result) > _AMISS * expected + _LITTLE
         ):
             plan, result = self._again(problem, plan, result, memory, objectives, clock)
-        return self._finish(problem, plan, result, clock)
+        end, after, report = self._finish(problem, plan, result, clock)
+        if self._at_once is not None and report.converged:
+            # A GPU foresees the next one while the motion is asked what that is to do.
+            start = self._start(end, after, dt)
+            self._at_once.begin(start)
+            self._ahead = after, start
+            clock.lap("begin")
+        return end, after, report
+
+    def _start(self, state: BodyState, memory: StepMemory, dt: float) -> StepStart:
+        """How a step begins, as it was begun when the one before had ended, if it goes on from there."""
+        ahead, self._ahead = self._ahead, None
+        if ahead is not None and ahead[0].is_same(memory) and ahead[1].problem.is_of(state, dt):
+            return ahead[1]
+        problem = StepProblem(self.body, state, dt, self.settings.drag)
+        contacts = self._detect(problem, memory)
+        known = self.points.matched(contacts.points, memory.points, memory.forces)
+        shift = self.solver.shift(contacts, dt)
+        return StepStart(problem, contacts, shift, self.geometry.friction, memory.activations, known)
 
     def _plan(
-        self,
-        problem: StepProblem,
-        contacts: ContactSet,
-        memory: StepMemory,
-        objectives: Sequence[AnyObjective],
-        clock: StageClock,
+        self, start: StepStart, memory: StepMemory, objectives: Sequence[AnyObjective], clock: StageClock
     ) -> tuple[ContactResponse, Plan]:
         """What is foreseen, and the plan about it: on a GPU at once, if all goes as usual."""
         if self._at_once is not None:
-            known = self.points.matched(contacts.points, memory.points, memory.forces)
-            shift, friction = self.solver.shift(contacts, problem.dt), self.geometry.friction
-            start = StepStart(problem, contacts, shift, friction, memory.activations, known)
             found = self._at_once.plan(start, objectives)
             clock.lap("plan")
             if found is not None:
                 return found
-        prospect = self.foresee(problem, contacts, memory, memory.activations)
+        prospect = self.foresee(start.problem, start.contacts, memory, memory.activations)
         clock.lap("foresee")
         return prospect.response, self.planner.plan(prospect, memory.activations, objectives, clock)
 

@@ -308,3 +308,35 @@ def test_the_same_body_on_other_ground_shares_what_it_works_with(
             alone.append(state.positions)
     for turn, place in zip(turns, (0, 2, 1, 3), strict=True):
         np.testing.assert_allclose(turn, alone[place], rtol=0, atol=1e-9 * stepper.body.height)
+
+
+def test_a_step_is_begun_when_the_one_before_has_ended(
+    creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once; whatever else is done there meanwhile, it is begun again, and ends alike."""
+    counted: list[StepStart] = []
+    begin = DevicePlanner.begin
+    monkeypatch.setattr(DevicePlanner, "begin", lambda self, start: counted.append(start) or begin(self, start))
+    objectives, slippery = asks(creature, 0.1), stepper.with_friction(0.2)
+    first = on_its_edge(stepper), stepper.initial_memory()
+
+    def end_after(meanwhile: Callable[[BodyState, StepMemory], object]) -> np.ndarray:
+        state, memory, _ = stepper.advance(*first, objectives, DT)
+        meanwhile(state, memory)
+        counted.clear()
+        end, _, (report,) = stepper.advance(state, memory, objectives, DT)
+        assert report.converged
+        return end.positions
+
+    expected = end_after(lambda state, memory: setattr(stepper, "_ahead", None))
+    assert len(counted) == 2
+    for times, meanwhile in [
+        (1, lambda state, memory: None),
+        (2, lambda state, memory: slippery.advance(state, memory, objectives, DT)),
+        (2, lambda state, memory: slippery.advance_held(state, memory, memory.activations, DT)),
+        (2, lambda state, memory: slippery.advance(*first, objectives, DT)),
+        (2, lambda state, memory: stepper.passive_step(first[0], memory, DT)),
+    ]:
+        found = end_after(meanwhile)
+        assert len(counted) == times
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
