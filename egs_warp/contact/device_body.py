@@ -50,7 +50,7 @@ class BodyRoom:
         self.gradients = wp.zeros(len(body.mesh.tets), dtype=Mat33, device=body.assembly.device)
         self.lines = elements.muscle_lines(MuscleTension.of(muscles, np.zeros(muscles.segment_count)))
         self.segment_count = muscles.segment_count
-        self._rows = self.tensor(muscles.difference_rows.toarray())
+        self._rows = self.tensor(self.lines.rows.toarray())
         self._ways = Upload(self.stream, 4 * (3 * self.segment_count + 2 * _DIRECTIONS))
         self._taken: tuple[BodyState, float] | None = None
         """What lies there: the state that a step of so many seconds begins from."""
