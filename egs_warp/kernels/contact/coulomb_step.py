@@ -1,5 +1,5 @@
-"""A Newton step of the search for contact forces by a block of threads on a GPU, see ``coulomb_block``: equations in
-registers, eliminated eight unknowns at a time."""
+"""A Newton step of the search for contact forces by a block of threads on a GPU, see ``coulomb_block``: each thread has
+equations of its own, eliminated eight unknowns at a time."""
 
 import warp as wp
 
@@ -9,7 +9,7 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 TILES = 15
-"""Eights of unknowns that registers have room for."""
+"""Eights of unknowns that the threads have room for."""
 
 _TILES = f"""
     constexpr int TILES = {TILES}, FEWEST = 0, PAIRS = WARPS, PITCH = 8 * TILES + 10, EACH = 9;
@@ -115,7 +115,7 @@ LIST = """
 """
 
 _WRITE = """
-    // Written out sixteen rows at a time, from where each warp takes its columns, at most two of tiles: in registers.
+    // Written out sixteen rows at a time, from where each warp takes its columns, at most two of tiles.
     const int r = own >> 2, q = own & 3;
     double part[2][PAIRS][4];
     #pragma unroll 1
@@ -319,7 +319,7 @@ def step_by_block(
     step: wp.array[real],
     change: wp.array[real],
 ) -> int:
-    """The ``step`` that ``write_equations`` and ``solve_equations`` find, rows not exchanged, in registers; 0, and what
-    is no step, where a pivot is not larger than ``least`` or there are more unknowns than 120. ``room`` is the block's,
+    """The ``step`` that ``write_equations`` and ``solve_equations`` find, rows not exchanged; 0, and what is no step,
+    where a pivot is not larger than ``least`` or there are more unknowns than 120. ``room`` is the block's,
     ``change`` (3n,) is scratch memory."""
     ...
