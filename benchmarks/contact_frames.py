@@ -142,7 +142,7 @@ def animation_frames(
         problem = StepProblem(body, state, dt)
         contact_set = stepper.detector.contact_set(points, state.positions)
         memory = StepMemory(points, forces, before)
-        prospect = stepper.foresee(problem, contact_set, memory, before)
+        prospect = stepper.foresee(stepper.start_of(problem, contact_set, memory))
         result = stepper.solver.solve(
             prospect.response,
             MuscleTension.of(muscles, now),

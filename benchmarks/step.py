@@ -66,7 +66,7 @@ def contact_errors(creature: Creature, before: StepReport, step: StepReport) -> 
     """(3k,) m/s by which a tangent misses the speeds of the k loaded contacts, by where it is."""
     stepper, contacts, muscles = creature.stepper, step.contacts, creature.muscles
     problem = StepProblem(creature.body, before.state, step.dt)
-    foreseen = stepper.foresee(problem, contacts, memory_of(before), before.activations).velocities
+    foreseen = stepper.foresee(stepper.start_of(problem, contacts, memory_of(before))).velocities
     factors = SparseFactors(creature.body.assembly.upper_pattern)
     now = MuscleTension.of(muscles, step.activations)
     loaded = np.repeat(step.forces[:, 0] > 0.0, 3)

@@ -218,7 +218,8 @@ class LocomotionStepper:
         """A step of ``dt`` s under given ``activations`` (M,) metres."""
         clock = StageClock()
         problem = StepProblem(self.body, state, dt, self.settings.drag)
-        prospect = self.foresee(problem, self._detect(problem, memory), memory, activations)
+        start = self.start_of(problem, self._detect(problem, memory), memory)
+        prospect = self.foresee(replace(start, activations=activations))
         clock.lap("foresee")
         plan = Plan(activations, prospect.velocities, prospect.forces)
         result = self._solve(prospect.response, plan)
@@ -233,7 +234,7 @@ class LocomotionStepper:
         start = self._start(state, memory, dt)
         problem = start.problem
         clock.lap("detect")
-        response, plan = self._plan(start, memory, objectives, clock)
+        response, plan = self._plan(start, objectives, clock)
         # A GPU is on its way to the end meanwhile.
         expected = self._missed(problem, objectives, response.contacts, plan)
         result = self._solve(response, plan)
@@ -258,13 +259,16 @@ class LocomotionStepper:
         if ahead is not None and ahead[0].is_same(memory) and ahead[1].problem.is_of(state, dt):
             return ahead[1]
         problem = StepProblem(self.body, state, dt, self.settings.drag)
-        contacts = self._detect(problem, memory)
+        return self.start_of(problem, self._detect(problem, memory), memory)
+
+    def start_of(self, problem: StepProblem, contacts: ContactSet, memory: StepMemory) -> StepStart:
+        """How a step with these ``contacts`` begins after that of the ``memory``."""
         known = self.points.matched(contacts.points, memory.points, memory.forces)
-        shift = self.solver.shift(contacts, dt)
+        shift = self.solver.shift(contacts, problem.dt)
         return StepStart(problem, contacts, shift, self.geometry.friction, memory.activations, known)
 
     def _plan(
-        self, start: StepStart, memory: StepMemory, objectives: Sequence[AnyObjective], clock: StageClock
+        self, start: StepStart, objectives: Sequence[AnyObjective], clock: StageClock
     ) -> tuple[ContactResponse, Plan]:
         """What is foreseen, and the plan about it: on a GPU at once, if all goes as usual."""
         if self._at_once is not None:
@@ -272,9 +276,9 @@ class LocomotionStepper:
             clock.lap("plan")
             if found is not None:
                 return found
-        prospect = self.foresee(start.problem, start.contacts, memory, memory.activations)
+        prospect = self.foresee(start)
         clock.lap("foresee")
-        return prospect.response, self.planner.plan(prospect, memory.activations, objectives, clock)
+        return prospect.response, self.planner.plan(prospect, start.activations, objectives, clock)
 
     def _again(
         self,
@@ -324,13 +328,10 @@ class LocomotionStepper:
         gaps, _ = self.detector.gaps(problem.end_positions(ballistic))
         return self.detector.contact_set(self.points.choose(memory.points, loaded, gaps), problem.state.positions)
 
-    def foresee(
-        self, problem: StepProblem, contacts: ContactSet, memory: StepMemory, activations: np.ndarray
-    ) -> Prospect:
-        """What ``activations`` (M,) metres, those of the step before, would bring."""
-        velocities, known = problem.start, self.points.matched(contacts.points, memory.points, memory.forces)
-        tension = MuscleTension.of(self.muscles, activations)
-        shift = self.solver.shift(contacts, problem.dt)
+    def foresee(self, start: StepStart) -> Prospect:
+        """What its activations, those of the step before, would bring."""
+        problem, contacts, known = start.problem, start.contacts, start.forces
+        velocities, tension = problem.start, MuscleTension.of(self.muscles, start.activations)
         # What tension adds to the stiffness is left to the solve: what is foreseen serves no better with it.
         tangent = problem.tangent(self.factors, velocities, None)
         ahead = self.respond.ahead(tangent, contacts, tension, velocities, known)
@@ -341,11 +342,11 @@ class LocomotionStepper:
         now = response.at(tension, velocities, known)
         forces = known
         for _ in range(LOOKS):
-            forces, _, ahead = now.onward(shift, self.geometry.friction)
+            forces, _, ahead = now.onward(start.shift, start.friction)
             if not ahead.feasible:
                 break
             now = ahead
-        return Prospect(response, shift, activations, now.velocities, forces)
+        return Prospect(response, start.shift, start.activations, now.velocities, forces)
 
     def _finish(
         self, problem: StepProblem, plan: Plan, result: CoupledResult, clock: StageClock

@@ -64,10 +64,7 @@ def asks(creature: Creature, speed: float) -> list[AnyObjective]:
 
 def begun(stepper: LocomotionStepper, state: BodyState, memory: StepMemory) -> StepStart:
     problem = StepProblem(stepper.body, state, DT, stepper.settings.drag)
-    contacts = stepper._detect(problem, memory)
-    known = stepper.points.matched(contacts.points, memory.points, memory.forces)
-    shift = stepper.solver.shift(contacts, DT)
-    return StepStart(problem, contacts, shift, stepper.geometry.friction, memory.activations, known)
+    return stepper.start_of(problem, stepper._detect(problem, memory), memory)
 
 
 def on_its_edge(stepper: LocomotionStepper) -> BodyState:
@@ -93,7 +90,7 @@ def is_the_host_s(
     response, plan = found
     begun_at = response.at(None, plan.velocities, plan.forces)
     delassus = response.delassus.copy()
-    prospect = stepper.foresee(start.problem, start.contacts, memory, memory.activations)
+    prospect = stepper.foresee(start)
     expected = stepper.planner.plan(prospect, memory.activations, objectives, StageClock())
     height = stepper.body.height
     assert plan.qp_count == expected.qp_count and plan.qp_infeasible == expected.qp_infeasible

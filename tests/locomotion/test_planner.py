@@ -51,7 +51,7 @@ def test_activations_cost_the_squares_of_what_their_muscles_give_or_take(monkeyp
     muscles, start = stepper.muscles, states[-1]
     memory = StepMemory.after(reports[-1])
     problem = StepProblem(stepper.body, start, DT, stepper.settings.drag)
-    prospect = stepper.foresee(problem, reports[-1].contacts, memory, memory.activations)
+    prospect = stepper.foresee(stepper.start_of(problem, reports[-1].contacts, memory))
 
     def pieces() -> ContactPieces:
         return stepper.planner.program(prospect, memory.activations, asked(stepper, 7)).pieces

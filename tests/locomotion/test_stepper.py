@@ -134,7 +134,7 @@ def test_what_a_program_foresees_is_in_its_units() -> None:
     states, reports = run_hop(stepper, 3)
     memory = StepMemory.after(reports[-1])
     problem = StepProblem(body, states[-1], DT, stepper.settings.drag)
-    prospect = stepper.foresee(problem, reports[-1].contacts, memory, memory.activations)
+    prospect = stepper.foresee(stepper.start_of(problem, reports[-1].contacts, memory))
     foreseen = stepper.planner.program(prospect, memory.activations, hop(body, 3)).foreseen
     speeds = prospect.response.contacts.speeds(prospect.velocities.ravel()).reshape(-1, 3)
     assert np.abs(speeds).max() > 1e-3 and prospect.forces[:, 0].sum() > 0.5 * body.weight
