@@ -56,8 +56,8 @@ class BodyRoom:
         """What lies there: the state that a step of so many seconds begins from."""
         self._looked_for: np.ndarray | None = None
         """(m,) points of the step before with which contacts are being chosen."""
-        self.begun: Any = None
-        """What has been begun there with this start, nothing else since."""
+        self.foreseen: Any = None
+        """The start of which a plan has begun there; None once anything else was done."""
         self.looked_at: StepProblem | None = None
         """Whose gaps at the start are known to ``sight``."""
 
@@ -77,7 +77,7 @@ class BodyRoom:
         if self._taken is not None and self._taken[0] is state and self._taken[1] == dt:
             return
         self._leave()
-        self._taken, self.looked_at, self.begun = (state, dt), None, None
+        self._taken, self.looked_at, self.foreseen = (state, dt), None, None
         self._start.write(state.positions, state.velocities)
         self._works.run(dt, lambda: self._enqueue_start(dt))
 

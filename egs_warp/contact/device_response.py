@@ -35,7 +35,7 @@ class DeviceResponder(BodyRoom):
     def __call__(self, tangent: Tangent, contacts: ContactSet) -> DeviceResponse:
         """The response at hand from now on."""
         assert tangent.factors is self.factors
-        room, self.begun = self.room_for(contacts), None
+        room, self.foreseen = self.room_for(contacts), None
         with self.stream:
             self.take(tangent.problem)
             delassus = room.respond(tangent.problem, contacts)
@@ -55,7 +55,7 @@ class DeviceResponder(BodyRoom):
         """See ``Responder``. No response is at hand then."""
         assert tangent.factors is self.factors
         room = self.room_for(contacts)
-        self.begun = self.at_hand = room.at_base = room.at_trial = room.coming = None
+        self.foreseen = self.at_hand = room.at_base = room.at_trial = room.coming = None
         with self.stream:
             self.take(tangent.problem)
         size, ahead = room.ahead(tangent.problem, contacts, tension, velocities, forces)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sparse
@@ -206,8 +205,7 @@ class _InverseRoot:
     """R of S^-1 = R^T R for symmetric matrices S (n, n) of one pattern: L^-1 of S in the order of its slabs, columns in
     that of S.
 
-    With parts D_i, what is between them C and what joins them B_i, L_i = chol(D_i) are factored, then
-    chol(C - sum B_i D_i^-1 B_i^T): on a GPU by tiles, parts at once.
+    On a GPU slabs are eliminated at once, by tiles; on a CPU the whole goes by torch.
     """
 
     def __init__(self, slabs: Slabs, stream: GraphStream) -> None:
@@ -222,23 +220,6 @@ class _InverseRoot:
         # Of each number of directions that were added at once.
         self._small: dict[int, tuple[_Triangle, _Triangle]] = {}
         self._tiled = TiledRoot(slabs, self.matrix, self.inverse, stream) if device.type == "cuda" else None
-        if self._tiled is not None:
-            return
-        ends = np.cumsum([0, *(len(part) for part in slabs.parts)]).tolist()
-        self._parts = [slice(first, last) for first, last in pairwise(ends)]
-        self._between = slice(ends[-1], count)
-        self._triangles = [_Triangle(part.stop - part.start, stream) for part in self._parts]
-        # R whose columns are in the order of the slabs, too; what joins a part to those between them, by its factor,
-        # and that by its factor once more.
-        self._made = torch.zeros_like(self.matrix)
-        self._across, self._far = self._made.new_zeros((2, len(slabs.between), ends[-1]))
-        self._definite = torch.zeros(len(self._parts) + 1, dtype=torch.bool, device=device)
-        self._definite[-1] = True
-
-    @cached_property
-    def _last(self) -> _Triangle:
-        """Of what lies between."""
-        return _Triangle(self._between.stop - self._between.start, self._stream)
 
     @cached_property
     def _whole(self) -> _Triangle:
@@ -254,25 +235,9 @@ class _InverseRoot:
         """R of what lies in the ``matrix``; () bool, whether that is definite."""
         if self._tiled is not None:
             return self._tiled.make()
-        for number in range(len(self._parts)):
-            self._factor_part(number)
-        last = self._between
-        if last.stop > last.start:
-            left = torch.addmm(self.matrix[last, last], self._across, self._across.T, alpha=-1.0)
-            self._definite[-1] = self._last.factor(left)
-            self._made[last, last] = self._last.inverse
-            torch.mm(self._last.inverse, self._far, out=self._across)
-            torch.neg(self._across, out=self._made[last, : last.start])
-        self._give(self._made)
-        return self._definite.all()
-
-    def _factor_part(self, number: int) -> None:
-        part, last, triangle = self._parts[number], self._between, self._triangles[number]
-        self._definite[number] = triangle.factor(self.matrix[part, part])
-        self._made[part, part] = triangle.inverse
-        if last.stop > last.start:
-            torch.mm(self.matrix[last, part], triangle.inverse.T, out=self._across[:, part])
-            torch.mm(self._across[:, part], triangle.inverse, out=self._far[:, part])
+        definite = self._whole.factor(self.matrix)
+        self._give(self._whole.inverse)
+        return definite
 
     def add(self, directions: torch.Tensor, sign: float) -> torch.Tensor:
         """R of S + ``sign`` U^T U, ``directions`` U (k, n); () bool, whether that is definite.

@@ -67,7 +67,7 @@ class Factors(Protocol):
 def factors_on(device: wp.Device, upper_pattern: sparse.csc_matrix | sparse.csc_array) -> Factors:
     """Dense ones on a GPU, where torch sees it too; else sparse ones.
 
-    A dense Cholesky factor and its inverse take 1.0 ms for 568 nodes on an H100, and 7.1 for 1,833.
+    The inverse of a dense factor takes 0.15 ms for 568 nodes on an H100, and 0.44 for 1,064.
     """
     if device.is_cuda:
         try:

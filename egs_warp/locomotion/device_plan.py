@@ -63,7 +63,7 @@ class DevicePlanner:
         """The response that is at hand then, and the plan for what the ``objectives`` ask, on the way to whose end the
         solve's first step is; None where something is not as usual: a matrix that is not definite, an element that is
         inverted, or forces that are not found."""
-        if self.owner.begun is not start:
+        if self.owner.foreseen is not start:
             self.begin(start)
         return self._room_for(start).plan(start, objectives)
 
@@ -124,6 +124,9 @@ class PlanRoom:
     def begin(self, start: StepStart) -> None:
         """See ``DevicePlanner``."""
         body, room, problem = self.body, self.room, start.problem
+        if body.foreseen is not None:
+            # What was told for another plan may still be on its way.
+            body.stream.wait()
         body.at_hand = room.at_base = room.at_trial = room.coming = None
         with body.stream:
             body.take(problem)
@@ -133,12 +136,12 @@ class PlanRoom:
             self._do(self._enqueue_foresight, problem.dt, 1.0 + problem.dt * problem.drag)
         body.factors.begun()
         self._begin_linear(start, TRIED)
-        body.begun = start
+        body.foreseen = start
 
     def plan(self, start: StepStart, objectives: Sequence[AnyObjective]) -> tuple[ContactResponse, Plan] | None:
         """See ``DevicePlanner``; it has begun."""
         body, room, problem = self.body, self.room, start.problem
-        body.begun = None
+        body.foreseen = None
         self._search_for(start, objectives)
         verdicts, sizes, missed, *_ = self._parts
         if not (verdicts.min() > 0.0 and np.isfinite(sizes).all() and missed.max() <= ASTRAY):
@@ -156,7 +159,7 @@ class PlanRoom:
             self._tell(start, prospect.activations)
             self._told.send()
             self.room.wanted.copy_(self._known)
-        self.body.begun = self.room.at_base = self.room.at_trial = self.room.coming = None
+        self.body.foreseen = self.room.at_base = self.room.at_trial = self.room.coming = None
         self._begin_linear(start, base)
         self._search_for(start, objectives)
         assert isinstance(prospect.response, DeviceResponse)
@@ -195,6 +198,7 @@ class PlanRoom:
             if found.x is None:
                 return None
             count, infeasible = found.qp_count, found.infeasible
+            # What the kernel has found first is where the device is.
             if found.x is not x:
                 self._end_at(found.x, start)
                 *_, (_, size, missed), _, _, forces, speeds, velocities = self._parts

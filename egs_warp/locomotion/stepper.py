@@ -136,7 +136,8 @@ class LocomotionStepper:
         other.detector = copy(self.detector)
         other.detector.geometry = other.geometry
         other.solver = replace(self.solver, detector=other.detector)
-        other.planner, other._ahead = replace(self.planner, friction=friction), None
+        other.planner = replace(self.planner, friction=friction)
+        other._ahead = None
         return other
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -353,7 +354,8 @@ class LocomotionStepper:
     ) -> tuple[BodyState, StepMemory, StepReport]:
         end = problem.end_positions(result.velocities)
         after = BodyState(end, result.velocities, problem.state.time + problem.dt)
-        self.respond.look_ahead(after, problem.dt, result.contacts.points)
+        if result.converged:
+            self.respond.look_ahead(after, problem.dt, result.contacts.points)
         if result.seen is None:
             least_gap = float(self.detector.gaps(end)[0].min())
             internal = problem.internal_gradient(result.velocities, MuscleTension.of(self.muscles, plan.activations))

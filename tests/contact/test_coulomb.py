@@ -134,8 +134,7 @@ def test_problems_that_take_all_iterations_have_the_same_bits_side_by_side() -> 
 @pytest.mark.cuda
 @pytest.mark.parametrize("friction", [0.0, 0.4, 5.0])
 def test_a_block_of_threads_finds_the_forces_of_one(friction: float) -> None:
-    """Of groups that are full and not, of as many unknowns as registers have room for and more, of more contacts than
-    are swept together."""
+    """Of groups that are full and not, of as many unknowns as one pass has room for and more."""
     counts, room = [1, 4, 5, 6, 11, 33, 40, 45, 64, 65, 70], 70
     random = np.random.default_rng(1)
     delassus, free = np.zeros((len(counts), 3 * room, 3 * room)), random.normal(size=(len(counts), 3 * room))
@@ -155,7 +154,7 @@ def test_a_block_of_threads_finds_the_forces_of_one(friction: float) -> None:
 @pytest.mark.cuda
 @pytest.mark.parametrize("friction", [0.0, 0.4, 5.0])
 def test_a_block_of_threads_finds_the_forces_of_many_contacts_that_press(friction: float) -> None:
-    """Of more unknowns than registers have room for: in full passes of columns and not, with full tiles and not, and of
+    """Of more unknowns than one pass has room for: in full passes of columns and not, with full tiles and not, and of
     more than there are passes for; of more contacts than are swept together."""
     counts, room = [41, 42, 43, 50, 53, 62, 64, 65, 80, 85, 86, 100, 130], 130
     random = np.random.default_rng(4)

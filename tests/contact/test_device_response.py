@@ -9,6 +9,7 @@ pytest.importorskip("torch")
 
 from egs_warp.contact.device_response import DeviceResponder
 from egs_warp.contact.response import ContactResponse, Iterate
+from egs_warp.fem import dense_factors
 from egs_warp.fem.body import BodyState
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.locomotion.stepper import LocomotionStepper
@@ -150,3 +151,21 @@ def test_a_step_has_the_same_contacts_whatever_was_looked_ahead_for(
             assert found is not None and np.array_equal(found.points, expected)
         seen.add(tuple(expected))
     assert len(seen) == 3
+
+
+def test_a_tangent_whose_sum_fails_is_the_host_s(
+    creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where what the muscles add is not definite by itself: factored as a whole, from the same place on."""
+    stepper = on_device(creature, device, monkeypatch)
+    problem, *_ = problems(stepper, creature)
+    contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
+    tension, forces = pulled(creature, 2), np.ones((6, 3))
+    tangent = problem.tangent(stepper.factors, problem.start, None)
+    place = stepper.respond(tangent, contacts).at(tension, problem.start, forces).toward(2.0 * forces)
+    monkeypatch.setattr(dense_factors._InverseRoot, "add", lambda root, directions, sign: 0.0 * directions[0, 0])
+    found = place.anew()
+    whole = problem.tangent(stepper.factors, place.velocities, tension)
+    expected = ContactResponse.of(whole, contacts).at(tension, place.velocities, place.forces)
+    assert_alike(expected, found)
+    assert_alike(expected.toward(forces), found.toward(forces))

@@ -32,7 +32,8 @@ SIZES = [
 @pytest.mark.cuda
 @pytest.mark.parametrize(("parts", "between"), SIZES)
 def test_tiles_make_the_inverse_of_a_factor(parts: list[int], between: int) -> None:
-    """Where something else was before, too; always with the same bits, also after a matrix that has no factor."""
+    """Where something else was before, too; always with the same bits, also after a matrix that has no factor, and by
+    however many blocks."""
     count = sum(parts) + between
     random = np.random.default_rng(count)
     order = random.permutation(count)
@@ -60,3 +61,7 @@ def test_tiles_make_the_inverse_of_a_factor(parts: list[int], between: int) -> N
         for _ in range(5):
             assert make(given)
             np.testing.assert_array_equal(inverse.cpu().numpy(), root)
+    for blocks in (1, 7):
+        tiled._blocks = blocks
+        assert make(given)
+        np.testing.assert_array_equal(inverse.cpu().numpy(), root)

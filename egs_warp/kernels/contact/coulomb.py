@@ -279,15 +279,15 @@ def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp
     least = real(wp.inf)
     keep(contacts, forces, newton.best, newton)
     for attempt in range(_ATTEMPTS + 1):
-        # The last begins at the best, once they are near enough, and takes them to rounding.
-        last = least < tolerance
-        if attempt == _ATTEMPTS and not last:
+        # The polishes begins at the best, once they are near enough, and takes them to rounding.
+        polishes = least < tolerance
+        if attempt == _ATTEMPTS and not polishes:
             keep(contacts, newton.best, forces, newton)
             break
         scale = real(1.0)
         short = _FINEST
         steps = _POLISHES
-        if last:
+        if polishes:
             keep(contacts, newton.best, forces, newton)
         else:
             scale = _RATES[attempt]
@@ -299,7 +299,7 @@ def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp
             sweep_together(contacts, sweeps, forces, newton)
         find_velocities(contacts, forces, newton)
         for number in range(steps):
-            if not last:
+            if not polishes:
                 short = _SHORT
                 if attempt > 0 and number < _CAREFUL:
                     short = _SHORTER
@@ -307,7 +307,7 @@ def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp
                     scale = _RATES[(attempt + number) % _ATTEMPTS]
             size = missed(contacts, forces, scale, real(0.0), newton)
             near = tolerance
-            if last:
+            if polishes:
                 near = _POLISHED * tolerance
                 least = size[0]
             elif size[0] < least:
@@ -317,13 +317,13 @@ def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp
                 break
             find_step(contacts, forces, scale, short, newton)
             length = real(1.0)
-            if last or attempt == 0:
+            if polishes or attempt == 0:
                 found = int(0)
                 halvings = int(0)
                 while found == 0 and halvings < _HALVINGS:
                     trial = missed(contacts, forces, scale, length, newton)
                     halvings += 1
-                    if last:
+                    if polishes:
                         halvings = _HALVINGS
                         if trial[0] < tolerance:
                             found = 1
@@ -335,7 +335,7 @@ def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp
                 if found == 0:
                     break
             move(contacts, forces, length, newton)
-        if last:
+        if polishes:
             break
     for i in range(newton.lane, contacts.count, wp.block_dim()):
         n = 3 * i
