@@ -279,7 +279,8 @@ def find_forces(contacts: Contacts, tolerance: real, iterations: int, forces: wp
     least = real(wp.inf)
     keep(contacts, forces, newton.best, newton)
     for attempt in range(_ATTEMPTS + 1):
-        # The polishes begins at the best, once they are near enough, and takes them to rounding.
+        # The last one begins at the best, once they are near enough, and takes them to rounding: in the same loop, so
+        # that a GPU has the code of a step once.
         polishes = least < tolerance
         if attempt == _ATTEMPTS and not polishes:
             keep(contacts, newton.best, forces, newton)
