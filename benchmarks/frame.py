@@ -9,8 +9,8 @@ logarithms). ``--old`` is a checkout of commit 3848750, whose own example is tim
 of the captures that are there (plush dog, monkey, robot) by both, each with the nodes it gives them. Give it two cores
 (``taskset -c 0,1``) and leave them alone.
 
-On a GPU, once more with 1,000,000 Gaussians on about 1,000 nodes: each step, then its picture of 1920 x 1080, whose
-bytes are taken after the next step (where that cage is among those asked for).
+On a GPU, once more with 1,000,000 Gaussians on about 1,000 nodes: each step, then its picture of 1920 x 1080, which is
+made beside the next step and whose bytes are taken after that (where that cage is among those asked for).
 
 Aims on a CPU: ``cpu_541`` (at most 60 ms in the mean and 5 times that in the worst step), ``cpu_10x`` (a tenth of the
 old commit's time, for the pawn and each capture), ``cpu_250_realtime`` (16.7 ms). On a GPU: ``gpu_541`` (8 ms in the
@@ -32,6 +32,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from egs_warp.assets import pawn
 from egs_warp.io import read_capture
@@ -39,6 +40,7 @@ from egs_warp.locomotion.stepper import LocomotionStepper
 from egs_warp.motions.script import motion
 from egs_warp.pipelines.creature import make_creature
 from egs_warp.pipelines.performance import simulate
+from egs_warp.render.ahead import PicturesAhead
 from harness import Row, Table, data_folder, flags, record, report
 from picture import Studio
 
@@ -74,50 +76,47 @@ def measure(asked: int, frames: int, *, device: str, seed: int) -> list[Row]:
 
 
 def measure_pictures(asked: int, frames: int, *, device: str, seed: int) -> Row:
-    """Milliseconds a frame of a jump with pictures, and of its stages: the step, the picture until the device has all
-    that it is made of, and what is waited for its bytes after the next step."""
+    """Milliseconds a frame of a jump with pictures, and of its stages: the step, what is waited for the bytes of the
+    picture before, and to begin this one's."""
     made = pawn(gaussian_count=GAUSSIANS, seed=seed, device=device)
     plain = make_creature(made.cloud, plane=made.plane, nodes=asked)
-    stepper = _Watched(plain.stepper, Studio(plain, SIZE))
+    stepper = _Watched(plain, SIZE)
     creature = replace(plain, stepper=stepper)
     for _ in range(2):
         simulate(creature, motion("jump"), frames=frames)
-    stepper.take_bytes()
+    stepper.pictures.take()
     stepper.stages = {}
     begun = time.perf_counter()
     simulate(creature, motion("jump"), frames=frames)
-    stepper.take_bytes()
+    stepper.pictures.take()
     whole = 1e3 * (time.perf_counter() - begun)
     means = {name: float(np.sum(spent)) / (frames - 1) for name, spent in stepper.stages.items()}
     return {"nodes": len(plain.body.mesh.nodes), "gaussians": plain.cloud.count, **means, "frame": whole / (frames - 1)}
 
 
 class _Watched(LocomotionStepper):
-    """Steps of which a picture is made each."""
+    """Steps of which a picture is made each, beside the next."""
 
-    def __init__(self, stepper: LocomotionStepper, studio: Studio) -> None:
-        vars(self).update(vars(stepper))
+    def __init__(self, creature: Creature, size: tuple[int, int]) -> None:
+        vars(self).update(vars(creature.stepper))
         self.stages: dict[str, list[float]] = {}
-        self._studio, self._image = studio, None
+        self.pictures = PicturesAhead(*size, creature.cloud.device)
+        wp.synchronize_device(creature.cloud.device)
+        with self.pictures.beside():
+            self._studio = Studio(creature, size)
 
     def advance(self, *given: Any) -> Any:
         """A step, and its picture."""
-        marks = [time.perf_counter()]
+        studio, marks = self._studio, [time.perf_counter()]
         done = super().advance(*given)
         marks.append(time.perf_counter())
-        self.take_bytes()
+        self.pictures.take()
         marks.append(time.perf_counter())
-        self._image = self._studio.drawn(self._studio.carried(done[0].positions))
+        self.pictures.begin(lambda: studio.begun(studio.carried(done[0].positions)))
         marks.append(time.perf_counter())
         for name, spent in zip(("step", "bytes", "picture"), 1e3 * np.diff(marks), strict=True):
             self.stages.setdefault(name, []).append(float(spent))
         return done
-
-    def take_bytes(self) -> None:
-        """Those of the picture before."""
-        if self._image is not None:
-            self._image.colour_srgb8()
-        self._image = None
 
 
 def _steps(creature: Creature, frames: int, *, before: int = 2) -> list[Row]:

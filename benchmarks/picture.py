@@ -24,8 +24,8 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.pipelines.creature import Creature, make_creature
 from egs_warp.render.backdrop import grid_floor
-from egs_warp.render.compositing import RenderedImage
-from egs_warp.render.rasteriser import render_gaussians
+from egs_warp.render.compositing import BegunImage
+from egs_warp.render.rasteriser import begin_image, render_gaussians
 from egs_warp.render.shadow import ContactShadow, grain_of
 from harness import Row, Table, flags, median_ms, report
 
@@ -54,9 +54,9 @@ class Studio:
         """The Gaussians where the cage has ``nodes`` (N, 3)."""
         return self._deformer.deform(nodes).cloud
 
-    def drawn(self, cloud: GaussianCloud) -> RenderedImage:
+    def begun(self, cloud: GaussianCloud) -> BegunImage:
         """The picture of that."""
-        return render_gaussians(cloud, self.camera, background=self.behind.background(cloud))
+        return begin_image(cloud, self.camera, background=self.behind.background(cloud))
 
 
 def measure(creature: Creature, size: tuple[int, int], *, repeats: int) -> Row:
@@ -69,13 +69,13 @@ def measure(creature: Creature, size: tuple[int, int], *, repeats: int) -> Row:
         return nodes + np.outer(height * lean, [1.0, 0.0, 0.0])
 
     cloud = studio.carried(bent())
-    floor, image = studio.behind.background(cloud), studio.drawn(cloud)
+    floor, image = studio.behind.background(cloud), studio.begun(cloud).settled().image
     stages = {
         "carry": lambda: studio.carried(bent()),
         "shadow": lambda: studio.behind.background(cloud),
         "draw": lambda: render_gaussians(cloud, studio.camera, background=floor),
         "bytes": image.colour_srgb8,
-        "whole": lambda: studio.drawn(studio.carried(bent())).colour_srgb8(),
+        "whole": lambda: studio.begun(studio.carried(bent())).settled().image.colour_srgb8(),
     }
     times = median_ms(stages, repeats=repeats, synchronise=lambda: wp.synchronize_device(device))
     return {"gaussians": cloud.count, "width": size[0], "height": size[1], **times}

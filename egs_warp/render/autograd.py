@@ -17,7 +17,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.launching import available_threads
 from egs_warp.render.backward import backward
-from egs_warp.render.compositing import RenderedImage, list_and_composite
+from egs_warp.render.compositing import BegunImage, RenderedImage
 from egs_warp.render.projection import ProjectedGaussians, project, view_from_camera
 from egs_warp.render.rasteriser import background_of, drawn_tiles, refusing_what_does_not_fit
 from egs_warp.render.tiles import TileLists
@@ -202,12 +202,10 @@ def _draw(
             )
             behind = background_of(task.background, camera, cloud.device)
             drawn = drawn_tiles(task.mask, camera, cloud.device)
-            lists, image = list_and_composite(
-                projected, view, background=behind, threads=threads, onto=onto, drawn=drawn
-            )
+            begun = BegunImage(projected, view, background=behind, threads=threads, onto=onto, drawn=drawn).settled()
     # The picture's own tensors will hold this.
     owners = (*tensors, *(tensor.detach() for tensor in picture))
-    return picture, _Forward(owners, cloud, view, projected, lists, image)
+    return picture, _Forward(owners, cloud, view, projected, begun.lists, begun.image)
 
 
 class _Render(torch.autograd.Function):

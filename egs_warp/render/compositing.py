@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -47,31 +48,47 @@ class RenderedImage:
 
     def colour_srgb8(self) -> np.ndarray:
         """(H, W, 3) uint8 on the host, ready for PNG or video: clipped and quantised; SH colours are sRGB already."""
-        device, (height, width) = device_of(self.colour), self.colour.shape
-        levels = empty((width * height, 3), wp.uint8, device)
-        launch_rows(quantise_kernel, width * height, inputs=[self.colour.flatten()], outputs=[levels], device=device)
-        return levels.numpy().reshape(height, width, 3)
+        levels = empty((*self.colour.shape, 3), wp.uint8, device_of(self.colour))
+        self.quantise(levels)
+        return levels.numpy()
+
+    def quantise(self, levels: wp.array) -> None:
+        """The same into ``levels`` (H, W, 3) uint8 on the device."""
+        height, width = self.colour.shape
+        launch_rows(
+            quantise_kernel,
+            width * height,
+            inputs=[self.colour.flatten()],
+            outputs=[levels.reshape((width * height, 3))],
+            device=device_of(self.colour),
+        )
 
 
-def list_and_composite(
-    projected: ProjectedGaussians,
-    view: Any,
-    *,
-    background: Background,
-    threads: int,
-    onto: RenderedImage | None = None,
-    drawn: wp.array | None = None,
-) -> tuple[TileLists, RenderedImage]:
-    """The tile lists and the picture, as ``composite`` makes it.
+class BegunImage:
+    """A picture and its tile lists, queued: a GPU that waited for the number of pairs would stand still meanwhile, so
+    that is guessed, and looked at later."""
 
-    The number of pairs is looked at when all is queued: a GPU that waited for it would stand still meanwhile.
-    """
-    lists = replace(build_tile_lists(projected, view, threads=threads, guess=True), drawn=drawn)
-    image = composite(projected, lists, view, background=background, threads=threads, onto=onto)
-    if not lists_fit(lists, projected):
-        lists = replace(build_tile_lists(projected, view, threads=threads), drawn=drawn)
-        image = composite(projected, lists, view, background=background, threads=threads, onto=image)
-    return lists, image
+    def __init__(
+        self,
+        projected: ProjectedGaussians,
+        view: Any,
+        *,
+        background: Background,
+        threads: int,
+        onto: RenderedImage | None = None,
+        drawn: wp.array | None = None,
+        guess: bool = True,
+    ) -> None:
+        self.projected, self.view = projected, view
+        self.lists = replace(build_tile_lists(projected, view, threads=threads, guess=guess), drawn=drawn)
+        self.image = composite(projected, self.lists, view, background=background, threads=threads, onto=onto)
+        self._fit = partial(lists_fit, self.lists, projected)
+        given = {"background": background, "threads": threads, "drawn": drawn}
+        self._anew = partial(BegunImage, projected, view, onto=self.image, guess=False, **given)
+
+    def settled(self) -> BegunImage:
+        """This, once it is known that all pairs had room; where they had not, another into the same arrays."""
+        return self if self._fit() else self._anew()
 
 
 def composite(

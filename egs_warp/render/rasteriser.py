@@ -19,7 +19,7 @@ from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
 from egs_warp.launching import Device, available_threads
-from egs_warp.render.compositing import Background, RenderedImage, add_geometry, list_and_composite
+from egs_warp.render.compositing import Background, BegunImage, RenderedImage, add_geometry
 from egs_warp.render.projection import project, view_from_camera
 from egs_warp.render.tiles import TILE_SIDE
 
@@ -44,15 +44,32 @@ def render_gaussians(
     of another size.
     """
     threads = threads or available_threads()
+    given = {"background": background, "antialiased": antialiased, "mask": mask, "threads": threads}
+    begun = begin_image(cloud, camera, **given)
+    with refusing_what_does_not_fit(cloud, camera):
+        begun = begun.settled()
+        if geometry:
+            return add_geometry(begun.image, cloud, begun.projected, begun.lists, begun.view, threads=threads)
+    return begun.image
+
+
+def begin_image(
+    cloud: GaussianCloud,
+    camera: Camera,
+    *,
+    background: tuple[float, float, float] | np.ndarray | wp.array = (1.0, 1.0, 1.0),
+    antialiased: bool = False,
+    mask: np.ndarray | None = None,
+    threads: int | None = None,
+) -> BegunImage:
+    """The picture of ``render_gaussians`` on its way, for which nobody has waited: to be ``settled``."""
+    threads = threads or available_threads()
     view = view_from_camera(camera)
     with refusing_what_does_not_fit(cloud, camera):
         behind = background_of(background, camera, cloud.device)
         drawn = drawn_tiles(mask, camera, cloud.device)
         projected = project(cloud, view, antialiased=antialiased, threads=threads)
-        lists, image = list_and_composite(projected, view, background=behind, threads=threads, drawn=drawn)
-        if geometry:
-            image = add_geometry(image, cloud, projected, lists, view, threads=threads)
-    return image
+        return BegunImage(projected, view, background=behind, threads=threads, drawn=drawn)
 
 
 def render_views(

@@ -16,7 +16,7 @@ from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import SH_BAND_0, GaussianCloud
 from egs_warp.launching import available_threads
 from egs_warp.render.backward import backward
-from egs_warp.render.compositing import list_and_composite
+from egs_warp.render.compositing import BegunImage
 from egs_warp.render.projection import project, view_from_camera
 from egs_warp.render.rasteriser import background_of, refusing_what_does_not_fit
 
@@ -110,9 +110,9 @@ def _votes_of_view(grey: GaussianCloud, masked: MaskedView) -> np.ndarray:
     with refusing_what_does_not_fit(grey, masked.camera):
         projected = project(grey, view, antialiased=False, threads=threads)
         behind = background_of((0.0, 0.0, 0.0), masked.camera, grey.device)
-        lists, image = list_and_composite(projected, view, background=behind, threads=threads)
+        begun = BegunImage(projected, view, background=behind, threads=threads).settled()
         gradients = backward(
-            *(grey, view, projected, lists, image),
+            *(grey, view, projected, begun.lists, begun.image),
             colour_gradient=wp.array(colour, dtype=wp.vec3, device=grey.device),
             alpha_gradient=None,
             depth_gradient=None,
