@@ -168,13 +168,15 @@ class _Recorded(threading.local):
     """Launches that this thread has made, for it to change and make again."""
 
     def __init__(self) -> None:
-        self.launches: dict[tuple[Any, str], tuple[Any, int, list[Any]]] = {}
+        self.launches: dict[tuple[Any, str], tuple[Any, int | tuple[int, int], list[Any]]] = {}
 
 
 _recorded = _Recorded()
 
 
-def launch_again(kernel: Any, dim: int, *, inputs: Sequence[Any], outputs: Sequence[Any], device: wp.Device) -> None:
+def launch_again(
+    kernel: Any, dim: int | tuple[int, int], *, inputs: Sequence[Any], outputs: Sequence[Any], device: wp.Device
+) -> None:
     """``wp.launch`` at a third of its cost, for kernels that run many times a second.
 
     The first launch of a thread is kept; the next ones only put in those arguments that are others than last time,
@@ -209,8 +211,13 @@ def launch_again(kernel: Any, dim: int, *, inputs: Sequence[Any], outputs: Seque
             elif last is not value:
                 kept.set_param_at_index(i, value)
                 held[i] = value
-    if dim > 0:
+    if kept.bounds.size > 0:
         kept.launch()
+
+
+def lanes_on(device: wp.Device) -> int:
+    """Threads that work out a row together: those of a GPU's warp, one on a CPU."""
+    return 1 if device.is_cpu else 32
 
 
 _UNKNOWN = object()

@@ -12,6 +12,7 @@ import warp as wp
 from egs_warp.fem.elasticity import ElasticAssembly
 from egs_warp.fem.worlds import launch_on, shared, tiled, tiled_bounds
 from egs_warp.kernels.fem import elasticity as kernels
+from egs_warp.launching import lanes_on
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import FULL, SLACK
 from egs_warp.precision import Mat33, Vec3, real
@@ -26,7 +27,7 @@ class BatchElasticity:
 
     def __init__(self, assembly: ElasticAssembly, muscles: MuscleSet, count: int, *, matrices: int) -> None:
         """``matrices``: bodies whose matrices are asked for at a time."""
-        self.device = torch.device(str(assembly.device))
+        self.device, self._lanes = torch.device(str(assembly.device)), lanes_on(assembly.device)
         self.node_count, self.tet_count = len(assembly.mesh.nodes), len(assembly.mesh.tets)
         self._material, maps = assembly.material, assembly.maps
         self._tets = shared(tiled(assembly.mesh.tets, count, self.node_count, self.device), wp.vec4i)
@@ -116,7 +117,7 @@ class BatchElasticity:
             launch_on(
                 self.device,
                 kernels.segment_pulls_kernel,
-                len(pulls),
+                (len(pulls), self._lanes),
                 inputs=[*self._lines, SLACK, FULL, (tensions.reshape(-1), real), flat],
                 outputs=[(pulls, Vec3)],
             )
@@ -130,7 +131,7 @@ class BatchElasticity:
         launch_on(
             self.device,
             kernels.gather_forces_kernel,
-            count * self.node_count,
+            (count * self.node_count, self._lanes),
             inputs=[*self._corners, *ends, (corners, Vec3), (pulls, Vec3)],
             outputs=[(nodes.view(-1, 3), Vec3)],
         )

@@ -10,7 +10,7 @@ import warp as wp
 
 from egs_warp.fem.elastic_maps import Damping, ElasticMaps, Material
 from egs_warp.kernels.fem import elasticity as kernels
-from egs_warp.launching import Mirror, empty, launch_again
+from egs_warp.launching import Mirror, empty, lanes_on, launch_again
 from egs_warp.muscles.tension import FULL, SLACK, MuscleTension
 from egs_warp.precision import Mat33, Vec3, real
 
@@ -36,7 +36,7 @@ class MuscleLines:
         """(M,) newtons, by which each segment with ``tensions`` (M,) draws its ends together."""
         launch_again(
             kernels.segment_pulls_kernel,
-            len(self._pulls),
+            (len(self._pulls), lanes_on(self._device)),
             inputs=[*self._lines, tensions, positions],
             outputs=[self._pulls],
             device=self._device,
@@ -166,7 +166,7 @@ class ElementKernels:
         )
         launch_again(
             kernels.gather_forces_kernel,
-            len(self._positions),
+            (len(self._positions), lanes_on(self._device)),
             inputs=[*self._corners, *ends, self._corner_gradients, pulls],
             outputs=[gradient],
             device=self._device,

@@ -54,3 +54,27 @@ def largest_of_block(value: real) -> real:
 def sum_of_block(value: real) -> real:
     """Of the threads' values; they have waited for each other."""
     ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return 32;
+#else
+    return 1;
+#endif
+""")
+def lanes() -> int:
+    """Threads of a warp, see ``launching.lanes_on``."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    for (int other = 16; other > 0; other >>= 1)
+        value += __shfl_xor_sync(0xffffffffu, value, other);
+#endif
+    return value;
+""")
+def sum_of_lanes(value: real) -> real:
+    """Of the values of a warp's threads, all of which call."""
+    ...

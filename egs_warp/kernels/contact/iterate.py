@@ -103,8 +103,9 @@ def residual_kernel(
     free = masses[node] * change + dt * internal[node]
     push = Vec3(real(0.0))
     for contact in range(nodes.shape[0]):
+        corners = nodes[contact]
         for corner in range(4):
-            if nodes[contact][corner] == node:
+            if corners[corner] == node:
                 push += weights[contact][corner] * (wp.transpose(axes[contact]) * forces[contact])
     free_out[node] = free
     rest_out[node] = free - dt * push

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from egs_warp.kernels.block import lanes, sum_of_lanes
 from egs_warp.precision import Mat33, Vec3, real
 
 wp.set_module_options({"enable_backward": False})
@@ -175,6 +176,12 @@ def element_gradients_kernel(
         corner_gradients_out[e, a] = volumes[e] * (stress * shape_gradient(rest_inverses[e], a))
 
 
+@wp.func
+def of_all_lanes(part: Vec3) -> Vec3:
+    """Sum of the lanes' parts."""
+    return Vec3(sum_of_lanes(part[0]), sum_of_lanes(part[1]), sum_of_lanes(part[2]))
+
+
 @wp.kernel
 def segment_pulls_kernel(
     # Model:
@@ -191,14 +198,16 @@ def segment_pulls_kernel(
     pulls_out: wp.array[Vec3],
 ):
     """T phi u of each segment (Eq. 7), with the shares of tension of ``muscles.tension``."""
-    segment = wp.tid()
+    segment, lane = wp.tid()
     line = Vec3(real(0.0))
-    for slot in range(offsets[segment], offsets[segment + 1]):
+    for slot in range(offsets[segment] + lane, offsets[segment + 1], lanes()):
         line += shares[slot] * positions[nodes[slot]]
+    line = of_all_lanes(line)
     length = wp.max(wp.length(line), real(1e-300))
     along = wp.clamp((length / rest_lengths[segment] - slack) / (full - slack), real(0.0), real(1.0))
     share = along * along * (real(3.0) - real(2.0) * along)
-    pulls_out[segment] = (tensions[segment] * share / length) * line
+    if lane == 0:
+        pulls_out[segment] = (tensions[segment] * share / length) * line
 
 
 @wp.kernel
@@ -216,15 +225,17 @@ def gather_forces_kernel(
     node_values_out: wp.array[Vec3],
 ):
     """Of each node's corners and, where there are ends of muscles, of those."""
-    node = wp.tid()
+    node, lane = wp.tid()
     total = Vec3(real(0.0))
-    for slot in range(corner_offsets[node], corner_offsets[node + 1]):
+    for slot in range(corner_offsets[node] + lane, corner_offsets[node + 1], lanes()):
         corner = corner_from_slot[slot]
         total += corner_values[corner // 4, corner % 4]
     if end_offsets.shape[0] > 0:
-        for slot in range(end_offsets[node], end_offsets[node + 1]):
+        for slot in range(end_offsets[node] + lane, end_offsets[node + 1], lanes()):
             total += end_shares[slot] * pulls[segment_from_end[slot]]
-    node_values_out[node] = total
+    total = of_all_lanes(total)
+    if lane == 0:
+        node_values_out[node] = total
 
 
 @wp.kernel
