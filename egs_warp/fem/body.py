@@ -73,6 +73,16 @@ class SoftBody:
         """sqrt(g H), m/s."""
         return float(np.sqrt(np.linalg.norm(self.gravity) * self.height))
 
+    @cached_property
+    def mean_rows(self) -> np.ndarray:
+        """(3, 3N) whose product with velocities is that of the centre of mass."""
+        return np.kron(self.node_mass / self.mass, np.eye(3))
+
+    @cached_property
+    def mass_roots(self) -> np.ndarray:
+        """(3N,) of the square root of each node's share of the mass, for each of its axes."""
+        return np.sqrt(np.repeat(self.node_mass / self.mass, 3))
+
     def centre_of_mass(self, positions: np.ndarray) -> np.ndarray:
         """(3,) mean of ``positions`` (N, 3) weighted by mass; of velocities, the velocity of the centre of mass."""
         return self.node_mass @ positions / self.mass

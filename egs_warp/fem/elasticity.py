@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from egs_warp.fem.elastic_maps import Damping, ElasticMaps, Material
 from egs_warp.fem.element_kernels import ElementKernels
 from egs_warp.fem.element_vectors import ElementVectors
 from egs_warp.fem.factors import Factors
+from egs_warp.fem.sparse_factors import Analysis
 from egs_warp.geometry.tetmesh import TetMesh
 from egs_warp.muscles.tension import MuscleTension
 
@@ -31,6 +32,11 @@ class ElasticAssembly:
     def __reduce__(self) -> tuple[Any, ...]:
         """It is made anew wherever a copy of it is read: its arrays lie on a device."""
         return partial(ElasticAssembly, device=str(self.device)), (self.mesh, self.material)
+
+    @cached_property
+    def analysis(self) -> Analysis:
+        """Of ``upper_pattern``."""
+        return Analysis.of(self.upper_pattern)
 
     def damping(self, positions: np.ndarray, dt: float) -> Damping:
         """Of a step of ``dt`` seconds that starts at ``positions`` (N, 3)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,41 @@ _SINGULAR = 1e-14
 """Of the largest diagonal entry: pivots that are as small have no reciprocal worth the name."""
 
 
+@dataclass(frozen=True)
+class Analysis:
+    """Of the pattern of symmetric matrices: what their factors have in common."""
+
+    full_from_upper: np.ndarray
+    """Where each entry of both triangles is, in the order of the columns, in the upper one."""
+    offsets: wp.array
+    """(n + 1,) of the columns of both triangles."""
+    indices: wp.array
+    """The rows in them."""
+    heads: wp.array
+    """(n,) see ``first_of_alike``."""
+    place: np.ndarray
+    """(n,) of each row in the order of elimination."""
+    layout: Layout
+
+    @classmethod
+    def of(cls, upper_pattern: sparse.csc_matrix | sparse.csc_array) -> Analysis:
+        """Of an upper triangle with the diagonal."""
+        upper = sparse.csc_matrix(
+            (np.arange(1.0, upper_pattern.nnz + 1.0), upper_pattern.indices, upper_pattern.indptr), upper_pattern.shape
+        )
+        full = (upper + sparse.triu(upper, 1).T).tocsc()
+        full.sort_indices()
+        blocks = Supernodes.of(upper)
+        return cls(
+            full.data.astype(np.int64) - 1,
+            indices_of(full.indptr),
+            indices_of(full.indices),
+            indices_of(first_of_alike(full)),
+            blocks.place,
+            Layout.of(blocks, upper),
+        )
+
+
 class SparseFactors:
     """L D L^T of symmetric matrices of one pattern by a multifrontal method; see ``Factors``. The symbolic analysis is
     done once. The same bits on any number of cores.
@@ -33,29 +69,23 @@ class SparseFactors:
     host = True
     stream: AbstractContextManager[None] = nullcontext()
 
-    def __init__(self, upper_pattern: sparse.csc_matrix | sparse.csc_array) -> None:
-        """``upper_pattern``: upper triangle with the diagonal, entries in the order of ``update``."""
+    def __init__(self, upper_pattern: sparse.csc_matrix | sparse.csc_array, analysis: Analysis | None = None) -> None:
+        """``upper_pattern``: upper triangle with the diagonal, entries in the order of ``update``; ``analysis``: of it,
+        where it is known."""
         self._device = wp.get_device("cpu")
         # Two threads at once cannot load them.
         kernels.solve_kernel.module.load(self._device, block_dim=1)
-        upper = sparse.csc_matrix(
-            (np.arange(1.0, upper_pattern.nnz + 1.0), upper_pattern.indices, upper_pattern.indptr), upper_pattern.shape
-        )
-        full = (upper + sparse.triu(upper, 1).T).tocsc()
-        full.sort_indices()
-        self._full_from_upper = full.data.astype(np.int64) - 1
+        known = analysis or Analysis.of(upper_pattern)
+        self._full_from_upper = known.full_from_upper
         self._full = Rows()
-        self._full_values, self._full.values = _shared_zeros(full.nnz)
-        self._full.offsets, self._full.indices = indices_of(full.indptr), indices_of(full.indices)
-        self._full.heads = indices_of(first_of_alike(full))
-        self._diagonal = upper.indptr[1:] - 1
-        self._unknowns = len(upper.indptr) - 1
-        blocks = Supernodes.of(upper)
-        self.place = blocks.place
+        self._full_values, self._full.values = _shared_zeros(len(known.full_from_upper))
+        self._full.offsets, self._full.indices, self._full.heads = known.offsets, known.indices, known.heads
+        self._diagonal = upper_pattern.indptr[1:] - 1
+        self._unknowns = len(upper_pattern.indptr) - 1
+        self.place = known.place
         """(n,) of each row in the order of elimination."""
-        self._layout = Layout.of(blocks, upper)
-        self._entries, self._matrix = _shared_zeros(upper.nnz)
-        layout = self._layout
+        self._layout = layout = known.layout
+        self._entries, self._matrix = _shared_zeros(upper_pattern.nnz)
         sizes = layout.front + layout.scratch, layout.stack, layout.factor, layout.inverses, self._unknowns
         self._front, self._stack, self._factor, self._inverses, self._reciprocals = (
             _shared_zeros(size + kernels.PADDING)[1] for size in sizes

@@ -82,6 +82,11 @@ class StepProblem:
         """(3, 3) 1/(kg m^2), the inverse of the inertia."""
         return np.linalg.inv(self.inertia)
 
+    @cached_property
+    def angular_momentum(self) -> np.ndarray:
+        """(3,) kg m^2/s about the centre of mass at the start of the step."""
+        return self.body.angular_momentum(self.state.positions, self.state.velocities)
+
     @property
     def unit(self) -> float:
         """dt times the weight, N s: what residuals are told in."""
@@ -101,7 +106,7 @@ class StepProblem:
         what is stiff, whose speed at the start says nothing about the end, is at rest."""
         positions, mass = self.state.positions, self.body.node_mass
         centre = self.body.centre_of_mass(positions)
-        spin = self.turning_rates @ self.body.angular_momentum(positions, self.state.velocities)
+        spin = self.turning_rates @ self.angular_momentum
         turned = Rotation.from_rotvec(self.dt * spin).apply(positions - centre)
         return mass @ self.state.velocities / mass.sum() + (turned - (positions - centre)) / self.dt
 

@@ -24,8 +24,13 @@ def turning(arms: np.ndarray) -> np.ndarray:
 
 def best_turn(masses: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """(3, 3) rotation that best carries the arms ``before`` (n, 3) to those ``after``, by ``masses`` (n,) (Kabsch)."""
-    u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", masses, after, before))
-    return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return nearest_turn(np.einsum("n,ni,nj->ij", masses, after, before))
+
+
+def nearest_turn(matrix: np.ndarray) -> np.ndarray:
+    """(3, 3) rotation nearest to a ``matrix`` (3, 3)."""
+    u, _, vt = np.linalg.svd(matrix)
+    return u * [1.0, 1.0, np.sign(np.linalg.det(u @ vt))] @ vt
 
 
 def box_corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:

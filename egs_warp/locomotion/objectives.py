@@ -40,7 +40,7 @@ class Objective:
 
 def centre_of_mass_velocity(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
     """Velocity (3,) of the centre of mass."""
-    return Objective("com", _along(body.node_mass / body.mass, np.eye(3)), np.asarray(target, float), weight)
+    return Objective("com", body.mean_rows, np.asarray(target, float), weight)
 
 
 @dataclass(frozen=True)
@@ -63,9 +63,7 @@ class SpinObjective:
         self, problem: StepProblem, contacts: ContactSet, velocities: np.ndarray, gained: np.ndarray, speed: float
     ) -> np.ndarray:
         """At the end of a step in which contact forces have ``gained`` (3,) kg m^2/s."""
-        state = problem.state
-        momentum = problem.body.angular_momentum(state.positions, state.velocities) + gained
-        return (momentum - self.target) / self._unit(problem, speed)
+        return (problem.angular_momentum + gained - self.target) / self._unit(problem, speed)
 
     @staticmethod
     def _unit(problem: StepProblem, speed: float) -> float:
@@ -108,7 +106,7 @@ AnyObjective = Objective | SpinObjective | LoadObjective
 
 def node_velocities(body: SoftBody, target: np.ndarray, weight: float) -> Objective:
     """Velocities (N, 3) of all nodes, each weighted by its share of the mass: a pose to move towards."""
-    shares = np.sqrt(np.repeat(body.node_mass / body.mass, 3))
+    shares = body.mass_roots
     return Objective("pose", sparse.csr_matrix(sparse.diags(shares)), shares * target.ravel(), weight)
 
 
@@ -120,13 +118,14 @@ def straining_velocities(body: SoftBody, positions: np.ndarray, target: np.ndarr
     The six rows are orthonormal in the mean over the mass, so the weight compares with that of ``node_velocities``.
     """
     arms = positions - body.centre_of_mass(positions)
-    modes = np.zeros((len(arms), 3, 12))
-    modes[:, :, :3], modes[:, :, 3:6] = np.eye(3), turning(arms)
+    modes = np.zeros((12, len(arms), 3))
+    modes[:3], modes[3:6] = np.eye(3)[:, None], np.moveaxis(turning(arms), 2, 0)
     for mode, (i, k) in enumerate(combinations_with_replacement(range(3), 2), start=6):
-        modes[:, k, mode] += arms[:, i]
-        modes[:, i, mode] += arms[:, k]
-    weights = np.sqrt(np.repeat(body.node_mass / body.mass, 3))
-    orthonormal, triangle = np.linalg.qr(modes.reshape(-1, 12) * weights[:, None])
+        modes[mode, :, k] += arms[:, i]
+        modes[mode, :, i] += arms[:, k]
+    weights = body.mass_roots
+    # By columns, as LAPACK takes them.
+    orthonormal, triangle = np.linalg.qr((modes.reshape(12, -1) * weights).T)
     kept = 6 + np.flatnonzero(np.abs(np.diag(triangle)[6:]) > 1e-6 * np.abs(triangle).max())
     rows = (orthonormal[:, kept] * weights[:, None]).T
     return Objective("pose", rows, rows @ target.ravel(), weight)

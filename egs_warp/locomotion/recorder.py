@@ -52,7 +52,8 @@ class Recorder:
 
     def add(self, reports: Sequence[StepReport], *, asked: int = 0, kick: np.ndarray | None = None) -> None:
         """Write down the next steps, into which one that was asked for was divided; ``asked`` is the ``digest`` of its
-        objectives and of ``kick`` (N, 3) m/s, which its nodes were given from outside as it began.
+        objectives and of ``kick`` (N, 3) m/s, which its nodes were given from outside as it began; it is read in a
+        folder alone.
         """
         if kick is not None:
             self._kicks.append((self._steps + len(self._reports), kick))

@@ -134,13 +134,16 @@ def roll_out(
         folder=parts,
     )
     replay = Replay(resume, recorder.start, stepper.detector) if resume is not None else None
+    # It takes time, and is read where a run goes on.
+    digested = parts is not None or resume is not None
     for frame in range(frames):
         for part in range(per_frame):
             with one_blas_thread():
                 objectives = motion.objectives(state, reports[-1] if reports else None, dt)
             kick = kicks(state.time, dt)
             held = None if activations is None else activations[frame * per_frame + part]
-            asked = digest([*objectives, *(given for given in (kick, held) if given is not None)])
+            given = [each for each in (kick, held) if each is not None]
+            asked = digest([*objectives, *given]) if digested else 0
             done = replay.step(asked) if replay is not None else []
             begin = state.kicked(kick)
             if held is None:

@@ -6,8 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from egs_warp.fem.body import BodyState
-from egs_warp.motions.stance import PoseFamily
+from egs_warp.motions.stance import Measurement, PoseFamily
 
 
 class Facing(Protocol):
@@ -25,7 +24,7 @@ class Facing(Protocol):
         ...
 
     def thrust_momentum(
-        self, pose: PoseFamily, state: BodyState, upright: np.ndarray, *, left: float, flight_time: float
+        self, pose: PoseFamily, seen: Measurement, upright: np.ndarray, *, left: float, flight_time: float
     ) -> np.ndarray:
         """(3,) kg m^2/s to leave the ground with, ``left`` seconds from now, so that a flight of ``flight_time``
         seconds ends upright and turned; ``upright`` (3,) is the rotation vector to the landing without its turn."""
@@ -52,10 +51,10 @@ class Straight:
         """Nothing depends on it."""
 
     def thrust_momentum(
-        self, pose: PoseFamily, state: BodyState, upright: np.ndarray, *, left: float, flight_time: float
+        self, pose: PoseFamily, seen: Measurement, upright: np.ndarray, *, left: float, flight_time: float
     ) -> np.ndarray:
         """Upright alone."""
-        return pose.body.inertia(state.positions) @ (upright / flight_time)
+        return seen.inertia @ (upright / flight_time)
 
     def airborne_pose(self, pose: np.ndarray, momentum: np.ndarray, up: np.ndarray, left: float) -> np.ndarray:
         """``pose`` as it is."""

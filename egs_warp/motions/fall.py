@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from egs_warp.fem.body import BodyState
-from egs_warp.geometry.frames import best_turn
+from egs_warp.geometry.frames import nearest_turn
 from egs_warp.locomotion.objectives import AnyObjective
 from egs_warp.locomotion.stepper import StepReport
 from egs_warp.motions.feet import Base
@@ -39,7 +39,8 @@ class FallWatch:
         body = place.body
         self.sequence = sequence
         self._body, self._up = body, place.ground.axes[2]
-        self._arms = place.standing - body.centre_of_mass(place.standing)
+        arms = place.standing - body.centre_of_mass(place.standing)
+        self._moments = body.node_mass[:, None] * arms
         self._has_upright = place.base() is not Base.ROUND
         self._in_base = sole_shares(body, place.ground, place.standing) > 0.0
         self._longest = FALLEN_TIME * float(np.sqrt(body.height / np.linalg.norm(body.gravity)))
@@ -101,7 +102,8 @@ class FallWatch:
     def _lies(self, state: BodyState, report: StepReport) -> str | None:
         """How a body on the ground lies that does not stand on it."""
         loads = report.forces[:, 0] / self._body.weight
-        turn = best_turn(self._body.node_mass, self._arms, state.positions - self._body.centre_of_mass(state.positions))
+        # By how the body stood, as ``best_turn``; moments about the centre of mass sum to nothing.
+        turn = nearest_turn(state.positions.T @ self._moments)
         tilt = float(np.degrees(np.arccos(np.clip(self._up @ turn @ self._up, -1.0, 1.0))))
         if tilt > FALLEN_TILT:
             return f"tilted by {tilt:.0f} degrees"

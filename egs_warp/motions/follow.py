@@ -169,12 +169,12 @@ class Follow:
         rules: list[AnyObjective] = []
         velocity = self._rate / 3.0 * (balance - seen.com)
         pose = self.pose.over_base(seen.com, seen.base, seen.heading)
-        upright = self.pose.turn_towards(state, pose) * 0.7 * self._rate
-        velocity, spin = self.pose.balanced(state, seen, velocity, upright, dt)
+        upright = self.pose.turn_towards(seen, pose) * 0.7 * self._rate
+        velocity, spin = self.pose.balanced(seen, velocity, upright, dt)
         if not {("body", Quantity.POSITION), ("body", Quantity.VELOCITY)} & ruled:
             rules.append(centre_of_mass_velocity(self.body, self.ground.axes.T @ velocity, self.weights.com))
         if not {("body", Quantity.ORIENTATION), ("body", Quantity.ANGULAR_MOMENTUM)} & ruled:
-            rules.append(SpinObjective(self.body.inertia(state.positions) @ spin, self.weights.spin))
+            rules.append(SpinObjective(seen.inertia @ spin, self.weights.spin))
         # The shape at rest goes along with the centre of mass.
         arms = self._standing - self.body.centre_of_mass(self._standing)
         now = state.positions - self.body.centre_of_mass(state.positions)

@@ -257,8 +257,8 @@ class Jump:
             position, velocity = self.plan.crouch(self._start_com, elapsed)
         velocity = self._following(seen, position, velocity, dt)
         pose = self.pose.bent_over_base(position, self._start_base)
-        velocity, spin = self.pose.balanced(state, seen, velocity, self._upright(state, pose), dt)
-        return self._write(state, velocity, pose, spin, dt)
+        velocity, spin = self.pose.balanced(seen, velocity, self._upright(seen, pose), dt)
+        return self._write(state, seen, velocity, pose, spin, dt)
 
     def _thrust(self, state: BodyState, seen: Measurement, elapsed: float, dt: float) -> list[AnyObjective]:
         """Along the ground the speed that brings the centre of mass from where it is to where it shall touch down."""
@@ -280,24 +280,24 @@ class Jump:
         flat = self._base_of_landing() - FLAT * np.array([self.plan.landing_lag, 0.0])
         upright = self.pose.over_base(landing, flat, self.facing.turned)
         standing = self.pose.bent_over_base(position, self._start_base, self.facing.turned)
-        spin = self._thrust_spin(state, upright, standing, elapsed, left, dt)
-        velocity, spin = self.pose.balanced(state, seen, velocity, spin, dt)
+        spin = self._thrust_spin(seen, upright, standing, elapsed, left, dt)
+        velocity, spin = self.pose.balanced(seen, velocity, spin, dt)
         self._asked = velocity[:2]
-        return self._write(state, velocity, standing, spin, dt)
+        return self._write(state, seen, velocity, standing, spin, dt)
 
     def _thrust_spin(
-        self, state: BodyState, landing: np.ndarray, standing: np.ndarray, elapsed: float, left: float, dt: float
+        self, seen: Measurement, landing: np.ndarray, standing: np.ndarray, elapsed: float, left: float, dt: float
     ) -> np.ndarray:
         """(3,) rad/s to ask for ``left`` seconds before take-off: from what keeps the body in the pose ``standing``
         (3, 3) to what brings it to that of the ``landing`` (3, 3). The spin of a turn grows as the speed does, since
         friction does with the load."""
-        up, inertia = self.ground.axes[2], self.body.inertia(state.positions)
-        upright = self.pose.turn_towards(state, landing)
-        wanted = self.facing.thrust_momentum(self.pose, state, upright, left=left, flight_time=self.plan.flight_time)
+        up, inertia = self.ground.axes[2], seen.inertia
+        upright = self.pose.turn_towards(seen, landing)
+        wanted = self.facing.thrust_momentum(self.pose, seen, upright, left=left, flight_time=self.plan.flight_time)
         share = min(elapsed / self.plan.thrust_time, 1.0)
-        momentum = share * wanted + (1.0 - share) * (inertia @ self._upright(state, standing))
+        momentum = share * wanted + (1.0 - share) * (inertia @ self._upright(seen, standing))
         if self.facing.turn:
-            now = up @ self.body.angular_momentum(state.positions, state.velocities)
+            now = up @ seen.angular_momentum
             about_up = now + dt / max(THRUST_LEAD * left, dt) * (up @ wanted - now)
             momentum += (about_up - up @ momentum) * up
         return np.linalg.solve(inertia, momentum)
@@ -307,13 +307,12 @@ class Jump:
         heading = self.facing.turned - self.facing.turn
         pose = self.pose.over_base(touch_down, self._foothold(state, seen, touch_down, left), heading)
         # Nothing turns a body in the air; a foot that lags on the ground must not push any more.
-        momentum = self.body.angular_momentum(state.positions, state.velocities)
-        spin = np.linalg.solve(self.body.inertia(state.positions), momentum)
-        pose = self.facing.airborne_pose(pose, momentum, self.ground.axes[2], left)
+        spin = np.linalg.solve(seen.inertia, seen.angular_momentum)
+        pose = self.facing.airborne_pose(pose, seen.angular_momentum, self.ground.axes[2], left)
         velocity = seen.velocity - np.array([0.0, 0.0, self.gravity * dt])
         # What was strained by the thrust is let go of first.
         share = self._gently(state.time + dt, LETTING_GO)
-        held = self._write(state, velocity, pose, spin, dt, left=left, share=share)
+        held = self._write(state, seen, velocity, pose, spin, dt, left=left, share=share)
         return [*held, *self._swung(state, pose, left, share)]
 
     def _swung(self, state: BodyState, pose: np.ndarray, left: float, share: float) -> list[AnyObjective]:
@@ -344,12 +343,12 @@ class Jump:
         closing = float(ahead @ seen.velocity[:2]) / max(float(np.linalg.norm(ahead)), 1e-9 * self.body.height)
         coming = min(max(closing / (COMING * self.body.speed_unit), 0.0), 1.0)
         flat = self.pose.over_base(np.array([*(goal[:2] - coming * ahead), seen.com[2]]), seen.base, heading)
-        upright = self._grown(state.time + dt, TOUCHING_DOWN) * self._upright(state, flat)
-        velocity, spin = self.pose.balanced(state, seen, velocity, upright, dt)
+        upright = self._grown(state.time + dt, TOUCHING_DOWN) * self._upright(seen, flat)
+        velocity, spin = self.pose.balanced(seen, velocity, upright, dt)
         # The ground catches what comes down; then little is asked of what comes to rest by itself.
         urgent = (self.pose.urgency(seen) - URGENT) / (1.0 - URGENT)
         share = self._gently(state.time + dt, TOUCHING_DOWN) * max(self.weights.landing, min(urgent, 1.0))
-        return self._write(state, velocity, pose, spin, dt, share=share)
+        return self._write(state, seen, velocity, pose, spin, dt, share=share)
 
     def _gently(self, time: float, unit: float) -> float:
         """As ``_grown``, at once of what has a turn to steer."""
@@ -365,9 +364,9 @@ class Jump:
         rate = 6.0 / self._time_unit
         return velocity + rate * (position - velocity * dt - seen.com)
 
-    def _upright(self, state: BodyState, pose: np.ndarray) -> np.ndarray:
+    def _upright(self, seen: Measurement, pose: np.ndarray) -> np.ndarray:
         """(3,) rad/s that turns a standing body to ``pose`` (3, 3)."""
-        return self.pose.turn_towards(state, pose) * 4.0 / self._time_unit
+        return self.pose.turn_towards(seen, pose) * 4.0 / self._time_unit
 
     def _sufficient_speed(self, seen: Measurement, dt: float) -> float:
         """Speed up, m/s, at the end of this step from which free flight reaches the asked height."""
@@ -407,6 +406,7 @@ class Jump:
     def _write(
         self,
         state: BodyState,
+        seen: Measurement,
         com_velocity: np.ndarray,
         pose: np.ndarray,
         spin: np.ndarray,
@@ -433,6 +433,7 @@ class Jump:
             follow, weights = min(IN_TIME / left, follow), replace(weights, pose=share * self._airborne)
         return self.pose.objectives(
             state,
+            seen,
             com_velocity=com_velocity,
             pose=pose,
             pose_rate=rate,

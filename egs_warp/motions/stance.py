@@ -78,6 +78,12 @@ class Measurement:
     swing: np.ndarray
     """(2,) m/s: what the spin about the centre of mass adds to its speed along the ground in the momentum about the
     feet."""
+    rotation: np.ndarray
+    """(3, 3) best-fit rotation from the standing pose, world axes."""
+    angular_momentum: np.ndarray
+    """(3,) kg m^2/s about the centre of mass, world axes."""
+    inertia: np.ndarray
+    """(3, 3) kg m^2 about the centre of mass, world axes."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +165,7 @@ class PoseFamily:
         self.support_high = np.maximum(footprint.max(axis=0), 0.01 * body.height)
 
     def balanced(
-        self, state: BodyState, seen: Measurement, velocity: np.ndarray, spin: np.ndarray, dt: float
+        self, seen: Measurement, velocity: np.ndarray, spin: np.ndarray, dt: float
     ) -> tuple[np.ndarray, np.ndarray]:
         """The end velocity (3,) m/s of the centre of mass, ground axes, and spin (3,) rad/s, world axes, nearest to
         those asked for that feet can bring about without tipping or sliding.
@@ -171,8 +177,7 @@ class PoseFamily:
         up = max(gravity + (velocity[2] - seen.velocity[2]) / dt, 0.2 * gravity)
         height = self._lever(seen.com)
         level = velocity[:2] - seen.velocity[:2]
-        inertia = self.body.inertia(state.positions)
-        turn = self._swing(inertia @ spin, height) - seen.swing
+        turn = self._swing(seen.inertia @ spin, height) - seen.swing
 
         def within_grip(change: np.ndarray) -> np.ndarray:
             push = np.array([*(change / dt), 0.0])
@@ -188,15 +193,15 @@ class PoseFamily:
         both = (seen.com[:2] - np.clip(pressure, low, high)) * up / height * dt
         # Each gives way as its objective weighs it, speeds as they are, spins with the radius of gyration; what
         # friction denies the one, the other takes.
-        share = 1.0 / (1.0 + 0.5 * np.trace(inertia) / (self.body.mass * height**2))
+        share = 1.0 / (1.0 + 0.5 * np.trace(seen.inertia) / (self.body.mass * height**2))
         level = within_grip(level + share * (both - level - turn))
         turn = both - level
         swing = seen.swing + turn
-        momentum = self.ground.axes @ inertia @ spin
+        momentum = self.ground.axes @ seen.inertia @ spin
         momentum[:2] = self.body.mass * height * np.array([-swing[1], swing[0]])
         return (
             np.array([*(seen.velocity[:2] + level), velocity[2]]),
-            np.linalg.solve(inertia, self.ground.axes.T @ momentum),
+            np.linalg.solve(seen.inertia, self.ground.axes.T @ momentum),
         )
 
     def caught(self, seen: Measurement, goal: np.ndarray) -> np.ndarray:
@@ -237,7 +242,8 @@ class PoseFamily:
         """What the controller sees."""
         local = self.ground.local(state.positions)
         forces = report.forces[:, 0].sum() if report is not None else self.body.weight
-        turn = self.ground.axes @ self.rotation(state.positions) @ self.ground.axes.T
+        rotation = self._rotation(state.positions)
+        turn = self.ground.axes @ rotation @ self.ground.axes.T
         com = self.body.centre_of_mass(local)
         momentum = self.body.angular_momentum(state.positions, state.velocities)
         return Measurement(
@@ -250,6 +256,9 @@ class PoseFamily:
             heading=float(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])),
             support=self._support(local, report),
             swing=self._swing(momentum, self._lever(com)),
+            rotation=rotation,
+            angular_momentum=momentum,
+            inertia=self.body.inertia(state.positions),
         )
 
     def _support(self, local: np.ndarray, report: StepReport | None) -> np.ndarray:
@@ -260,8 +269,7 @@ class PoseFamily:
         places = np.einsum("cw,cwi->ci", contacts.weights, local[contacts.nodes])[:, :2]
         return np.stack([places.min(axis=0), places.max(axis=0)])
 
-    def rotation(self, positions: np.ndarray) -> np.ndarray:
-        """(3, 3) best-fit rotation from the standing pose, world axes."""
+    def _rotation(self, positions: np.ndarray) -> np.ndarray:
         arms = positions - self.body.centre_of_mass(positions)
         return best_turn(self.body.node_mass, self.arms, arms)
 
@@ -298,7 +306,7 @@ class PoseFamily:
         entries = assembly.hessian_entries(self._standing, projected=True)
         held = np.repeat(self._sole_share > 0.0, 3)
         entries[assembly.diagonal_entries] += _PINNED * entries.max() * held
-        factors = SparseFactors(assembly.upper_pattern)
+        factors = SparseFactors(assembly.upper_pattern, assembly.analysis)
         factors.update(entries)
         pulls = np.stack([np.kron(body.node_mass, axis) for axis in axes[:2]], axis=1)
         bent = factors.solve(pulls * ~held[:, None]).reshape(len(body.node_mass), 3, 2)
@@ -315,6 +323,7 @@ class PoseFamily:
     def objectives(
         self,
         state: BodyState,
+        seen: Measurement,
         *,
         com_velocity: np.ndarray,
         pose: np.ndarray,
@@ -334,7 +343,7 @@ class PoseFamily:
         velocity = self.ground.axes.T @ com_velocity
         wanted = self.arms @ pose.T
         pose_velocity = velocity + self.arms @ pose_rate.T + follow * (wanted - arms)
-        momentum = body.inertia(state.positions) @ spin
+        momentum = seen.inertia @ spin
         return [
             *self._balance(velocity, weights),
             SpinObjective(momentum, weights.spin),
@@ -352,10 +361,10 @@ class PoseFamily:
             replace(both, rows=up @ both.rows, target=up @ velocity, weight=weights.up),
         ]
 
-    def turn_towards(self, state: BodyState, pose: np.ndarray) -> np.ndarray:
+    def turn_towards(self, seen: Measurement, pose: np.ndarray) -> np.ndarray:
         """(3,) rotation vector, world axes, from the measured best-fit rotation to that of ``pose``."""
         wanted = best_turn(self.body.node_mass, self.arms, self.arms @ pose.T)
-        return Rotation.from_matrix(wanted @ self.rotation(state.positions).T).as_rotvec()
+        return Rotation.from_matrix(wanted @ seen.rotation.T).as_rotvec()
 
 
 def _share_in_cone(push: np.ndarray, held: np.ndarray, normal: np.ndarray, friction: float) -> float:

@@ -70,10 +70,11 @@ class Stand:
         velocity = seen.velocity + dt * acceleration
         heading = self.pose.sole_heading(state.positions)
         pose = self.pose.over_base(seen.com + dt * velocity, seen.base, heading)
-        upright = self.pose.turn_towards(state, pose) * 4.0 / self._time_unit
-        velocity, spin = self.pose.balanced(state, seen, velocity, upright, dt)
+        upright = self.pose.turn_towards(seen, pose) * 4.0 / self._time_unit
+        velocity, spin = self.pose.balanced(seen, velocity, upright, dt)
         return self.pose.objectives(
             state,
+            seen,
             com_velocity=velocity,
             pose=pose,
             pose_rate=np.zeros((3, 3)),

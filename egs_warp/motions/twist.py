@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from egs_warp.fem.body import BodyState
 from egs_warp.motions.free_turn import spin_that_turns
 from egs_warp.motions.jump import Jump
 from egs_warp.motions.jump_plan import JumpTarget
 from egs_warp.motions.sequence import Place
-from egs_warp.motions.stance import PoseFamily
+from egs_warp.motions.stance import Measurement, PoseFamily
 
 AIRBORNE_SHARE = 0.88
 """Of the planned time of flight the body is off the ground: it stretches before it leaves it and before it lands."""
@@ -42,15 +41,15 @@ class Turning:
         self.turned += float(np.remainder(heading - self.turned + np.pi, 2.0 * np.pi) - np.pi)
 
     def thrust_momentum(
-        self, pose: PoseFamily, state: BodyState, upright: np.ndarray, *, left: float, flight_time: float
+        self, pose: PoseFamily, seen: Measurement, upright: np.ndarray, *, left: float, flight_time: float
     ) -> np.ndarray:
         """(3,) kg m^2/s with which the body, once in the air, turns upright and by what is left.
 
         It flies in about the shape in which it stands, so its inertia then, not the one now, says how.
         """
-        up, rotation = pose.ground.axes[2], pose.rotation(state.positions)
+        up, rotation = pose.ground.axes[2], seen.rotation
         inertia = rotation @ self._standing_inertia @ rotation.T
-        momentum = float(up @ self.body.angular_momentum(state.positions, state.velocities))
+        momentum = float(up @ seen.angular_momentum)
         spinning = momentum / float(up @ inertia @ up)
         airborne = AIRBORNE_SHARE * flight_time + 0.5 * left
         turn = SPARE_SPIN * self._left_to_turn() - 0.5 * left * spinning

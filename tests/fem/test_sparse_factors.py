@@ -8,7 +8,7 @@ import scipy.sparse as sparse
 
 from egs_warp.fem.factors import Factors
 from egs_warp.fem.kept import Kept
-from egs_warp.fem.sparse_factors import SparseFactors, inverse_and_positives
+from egs_warp.fem.sparse_factors import Analysis, SparseFactors, inverse_and_positives
 from egs_warp.launching import THREADS
 from tests.support.sparse_patterns import PATTERNS, upper_of
 
@@ -135,6 +135,19 @@ def test_the_same_bits_on_any_number_of_cores(monkeypatch: pytest.MonkeyPatch) -
         found.append((factors.solve(right), *strained(factors, upper_of(matrix), right)))
     for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_factors_that_share_an_analysis_keep_to_their_own_matrices() -> None:
+    """Two at once, to the bits of those that have found it for themselves."""
+    upper = upper_of(random_matrix(60, 12.0))
+    analysis, right = Analysis.of(upper), np.random.default_rng(5).standard_normal((60, 3))
+    shared = [SparseFactors(upper, analysis) for _ in range(2)]
+    for scale, factors in zip((1.0, 3.0), shared, strict=True):
+        assert factors.update(scale * upper.data)
+    for scale, factors in zip((1.0, 3.0), shared, strict=True):
+        alone = SparseFactors(upper)
+        assert alone.update(scale * upper.data)
+        assert np.array_equal(factors.solve(right), alone.solve(right))
 
 
 def test_a_pivot_next_to_nothing_has_no_factors() -> None:

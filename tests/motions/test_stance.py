@@ -38,7 +38,7 @@ def test_the_nearest_end_of_a_step_that_does_not_tip(
     centre of mass times the load; of all ends that do, the one whose velocity and spin miss least."""
     pose, state, seen = stood(place, 1e3, (0.05, -0.03, 0.1))
     asked, spin = np.array([*wanted, up]), np.array(turning)
-    velocity, turned = pose.balanced(state, seen, asked, spin, DT)
+    velocity, turned = pose.balanced(seen, asked, spin, DT)
     load, height = GRAVITY + up / DT, seen.com[2]
     middle = place.ground.local(place.touching)[:, :2].mean(axis=0)
 
@@ -65,13 +65,13 @@ def test_the_nearest_end_of_a_step_that_does_not_tip(
 
 
 def test_what_feet_can_give_is_asked_for_as_it_is_and_a_falling_body_may_be_pushed_either_way(place: Place) -> None:
-    pose, state, seen = stood(place, 1e3, (0.0, 0.0, 0.0))
+    pose, _, seen = stood(place, 1e3, (0.0, 0.0, 0.0))
     asked, spin = np.array([0.01, -0.005, 0.02]), np.array([0.01, 0.02, 0.5])
-    velocity, turned = pose.balanced(state, seen, asked, spin, DT)
+    velocity, turned = pose.balanced(seen, asked, spin, DT)
     np.testing.assert_allclose(velocity, asked, atol=1e-12)
     np.testing.assert_allclose(turned, spin, atol=1e-12)
-    pose, state, seen = stood(place, 1e3, (0.5, 0.0, 0.0))
-    ways = [pose.balanced(state, seen, np.array([x, 0.0, 0.0]), np.zeros(3), DT)[0][0] for x in (-2.0, 2.0)]
+    pose, _, seen = stood(place, 1e3, (0.5, 0.0, 0.0))
+    ways = [pose.balanced(seen, np.array([x, 0.0, 0.0]), np.zeros(3), DT)[0][0] for x in (-2.0, 2.0)]
     assert ways[0] < -0.5 * DT and ways[1] > 0.5 * DT
 
 
@@ -79,12 +79,12 @@ def test_what_feet_can_give_is_asked_for_as_it_is_and_a_falling_body_may_be_push
 def test_no_more_is_asked_than_friction_gives(place: Place, up: float) -> None:
     """Coulomb: what is asked keeps its way and is 0.95 of what the ground's friction could do; less is asked as it
     is."""
-    pose, state, seen = stood(place, 0.05, (0.0, 0.0, 0.0))
+    pose, _, seen = stood(place, 0.05, (0.0, 0.0, 0.0))
     wanted = np.array([0.009, -0.012])
     most = 0.95 * 0.05 * (GRAVITY + up / DT) * DT
-    got, _ = pose.balanced(state, seen, np.array([*(10.0 * wanted), up]), np.zeros(3), DT)
+    got, _ = pose.balanced(seen, np.array([*(10.0 * wanted), up]), np.zeros(3), DT)
     assert got[:2] == pytest.approx(most * wanted / 0.015)
-    little, _ = pose.balanced(state, seen, np.array([*(0.1 * wanted), up]), np.zeros(3), DT)
+    little, _ = pose.balanced(seen, np.array([*(0.1 * wanted), up]), np.zeros(3), DT)
     assert little[:2] == pytest.approx(0.1 * wanted)
 
 
@@ -109,7 +109,7 @@ def test_on_a_slope_friction_gives_less_uphill(way: tuple[float, float]) -> None
 def test_what_friction_denies_the_speed_the_spin_takes(place: Place, spin: tuple[float, float, float]) -> None:
     """On a slippery ground, too, the centre of pressure asked for is within the footprint."""
     pose, state, seen = stood(place, 0.3, (0.05, -0.03, 0.1))
-    velocity, turned = pose.balanced(state, seen, np.array([0.3, 0.01, 0.0]), np.array(spin), DT)
+    velocity, turned = pose.balanced(seen, np.array([0.3, 0.01, 0.0]), np.array(spin), DT)
     change = velocity[:2] + swing(place, state, seen, turned)
     middle = place.ground.local(place.touching)[:, :2].mean(axis=0)
     pressure = seen.com[:2] - seen.com[2] / GRAVITY * change / DT
@@ -164,8 +164,8 @@ def test_a_body_that_leans_turns_as_far_as_strains_it_least(place: Place) -> Non
     nearest = np.linalg.lstsq(weights * arms, weights * ends, rcond=None)[0].T
     goal = seen.com + lean * pose.standing_height * np.array([1.0, 0.0, 0.0])
     assert np.allclose(pose.bent_over_base(goal, seen.base), nearest, atol=1e-5)
-    state, left = BodyState(place.standing, 0.0 * place.standing), place.ground.axes[1]
+    left = place.ground.axes[1]
     sheared, bent = (
-        left @ pose.turn_towards(state, of(goal, seen.base)) for of in (pose.over_base, pose.bent_over_base)
+        left @ pose.turn_towards(seen, of(goal, seen.base)) for of in (pose.over_base, pose.bent_over_base)
     )
     assert 1.1 * sheared < bent
