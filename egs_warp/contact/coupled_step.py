@@ -133,9 +133,13 @@ class CoupledSolver:
         none = contacts.points[:0]
         tangents, unanswered, fresh = 0, 0, False
         now = trial = response.at(tension, velocities, forces)
+        before: Iterate | None = None
         recent: list[float] = []
         for iteration in range(1, ITERATIONS + 1):
-            wanted, missed, trial = now.onward(shift, friction, further=True)
+            # If it falls as in the step before.
+            coming = np.inf if before is None else now.size * (now.size / before.size)
+            ends = coming <= self.tolerance or (coming <= JOINING < now.size and not last)
+            wanted, missed, trial = now.onward(shift, friction, further=not ends)
             unanswered += missed > answered
             length, better = 1.0, False
             while length > SHORTEST:
