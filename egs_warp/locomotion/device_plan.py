@@ -33,9 +33,12 @@ from egs_warp.locomotion.objectives import AnyObjective, Objective
 from egs_warp.locomotion.planner import REGULAR, WORK, Plan, StepPlanner
 from egs_warp.locomotion.solvers import QpSolver
 from egs_warp.locomotion.step_cost import EFFORT, HORIZON
-from egs_warp.locomotion.strategies import better_elsewhere, is_doubted
+from egs_warp.locomotion.strategies import COSTLY, better_elsewhere, is_doubted
 from egs_warp.muscles.tension import MuscleTension
 from egs_warp.precision import real
+
+LIKELY = 0.5 * COSTLY
+"""After a step that costs as much the next has its second search beside the first."""
 
 
 class DevicePlanner:
@@ -115,8 +118,11 @@ class PlanRoom:
         self._answer, self._looked, self._forces, self._speeds_after, self._end = others
         self._verdicts = verdicts.view(2, 2)
         self._x, self._point = zeros(m + width + 1), Upload(body.stream, m + width + 1)
-        self._search = SearchRoom(m, places, str(body.factors.device))
+        alias = str(body.factors.device)
+        self._search = SearchRoom(m, places, alias, costly=COSTLY)
         self._relaxed = RelaxedRoom(m, places, self._search)
+        self._second = SearchRoom(m, places, alias, beside=self._search)
+        self._objective, self._beside = 0.0, False
         # What contact answers where a second search begins, and by how much that misses its laws: it is only a start.
         self._answered, self._answered_missed = zeros(width), zeros(1)
         self._works, self._arrived = Recordings(body.stream), None
@@ -177,7 +183,8 @@ class PlanRoom:
         dt, ratio = start.problem.dt, 1.0 + start.problem.dt * start.problem.drag
         with self.body.stream:
             self._ask(start, objectives)
-            self._do(self._enqueue_search, dt, ratio, self._horizon(dt))
+            self._beside = start.contacts.count > 0 and self._objective >= LIKELY
+            self._do(self._enqueue_search, dt, ratio, self._horizon(dt), self._beside)
         self._begin_solve(start)
 
     def _horizon(self, dt: float) -> float:
@@ -191,9 +198,12 @@ class PlanRoom:
         if not definite > 0.0:
             return None
         contacts = start.contacts.count
+        self._objective = float(objective)
         if ended != FOUND or there != 1.0 or is_doubted(objective, contacts):
             x = answer[HEADER : HEADER + self.m + 3 * contacts].copy() if there == 1.0 else None
-            first = PieceSearch(x, objective, int(count), int(infeasible)) if ended == FOUND else self._by_host()
+            first = PieceSearch(x, objective, int(count), int(infeasible))
+            if ended != FOUND:
+                first = self._by_host(self._search)
             found = self._searched_on(first, contacts)
             if found.x is None:
                 return None
@@ -217,36 +227,54 @@ class PlanRoom:
         """``found``, or better if that costs so much that it is doubted."""
         if not is_doubted(found.objective, contacts):
             return found
-        relaxed = self._relaxed.solve() or solve_relaxed(self._search.asked()[0], QpSolver.OSQP)
+        there = self._relaxed.found() if self._beside else None
+        if there is None:
+            with self.body.stream:
+                self._search.settled.zero_()
+                self._do(self._enqueue_elsewhere)
+            there = self._relaxed.found()
+        relaxed = there or solve_relaxed(self._search.asked()[0], QpSolver.OSQP)
 
         def search(activations: np.ndarray) -> PieceSearch:
-            with self.body.stream:
-                self._point.take(activations)
-                self._do(self._enqueue_elsewhere)
-            return self._search.found(self.m + 3 * contacts) or self._by_host()
+            if there is None:
+                with self.body.stream:
+                    self._point.take(activations)
+                    self._do(self._enqueue_from_point)
+            return self._second.found(self.m + 3 * contacts) or self._by_host(self._second)
 
         return better_elsewhere(found, relaxed, search)
 
-    def _by_host(self) -> PieceSearch:
-        """The search that was told, where rounding has led the kernel astray."""
-        program, start, modes = self._search.asked()
+    def _by_host(self, search: SearchRoom) -> PieceSearch:
+        """The ``search`` that was told, where rounding has led the kernel astray."""
+        program, start, modes = search.asked()
         limit = self.owner.planner.settings.qp_limit
         return search_pieces(program, start, modes, qp_limit=limit, solver=QpSolver.OSQP)
 
     def _enqueue_elsewhere(self) -> None:
-        """A search from other activations and what contact answers to them."""
-        body, room, activations = self.body, self.room, self._point.there[: self.m]
+        """The optimum without complementarity, and a search from there."""
+        # Warp, too, works where torch does.
+        with wp.ScopedStream(self.body.stream.current(), sync_enter=False):
+            self._relaxed.enqueue()
+            self._enqueue_from(wp.to_torch(self._relaxed.answer)[HEADER:])
+
+    def _enqueue_from_point(self) -> None:
+        self._enqueue_from(self._point.there[: self.m])
+
+    def _enqueue_from(self, activations: torch.Tensor) -> None:
+        """A second search, from these ``activations`` (m,) and what contact answers to them."""
+        body, room = self.body, self.room
         moved = torch.addmv(self._speeds[:, -1], self._speeds[:, : self.m], activations)
         self._answered.copy_(self._looked)
         room.coulomb.enqueue_forces(moved, self._answered, self._answered_missed)
+        wp.to_torch(self._second.told).copy_(wp.to_torch(self._search.told))
         wp.launch(
             start_kernel,
             self.m + room.places,
-            inputs=[body.body.weight, shared(activations, real), vectors(self._answered)],
-            outputs=[self._search.told],
+            inputs=[body.body.weight, shared(activations, real), vectors(self._answered), self._search.settled],
+            outputs=[self._second.told],
             device=body.body.assembly.device,
         )
-        self._search.enqueue()
+        self._second.enqueue()
 
     def _end_at(self, x: np.ndarray, start: StepStart) -> None:
         """The end of another search than the first, ``x`` (m + 3n,), and the first step of the solve from there."""
@@ -351,8 +379,8 @@ class PlanRoom:
             rows = self.owner.others.there(*told).view(-1, len(self._form))
             self._form.addmm_(rows.T, rows)
 
-    def _enqueue_search(self, dt: float, ratio: float, time: float) -> None:
-        """The program, its search, and the step's equation at the end that it expects."""
+    def _enqueue_search(self, dt: float, ratio: float, time: float, beside: bool) -> None:
+        """The program, its search, a second one ``beside`` that, and the step's equation at the end that it expects."""
         body, room, planner = self.body, self.room, self.owner.planner
         width, laws = 3 * room.places, room.coulomb
         self._looked.copy_(room.wanted)
@@ -370,7 +398,8 @@ class PlanRoom:
             outputs=[self._search.told],
             device=target,
         )
-        self._search.enqueue()
+        self._search.settled.zero_()
+        body.stream.at_once([self._search.enqueue, *([self._enqueue_elsewhere] if beside else [])])
         wp.launch(
             kernels.take_kernel,
             len(self._x),

@@ -33,13 +33,14 @@ def search_at_once(
 
 class SearchRoom:
     """Memory for programs of m activations and n contacts at most, and the launch that reads what is ``told`` and
-    writes the ``answer``, see ``search_kernel``."""
+    writes the ``answer``, see ``search_kernel``: it has ``settled`` the search as soon as an end is not ``costly``, and
+    ends where another that it is ``beside`` has done so."""
 
-    def __init__(self, m: int, n: int, alias: str) -> None:
+    def __init__(self, m: int, n: int, alias: str, *, costly: float = 0.0, beside: SearchRoom | None = None) -> None:
         self._device, size = wp.get_device(alias), m + 3 * n
         zeros = partial(wp.zeros, device=self._device)
         self.told = zeros(kernels.HEADER + size * size + size + 3 * n * (size + 1) + 3 * m + 3 * n, dtype=real)
-        self.answer = zeros(kernels.HEADER + size, dtype=real)
+        self.answer, self.settled = zeros(kernels.HEADER + size, dtype=real), zeros(1, dtype=int)
         further, forces, answers = 9 * n, 3 * n, 5 * n
         total = m + further
         room = kernels.Room()
@@ -56,7 +57,6 @@ class SearchRoom:
             "gathered": (size, forces),
             "moved": (size, m + 1),
             **dict.fromkeys(("cost", "root"), (m, m)),
-            "turned": (answers, m),
             **dict.fromkeys(("slope", "minimum", "found", "start"), m),
             **dict.fromkeys(("at_minimum", "at_start", "at_found"), answers),
             **{"lengths": total, "bounds": (2, total), "pushes": further, "slips": (4, n, 2)},
@@ -64,8 +64,9 @@ class SearchRoom:
         }.items():
             setattr(room, name, zeros(shape, dtype=real))
         # The launch has where these lie.
-        self._held = room, *_active_set(total, m, self._device)
-        self._launch: Any = _launch(kernels.search_kernel, [self.told, *self._held], self.answer)
+        self._held = room, *_active_set(total, m + answers, m, beside.settled if beside else zeros(1, dtype=int))
+        given = [self.told, costly, *self._held]
+        self._launch: Any = _launch(kernels.search_kernel, given, [self.answer, self.settled])
 
     @cached_property
     def _told_here(self) -> wp.array:
@@ -125,11 +126,11 @@ class SearchRoom:
 
 class RelaxedRoom:
     """Memory for the optimum without complementarity of the program that a ``search`` of m activations and n contacts
-    at most was told, and its launch."""
+    at most was told, and its launch, whose ``answer`` is what ``relax_kernel`` says, unless that search has settled."""
 
     def __init__(self, m: int, n: int, search: SearchRoom) -> None:
         device, size, total = device_of(search.told), m + 3 * n, m + (2 + FACES) * n
-        self._answer = wp.zeros(kernels.HEADER + m, dtype=real, device=device)
+        self.answer = wp.zeros(kernels.HEADER + m, dtype=real, device=device)
         relaxed = Relaxed()
         for name, shape in {
             **{"cost": (size, size), "root": (size, size), "leaving": (n, size), "speeds": n},
@@ -138,33 +139,38 @@ class RelaxedRoom:
         }.items():
             setattr(relaxed, name, wp.zeros(shape, dtype=real, device=device))
         # The launch has where these lie.
-        self._held = search.told, relaxed, *_active_set(total, size, device)
-        self._launch: Any = _launch(relax_kernel, list(self._held), self._answer)
+        self._held = search.told, relaxed, *_active_set(total, n + size, size, search.settled)
+        self._launch: Any = _launch(relax_kernel, list(self._held), [self.answer])
 
     @cached_property
     def _answer_here(self) -> Mirror:
-        return Mirror(self._answer)
+        return Mirror(self.answer)
 
-    def solve(self) -> tuple[np.ndarray, float] | None:
-        """See ``solve_relaxed``; None where rounding leads astray."""
+    def enqueue(self) -> None:
+        """The launch, with nothing that waits."""
         self._launch.launch()
+
+    def found(self) -> tuple[np.ndarray, float] | None:
+        """What has come of it, see ``solve_relaxed``; None where rounding leads astray, or the search has settled."""
         answer = self._answer_here.get()
         # Contact can always push so hard that nothing sinks in: where no point is found there is one all the same.
         return (answer[kernels.HEADER :], float(answer[1])) if answer[0] == FOUND else None
 
 
-def _active_set(rows: int, unknowns: int, device: wp.Device) -> tuple[Any, Any, Any]:
+def _active_set(rows: int, made_of: int, unknowns: int, settled: wp.array) -> tuple[Any, Any, Any]:
     """``UnitRows``, ``Holding`` and ``Splitting`` for so many at most."""
-    zeros = partial(wp.zeros, device=device)
+    zeros = partial(wp.zeros, device=device_of(settled))
     units, holding, splitting = UnitRows(), Holding(), Splitting()
-    units.units = zeros((rows, unknowns), dtype=real)
+    units.settled = settled
+    units.units, units.seen = zeros((made_of, unknowns), dtype=real), zeros(made_of, dtype=real)
+    units.parts, units.shares = zeros((rows, 3), dtype=int), zeros((rows, 3), dtype=real)
     for name in ("free", "lower", "upper", "slack"):
         setattr(units, name, zeros(rows, dtype=real))
     holding.side, holding.active = zeros(rows, dtype=int), zeros(unknowns, dtype=int)
     for name in ("held", "held_across", "products", "root", "inverse"):
         setattr(holding, name, zeros((unknowns, unknowns), dtype=real))
     holding.at = zeros(rows, dtype=real)
-    for name in ("pulls", "place", "ways", "beside", "between", "outside"):
+    for name in ("pulls", "place", "ways", "beside", "between", "joins", "outside"):
         setattr(holding, name, zeros(unknowns, dtype=real))
     splitting.begun, splitting.held_by = zeros(rows, dtype=real), zeros(rows, dtype=real)
     for name in ("rows", "near", "pushes", "sums", "right", "between", "step"):
@@ -172,14 +178,14 @@ def _active_set(rows: int, unknowns: int, device: wp.Device) -> tuple[Any, Any, 
     return units, holding, splitting
 
 
-def _launch(kernel: Any, inputs: list[Any], answer: wp.array) -> Any:
+def _launch(kernel: Any, inputs: list[Any], outputs: list[wp.array]) -> Any:
     """By one block."""
-    device = device_of(answer)
+    device = device_of(outputs[0])
     return wp.launch(
         kernel,
         dim=1 if device.is_cpu else kernels.BLOCK,
         inputs=inputs,
-        outputs=[answer],
+        outputs=outputs,
         device=device,
         block_dim=kernels.BLOCK,
         record_cmd=True,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -176,22 +177,29 @@ def test_what_is_asked_again_is_the_host_s(creature: Creature, stepper: Locomoti
     assert planner_of(stepper).plan_again(prospect, memory.activations, objectives, start.friction) is None
 
 
+@pytest.mark.parametrize("beside", [False, True])
 @pytest.mark.parametrize("what", ["costly", "kept", "better", "astray", "no bound", "second astray"])
 def test_a_search_goes_on_as_the_host_s(
-    what: str, creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
+    what: str, beside: bool, creature: Creature, stepper: LocomotionStepper, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where its end costs so much that another may be better, and where that is: to the host's plan, at whose end the
-    solve begins. Only what is led astray the host searches itself."""
+    solve begins, whether the second search is ``beside`` the first or after it. Only what is led astray the host
+    searches itself."""
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
+    monkeypatch.setattr(device_plan, "LIKELY", 0.0 if beside else np.inf)
+    if what != "astray":
+        monkeypatch.setattr(device_plan, "COSTLY", 0.0)
+    planner_of(stepper)._rooms.clear()
     start = begun(stepper, creature.start, memory)
     asked: list[str] = []
 
     def noted(module: Any, name: str, given: Callable[..., Any]) -> None:
-        monkeypatch.setattr(module, name, lambda *a, **b: asked.append(name) or given(*a, **b))
+        monkeypatch.setattr(module, name, wraps(given)(lambda *a, **b: asked.append(name) or given(*a, **b)))
 
     noted(device_plan, "search_pieces", search_pieces)
     noted(device_plan, "solve_relaxed", solve_relaxed)
     noted(PlanRoom, "_enqueue_elsewhere", PlanRoom._enqueue_elsewhere)
+    noted(PlanRoom, "_enqueue_from_point", PlanRoom._enqueue_from_point)
     noted(PlanRoom, "_end_at", PlanRoom._end_at)
     if what != "astray":
         monkeypatch.setattr(strategies, "COSTLY", 0.0)
@@ -207,7 +215,7 @@ def test_a_search_goes_on_as_the_host_s(
         monkeypatch.setattr(device_plan, "FOUND", -1)
         monkeypatch.setattr(strategies, "search_at_once", lambda *_, **__: None)
     elif what == "no bound":
-        monkeypatch.setattr(RelaxedRoom, "solve", lambda _: None)
+        monkeypatch.setattr(RelaxedRoom, "found", lambda _: None)
     elif what == "second astray":
         monkeypatch.setattr(SearchRoom, "found", lambda *_: None)
     assert is_the_host_s(stepper, start, memory, objectives)
@@ -216,10 +224,11 @@ def test_a_search_goes_on_as_the_host_s(
         "better": ["_enqueue_elsewhere", "_end_at"],
         "kept": ["_enqueue_elsewhere"],
         "astray": ["search_pieces", "_end_at"],
-        "no bound": ["solve_relaxed", "_enqueue_elsewhere", "_end_at"],
+        "no bound": ["_enqueue_elsewhere", "solve_relaxed", "_enqueue_from_point", "_end_at"],
         "second astray": ["_enqueue_elsewhere", "search_pieces", "_end_at"],
     }
-    assert asked == expected[what]
+    again = ["_enqueue_elsewhere"] if beside and what in ("astray", "no bound") else []
+    assert asked == again + expected[what]
     found = planner_of(stepper).plan(start, objectives)
     assert found is not None
     forces, missed, ahead = (

@@ -175,7 +175,8 @@ def test_one_launch_finds_the_optimum_without_complementarity(activations: int, 
     for seed in range(12):
         program = body_program(seed, activations, contacts, bias=0.5 * (seed % 3))
         found = search.search(program, *entered(program), 12)
-        there, here = room.solve(), solve_relaxed(program, QpSolver.OSQP)
+        room.enqueue()
+        there, here = room.found(), solve_relaxed(program, QpSolver.OSQP)
         assert here is not None
         if there is None:
             continue
@@ -201,11 +202,13 @@ def test_a_block_does_the_algebra(count: int, device: str) -> None:
     made = [wp.zeros((count, count), dtype=real, device=device) for _ in range(3)]
     numbers = [wp.array(marks.astype(np.int32), dtype=int, device=device)]
     numbers += [wp.zeros(size, dtype=int, device=device) for size in (count, 4)]
-    lengths = wp.zeros(count, dtype=real, device=device)
+    which, shares = rng.integers(0, count, (count, 3)), rng.standard_normal((count, 3))
+    parts = [wp.array(which.astype(np.int32), dtype=int, device=device), wp.array(shares, dtype=real, device=device)]
+    lengths, across = (wp.zeros(count, dtype=real, device=device) for _ in range(2))
     wp.launch(
         algebra_kernel,
         1 if device == "cpu" else piece_search.BLOCK,
-        inputs=[count, count + right, *given, *made, *numbers, lengths],
+        inputs=[count, count + right, *given, *made, *numbers, *parts, lengths, across],
         device=device,
         block_dim=piece_search.BLOCK,
     )
@@ -219,9 +222,13 @@ def test_a_block_does_the_algebra(count: int, device: str) -> None:
     assert told == [1, 1, len(listed), 0 if device == "cpu" else 6]
     kept = min(len(listed), count)
     np.testing.assert_array_equal(numbers[1].numpy()[:kept], listed[:kept])
-    solved, long = given[0].numpy()[:, count:], lengths.numpy()[:, None]
+    left = given[0].numpy()
     expected = np.linalg.solve(matrix[:, :count], matrix[:, count:])
-    np.testing.assert_allclose(long * solved, expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(left[:, count:], expected, rtol=1e-9, atol=1e-9)
+    long = np.linalg.norm((shares[:, :, None] * left[which]).sum(axis=1), axis=1)
+    np.testing.assert_allclose(lengths.numpy(), long, rtol=1e-9)
+    np.testing.assert_allclose(parts[1].numpy(), shares / long[:, None], rtol=1e-9)
+    np.testing.assert_allclose(across.numpy(), product.T @ long, rtol=1e-9, atol=1e-9 * count)
 
 
 def test_bounds_give_way_by_as_much_as_on_the_host() -> None:
@@ -234,7 +241,7 @@ def test_bounds_give_way_by_as_much_as_on_the_host() -> None:
 def filled(made: Any, device: str, **shapes: Any) -> Any:
     """The struct ``made`` with zeros of these shapes, or with the numbers of arrays."""
     for name, given in shapes.items():
-        kind = int if name in ("side", "active") else real
+        kind = int if name in ("side", "active", "settled", "parts") else real
         array = given if isinstance(given, np.ndarray) else np.zeros(given)
         setattr(made, name, wp.array(np.ascontiguousarray(array), dtype=kind, device=device))
     return made
@@ -262,11 +269,14 @@ def test_a_block_iterates_as_osqp_does_and_ends_at_the_optimum(seed: int, device
     pushes[chosen] = near.multipliers
     at = free + units @ near.x
     expected = np.where(at - lower < -pushes, 1, np.where(upper - at < pushes, -1, 0))
-    rows = filled(UnitRows(), device, units=units, free=free, lower=lower, upper=upper, slack=np.full(m, 1e-8))
-    rows.unknowns, rows.count, rows.most = n, m, 1e6
+    rows = filled(
+        UnitRows(), device, units=units, free=free, lower=lower, upper=upper, slack=np.full(m, 1e-8),
+        settled=1, seen=m, parts=np.arange(m)[:, None].repeat(3, 1), shares=np.eye(1, 3).repeat(m, 0),
+    )  # fmt: skip
+    rows.unknowns, rows.count, rows.made_of, rows.most = n, m, m, 1e6
     holding = filled(
         Holding(), device, side=side, active=n, at=m, **dict.fromkeys(("pulls", "place", "ways", "beside"), n),
-        **dict.fromkeys(("between", "outside"), n),
+        **dict.fromkeys(("between", "joins", "outside"), n),
         **dict.fromkeys(("held", "held_across", "products", "root", "inverse"), (n, n)),
     )  # fmt: skip
     splitting = filled(

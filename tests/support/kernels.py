@@ -43,7 +43,10 @@ def algebra_kernel(
     marks: wp.array[int],
     found: wp.array[int],
     told: wp.array[int],
+    parts: wp.array2d[int],
+    shares: wp.array2d[real],
     lengths: wp.array[real],
+    across: wp.array[real],
 ):
     """Each of the block's functions once."""
     for e in range(algebra.lane_of_block(), unknowns * unknowns, wp.block_dim()):
@@ -57,7 +60,8 @@ def algebra_kernel(
     told[2] = algebra.list_marked(marks, columns, unknowns, found)
     mine = real(algebra.lane_of_block() % 7)
     told[3] = int(algebra.largest_and_place(mine, algebra.lane_of_block())[1])
-    algebra.normalise(matrix, unknowns, columns, lengths)
+    algebra.normalise(matrix, columns, parts, shares, unknowns, lengths)
+    algebra.multiply_across(product, unknowns, unknowns, lengths, across)
 
 
 @wp.kernel(launch_bounds=BLOCK)

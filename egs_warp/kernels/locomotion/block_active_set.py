@@ -46,8 +46,16 @@ class UnitRows:
     """n."""
     count: int
     """m."""
+    made_of: int
+    """k."""
     units: wp.array2d[real]
-    """(m, n) R."""
+    """(k, n) what R is made of: a row holds three of these at most."""
+    parts: wp.array2d[int]
+    """(m, 3) which,"""
+    shares: wp.array2d[real]
+    """(m, 3) and of how much."""
+    seen: wp.array[real]
+    """(k,) scratch: what R is made of, at some z."""
     free: wp.array[real]
     """(m,) the rows at z = 0."""
     lower: wp.array[real]
@@ -56,6 +64,8 @@ class UnitRows:
     """(m,) by how much a row may break its bounds."""
     most: real
     """Cost z^T z / 2 beyond which no point is looked for."""
+    settled: wp.array[int]
+    """(1,) not 0 as soon as nobody asks for a point."""
 
 
 @wp.struct
@@ -87,6 +97,8 @@ class Holding:
     beside: wp.array[real]
     between: wp.array[real]
     """(n,) scratch."""
+    joins: wp.array[real]
+    """(n,) the row that joins."""
     outside: wp.array[real]
     """(n,) what of the row that joins lies outside of those that hold."""
 
@@ -102,17 +114,22 @@ def bound_of(rows: UnitRows, holding: Holding, row: int):
 @wp.func
 def see(rows: UnitRows, holding: Holding):
     """All rows at the place."""
-    multiply(rows.units, rows.count, rows.unknowns, holding.place, holding.at)
+    multiply(rows.units, rows.made_of, rows.unknowns, holding.place, rows.seen)
     for row in range(lane_of_block(), rows.count, wp.block_dim()):
-        holding.at[row] = holding.at[row] + rows.free[row]
+        at = rows.free[row]
+        for t in range(3):
+            at += rows.shares[row, t] * rows.seen[rows.parts[row, t]]
+        holding.at[row] = at
     wait_for_block()
 
 
 @wp.func
-def take_hold(rows: UnitRows, holding: Holding, place: int, row: int):
-    """``row`` is the one at ``place`` of those that hold."""
-    for c in range(lane_of_block(), rows.unknowns, wp.block_dim()):
-        holding.held[place, c] = rows.units[row, c]
+def unit_at(rows: UnitRows, row: int, c: int):
+    """R there."""
+    value = real(0.0)
+    for t in range(3):
+        value += rows.shares[row, t] * rows.units[rows.parts[row, t], c]
+    return value
 
 
 @wp.func
@@ -122,7 +139,7 @@ def gather(rows: UnitRows, holding: Holding, count: int, added: real):
     for e in range(lane, count * rows.unknowns, wp.block_dim()):
         i = e / rows.unknowns
         c = e % rows.unknowns
-        value = rows.units[holding.active[i], c]
+        value = unit_at(rows, holding.active[i], c)
         holding.held[i, c] = value
         holding.held_across[c, i] = value
     for e in range(lane, count * count, wp.block_dim()):
@@ -222,20 +239,21 @@ def leave(rows: UnitRows, holding: Holding, count: int, place: int):
             holding.inverse[place, i] = value
     if lane == 0:
         holding.inverse[place, place] = holding.inverse[last, last]
-    take_hold(rows, holding, place, holding.active[place])
+    for c in range(lane, rows.unknowns, wp.block_dim()):
+        holding.held[place, c] = holding.held[last, c]
     wait_for_block()
 
 
 @wp.func
-def find_ways(rows: UnitRows, holding: Holding, count: int, row: int, towards: real):
-    """What of ``row``, in the direction that it is held ``towards``, lies outside of those that hold: the square of
-    that."""
-    multiply(holding.held, count, rows.unknowns, rows.units[row], holding.beside)
+def find_ways(rows: UnitRows, holding: Holding, count: int, towards: real):
+    """What of the row that joins, in the direction that it is held ``towards``, lies outside of those that hold: the
+    square of that."""
+    multiply(holding.held, count, rows.unknowns, holding.joins, holding.beside)
     multiply(holding.inverse, count, count, holding.beside, holding.ways)
     multiply_across(holding.held, count, rows.unknowns, holding.ways, holding.outside)
     square = real(0.0)
     for c in range(lane_of_block(), rows.unknowns, wp.block_dim()):
-        value = rows.units[row, c] - holding.outside[c]
+        value = holding.joins[c] - holding.outside[c]
         holding.outside[c] = towards * value
         square += value * value
     square = sum_of_block(square)
@@ -255,9 +273,12 @@ def join(rows: UnitRows, holding: Holding, active: int, row: int):
         sign = 1
         bound = rows.lower[row]
     towards = real(sign)
+    for c in range(lane, rows.unknowns, wp.block_dim()):
+        holding.joins[c] = unit_at(rows, row, c)
+    wait_for_block()
     pull = real(0.0)
     while True:
-        apart = find_ways(rows, holding, count, row, towards)
+        apart = find_ways(rows, holding, count, towards)
         soonest = real(-wp.inf)
         first = int(-1)
         for i in range(lane, count, wp.block_dim()):
@@ -288,12 +309,12 @@ def join(rows: UnitRows, holding: Holding, active: int, row: int):
         if whole < real(wp.inf):
             for c in range(lane, rows.unknowns, wp.block_dim()):
                 holding.place[c] = holding.place[c] + step * holding.outside[c]
-            wait_for_block()
-            see(rows, holding)
-        else:
-            wait_for_block()
+            if lane == 0:
+                holding.at[row] = holding.at[row] + towards * step * apart
+        wait_for_block()
         if whole <= part:
-            grow(rows, holding, count, row, apart + REDUNDANT)
+            see(rows, holding)
+            grow(rows, holding, count, apart + REDUNDANT)
             if lane == 0:
                 holding.active[count] = row
                 holding.pulls[count] = pull
@@ -306,8 +327,8 @@ def join(rows: UnitRows, holding: Holding, active: int, row: int):
 
 
 @wp.func
-def grow(rows: UnitRows, holding: Holding, count: int, row: int, apart: real):
-    """The inverse, with ``row`` beside the others, of which so much of a square lies ``apart``."""
+def grow(rows: UnitRows, holding: Holding, count: int, apart: real):
+    """The inverse, with the row that joins beside the others, of which so much of a square lies ``apart``."""
     lane = lane_of_block()
     by = real(1.0) / apart
     for e in range(lane, count * count, wp.block_dim()):
@@ -319,7 +340,8 @@ def grow(rows: UnitRows, holding: Holding, count: int, row: int, apart: real):
         holding.inverse[count, i] = -by * holding.ways[i]
     if lane == 0:
         holding.inverse[count, count] = by
-    take_hold(rows, holding, count, row)
+    for c in range(lane, rows.unknowns, wp.block_dim()):
+        holding.held[count, c] = holding.joins[c]
 
 
 @wp.func
@@ -348,6 +370,17 @@ def cost_of(rows: UnitRows, holding: Holding):
 
 
 @wp.func
+def is_settled(rows: UnitRows):
+    """Whether nobody asks for a point any more: somebody else's launch may say so meanwhile."""
+    settled = real(0.0)
+    if lane_of_block() == 0:
+        settled = real(wp.atomic_add(rows.settled, 0, 0))
+    settled = sum_of_block(settled)
+    wait_for_block()
+    return settled != real(0.0)
+
+
+@wp.func
 def descend(rows: UnitRows, holding: Holding, active: int):
     """From rows that all pull the right way: how many hold the optimum, -1 where there is no point, -2 where rounding
     leads astray. What is broken most joins first."""
@@ -360,8 +393,11 @@ def descend(rows: UnitRows, holding: Holding, active: int):
         count = join(rows, holding, count, row)
         if count < 0:
             return count
-        if number % _LOOKS == 0 and cost_of(rows, holding) > rows.most:
-            return -1
+        if number % _LOOKS == 0:
+            if cost_of(rows, holding) > rows.most:
+                return -1
+            if is_settled(rows):
+                return -2
     return -2
 
 
@@ -396,6 +432,8 @@ def find_optimum(rows: UnitRows, holding: Holding):
     count = int(0)
     wrong = int(1)
     while wrong > 0:
+        if is_settled(rows):
+            return ASTRAY
         count = hold(rows, holding)
         if count < 0:
             let_go_of_all(rows, holding)

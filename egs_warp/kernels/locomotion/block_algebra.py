@@ -169,18 +169,21 @@ def list_marked(marks: wp.array[int], count: int, room: int, found: wp.array[int
 #if defined(__CUDA_ARCH__)
     __shared__ double sizes[32];
     __shared__ int places[32];
-    for (int away = 16; away > 0; away >>= 1) {
-        const double theirs = __shfl_xor_sync(0xffffffffu, value, away);
-        const int other = __shfl_xor_sync(0xffffffffu, place, away);
-        if (theirs > value || (theirs == value && other < place)) { value = theirs; place = other; }
-    }
+    auto larger = [&]() {
+        #pragma unroll
+        for (int away = 16; away > 0; away >>= 1) {
+            const double theirs = __shfl_xor_sync(0xffffffffu, value, away);
+            const int other = __shfl_xor_sync(0xffffffffu, place, away);
+            if (theirs > value || (theirs == value && other < place)) { value = theirs; place = other; }
+        }
+    };
+    larger();
     WAIT;
     if (own == 0) { sizes[warp] = value; places[warp] = place; }
     WAIT;
-    value = sizes[0];
-    place = places[0];
-    for (int i = 1; i < warps; ++i)
-        if (sizes[i] > value || (sizes[i] == value && places[i] < place)) { value = sizes[i]; place = places[i]; }
+    value = sizes[own < warps ? own : 0];
+    place = places[own < warps ? own : 0];
+    larger();
 #endif
     return wp::vec_t<2, double>(value, double(place));
 """)
@@ -247,6 +250,27 @@ def multiply_at(
 @wp.func_native(
     by_block("""
     const int stride = matrix.strides[0] / 8;
+#if defined(__CUDA_ARCH__)
+    const int chunks = (columns + 31) / 32, groups = warps / chunks;
+    if (groups > 1) {
+        // Of each column several warps have some rows.
+        __shared__ double parts[1024];
+        const int c = warp % chunks * 32 + own, group = warp / chunks;
+        double sum = 0.0;
+        if (group < groups && c < columns)
+            #pragma unroll 8
+            for (int k = group; k < rows; k += groups) sum += matrix.data[k * stride + c] * given.data[k];
+        parts[lane] = sum;
+        WAIT;
+        for (int k = lane; k < columns; k += lanes) {
+            double value = parts[k];
+            for (int other = 1; other < groups; ++other) value += parts[other * chunks * 32 + k];
+            made.data[k] = value;
+        }
+        WAIT;
+        return;
+    }
+#endif
     for (int c = lane; c < columns; c += lanes) {
         double some[4] = {0.0, 0.0, 0.0, 0.0};
         const double* at = matrix.data + c;
@@ -269,22 +293,43 @@ def multiply_across(
 @wp.func_native(
     by_block("""
     const int stride = matrix.strides[0] / 8;
-    for (int i = warp; i < rows; i += warps) {
-        double* const row = matrix.data + i * stride;
-        double square = 0.0;
-        for (int k = own; k < columns; k += WIDE) square += row[k] * row[k];
+    for (int i = 4 * warp; i < rows; i += 4 * warps) {
+        double square[4];
+        #pragma unroll
+        for (int t = 0; t < 4; ++t) {
+            const int r = 3 * (i + t < rows ? i + t : rows - 1);
+            const double *row[3], *const share = shares.data + r;
+            for (int s = 0; s < 3; ++s) row[s] = matrix.data + parts.data[r + s] * stride;
+            square[t] = 0.0;
+            for (int k = own; k < columns; k += WIDE) {
+                const double value = share[0] * row[0][k] + share[1] * row[1][k] + share[2] * row[2][k];
+                square[t] += value * value;
+            }
+        }
 #if defined(__CUDA_ARCH__)
-        for (int away = 16; away > 0; away >>= 1) square += __shfl_xor_sync(0xffffffffu, square, away);
+        for (int away = 16; away > 0; away >>= 1)
+            for (int t = 0; t < 4; ++t) square[t] += __shfl_xor_sync(0xffffffffu, square[t], away);
 #endif
-        const double length = square > 0.0 ? wp::sqrt(square) : 1.0, by = 1.0 / length;
-        for (int k = own; k < columns; k += WIDE) row[k] *= by;
-        if (own == 0) lengths.data[i] = length;
+        for (int t = 0; t < 4 && i + t < rows; ++t)
+            if (own == 0) {
+                const double length = square[t] > 0.0 ? wp::sqrt(square[t]) : 1.0;
+                lengths.data[i + t] = length;
+                for (int s = 0; s < 3; ++s) shares.data[3 * (i + t) + s] /= length;
+            }
     }
     WAIT;
 """)
 )
-def normalise(matrix: wp.array2d[real], rows: int, columns: int, lengths: wp.array[real]) -> None:
-    """Rows of a ``matrix`` (rows, columns) over their ``lengths`` (rows,), which are 1 for those of zeros."""
+def normalise(
+    matrix: wp.array2d[real],
+    columns: int,
+    parts: wp.array2d[int],
+    shares: wp.array2d[real],
+    rows: int,
+    lengths: wp.array[real],
+) -> None:
+    """Rows of which three of a ``matrix`` (k, columns), ``parts`` (rows, 3), have ``shares`` (rows, 3): these over the
+    rows' ``lengths`` (rows,), which are 1 for those of zeros."""
     ...
 
 

@@ -11,10 +11,50 @@ from egs_warp.precision import real
 wp.set_module_options({"enable_backward": False})
 
 _TAKE_OFF = """
-    // to[rows][columns] -= left[rows][some] top[some][columns], a tile of four by four at a time; of the rows below
-    // this one only what lies right of the diagonal.
+    // to[rows][columns] -= left[rows][some] top[some][columns], of at most eight parts, a tile of four by four at a
+    // time; of a half only what lies right of the diagonal.
     auto take_off = [&](double* to, int stride, int rows, int columns, const double* left, int by_row, int by_part,
                         const double* top, int top_stride, int some, bool half) {
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+        // By a warp 8 x 16 at a time: of eight parts no other product is as quick.
+        const int across = (columns + 15) / 16, down = (rows + 7) / 8, quad = own >> 2, place = own & 3;
+        for (int tile = warp; tile < across * down; tile += warps) {
+            const int r = tile / across * 8 + quad, begin = tile % across * 16;
+            if (half && begin + 15 < r - quad) continue;
+            const double* const from = left + (r < rows ? r : rows - 1) * by_row;
+            double one[2], other[2][2], made[2][2];
+            #pragma unroll
+            for (int s = 0; s < 2; ++s) {
+                const int p = place + 4 * s;
+                one[s] = p < some ? -from[p * by_part] : 0.0;
+                #pragma unroll
+                for (int k = 0; k < 2; ++k) {
+                    const int c = begin + 8 * k + quad;
+                    other[s][k] = p < some ? top[p * top_stride + (c < columns ? c : columns - 1)] : 0.0;
+                }
+            }
+            #pragma unroll
+            for (int k = 0; k < 2; ++k)
+                #pragma unroll
+                for (int t = 0; t < 2; ++t) {
+                    const int c = begin + 8 * k + 2 * place + t;
+                    made[k][t] = r < rows && c < columns ? to[r * stride + c] : 0.0;
+                }
+            #pragma unroll
+            for (int s = 0; s < 2; ++s)
+                #pragma unroll
+                for (int k = 0; k < 2; ++k)
+                    asm volatile("mma.sync.aligned.m8n8k4.row.col.f64.f64.f64.f64 {%0,%1},{%2},{%3},{%0,%1};"
+                                 : "+d"(made[k][0]), "+d"(made[k][1]) : "d"(one[s]), "d"(other[s][k]));
+            #pragma unroll
+            for (int k = 0; k < 2; ++k)
+                #pragma unroll
+                for (int t = 0; t < 2; ++t) {
+                    const int c = begin + 8 * k + 2 * place + t;
+                    if (r < rows && c < columns) to[r * stride + c] = made[k][t];
+                }
+        }
+#else
         const int across = (columns + 3) / 4, down = (rows + 3) / 4;
         for (int tile = lane; tile < across * down; tile += lanes) {
             const int first = tile / across * 4, begin = tile % across;
@@ -46,6 +86,7 @@ _TAKE_OFF = """
                 for (int s = 0; s < 4; ++s)
                     if (first + t < rows && begin + s * across < columns) to[r[t] * stride + c[s]] -= sum[t][s];
         }
+#endif
     };
 """
 

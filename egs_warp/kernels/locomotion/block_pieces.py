@@ -86,8 +86,6 @@ class Room:
     """(m, m)."""
     root: wp.array2d[real]
     """(m, m) of its inverse."""
-    turned: wp.array2d[real]
-    """(T + v, m) answers in coordinates whose squares are costs."""
     slope: wp.array[real]
     """(m,)."""
     minimum: wp.array[real]
@@ -364,22 +362,22 @@ def write_rows(program: Program, room: Room, rows: UnitRows, begun: wp.array[rea
     lane = lane_of_block()
     m = program.m
     for e in range(lane, answers * m, wp.block_dim()):
-        room.turned[e / m, e % m] = real(0.0)
+        rows.units[e / m, e % m] = real(0.0)
+    for e in range(lane, m * m, wp.block_dim()):
+        rows.units[answers + e / m, e % m] = room.root[e / m, e % m]
+    for row in range(lane, m + further, wp.block_dim()):
+        for t in range(3):
+            if row < m:
+                rows.parts[row, t] = answers + row
+                rows.shares[row, t] = wp.where(t == 0, real(1.0), real(0.0))
+            else:
+                rows.parts[row, t] = room.parts[row - m, t]
+                rows.shares[row, t] = room.shares[row - m, t]
     wait_for_block()
-    add_product(room.turned, room.answers, room.root, answers, m, m, 0)
+    add_product(rows.units, room.answers, room.root, answers, m, m, 0)
     multiply(room.answers, answers, m, room.minimum, room.at_minimum)
     multiply(room.answers, answers, m, room.start, room.at_start)
-    for e in range(lane, m * m, wp.block_dim()):
-        rows.units[e / m, e % m] = room.root[e / m, e % m]
-    for e in range(lane, further * m, wp.block_dim()):
-        row = e / m
-        c = e % m
-        value = real(0.0)
-        for t in range(3):
-            value += room.shares[row, t] * room.turned[room.parts[row, t], c]
-        rows.units[m + row, c] = value
-    wait_for_block()
-    normalise(rows.units, m + further, m, room.lengths)
+    normalise(rows.units, m, rows.parts, rows.shares, m + further, room.lengths)
     for row in range(lane, m + further, wp.block_dim()):
         length = room.lengths[row]
         free = real(0.0)

@@ -243,6 +243,7 @@ def solve_piece(program: Program, room: Room, rows: UnitRows, holding: Holding, 
     write_rows(program, room, rows, splitting.begun, answers, further)
     rows.unknowns = m
     rows.count = m + further
+    rows.made_of = m + answers
     rows.most = HOPELESS * worth
     holds = int(0)
     solved.ended = FOUND
@@ -309,6 +310,7 @@ def program_in(told: wp.array[real]):
 def search_kernel(
     # In:
     told: wp.array[real],
+    costly: real,
     # Scratch:
     room: Room,
     rows: UnitRows,
@@ -316,11 +318,13 @@ def search_kernel(
     splitting: Splitting,
     # Out:
     answer: wp.array[real],
+    settled_out: wp.array[int],
 ):
     """``search_pieces`` of what is ``told``: m, n, friction, the constant, the most programs, numbers that mean nothing
     up to ``HEADER``; P, q, rows, offset, bounds of the activations; the activations of the start (m,), how each contact
     moves there (n,), and its slip (n, 2). ``answer``: how it ended, programs, those without a solution among them, the
-    objective, whether there is a point; from ``HEADER`` on the point (m + 3n,)."""
+    objective, whether there is a point; from ``HEADER`` on the point (m + 3n,). ``settled_out`` (1,) is 1 as soon as
+    one is found that is not ``costly``."""
     lane = lane_of_block()
     program = program_in(told)
     m = program.m
@@ -372,6 +376,8 @@ def search_kernel(
             enough = there == 1 and best - solved.objective < _GAIN * wp.abs(best)
             there = 1
             best = solved.objective
+            if lane == 0 and best < costly:
+                wp.atomic_max(settled_out, 0, 1)
             for k in range(lane, program.size, wp.block_dim()):
                 answer[_HEADER + k] = room.trial[k]
                 if k < m:

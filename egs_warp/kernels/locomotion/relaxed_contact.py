@@ -7,7 +7,7 @@ import warp as wp
 
 from egs_warp.kernels.block import sum_of_block, wait_for_block
 from egs_warp.kernels.locomotion.active_set import ASTRAY, FOUND
-from egs_warp.kernels.locomotion.block_active_set import Holding, UnitRows, find_optimum
+from egs_warp.kernels.locomotion.block_active_set import Holding, UnitRows, find_optimum, is_settled
 from egs_warp.kernels.locomotion.block_algebra import (
     add_product,
     apply_root,
@@ -133,19 +133,20 @@ def write_rows(program: Program, relaxed: Relaxed, rows: UnitRows, begun: wp.arr
         rows.units[e / size, e % size] = real(0.0)
     wait_for_block()
     add_product(rows.units, relaxed.leaving, relaxed.root, n, size, size, 0)
-    for e in range(lane, (rows.count - n) * size, wp.block_dim()):
-        k = e / size
-        c = e % size
-        value = real(0.0)
-        if k < m:
-            value = relaxed.root[k, c]
-        else:
-            share = share_of(program.friction, (k - m) % _OF_FORCES)
-            for t in range(3):
-                value += share[t] * relaxed.root[m + 3 * ((k - m) / _OF_FORCES) + t, c]
-        rows.units[n + k, c] = value
+    for e in range(lane, size * size, wp.block_dim()):
+        rows.units[n + e / size, e % size] = relaxed.root[e / size, e % size]
+    for row in range(lane, rows.count, wp.block_dim()):
+        part = row
+        share = wp.vec3d(real(1.0), real(0.0), real(0.0))
+        k = row - n - m
+        if k >= 0:
+            part = n + m + 3 * (k / _OF_FORCES)
+            share = share_of(program.friction, k % _OF_FORCES)
+        for t in range(3):
+            rows.parts[row, t] = wp.where(k >= 0, part + t, part)
+            rows.shares[row, t] = share[t]
     wait_for_block()
-    normalise(rows.units, rows.count, size, relaxed.lengths)
+    normalise(rows.units, size, rows.parts, rows.shares, rows.count, relaxed.lengths)
     see_speeds(program, relaxed, relaxed.minimum)
     for row in range(lane, rows.count, wp.block_dim()):
         least = real(0.0)
@@ -215,9 +216,10 @@ def relax_kernel(
     added = regular(program)
     worth = write_root(program, relaxed, added)
     ended = ASTRAY
-    if worth > real(0.0):
+    if worth > real(0.0) and not is_settled(rows):
         rows.unknowns = size
         rows.count = program.m + (1 + _OF_FORCES) * program.n
+        rows.made_of = program.n + size
         rows.most = HOPELESS * worth
         write_rows(program, relaxed, rows, splitting.begun)
         ended = FOUND
@@ -250,12 +252,15 @@ def start_kernel(
     # In:
     activations: wp.array[real],
     forces: wp.array[Vec3],
+    settled: wp.array[int],
     # Out:
     told_out: wp.array[real],
 ):
     """A search from these ``activations`` (m,), to which contact answers ``forces`` (K,) newtons, in place of the one
-    that was told; ``weight`` is newtons. m + K threads."""
+    that was told, or none if that is ``settled`` (1,); ``weight`` is newtons. m + K threads."""
     k = wp.tid()
+    if k == 0 and settled[0] != 0:
+        told_out[4] = real(0.0)
     program = program_in(told_out)
     begin = program.upper + program.m
     kinds = begin + program.m
