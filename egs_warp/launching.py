@@ -272,6 +272,13 @@ def beside(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
         raise
 
 
+@cache
+def warp_stream(stream: Any) -> wp.Stream:
+    """Warp's name of a ``stream`` of torch, which has few and keeps them, kept, too: with a name goes what Warp holds
+    for that stream, whoever else has a name of it."""
+    return wp.stream_from_torch(stream)
+
+
 def device_of(array: wp.array) -> wp.Device:
     """Where ``array`` is. Warp's own type leaves room for none, which only annotations have."""
     device: Any = array.device

@@ -13,6 +13,8 @@ import numpy as np
 import torch
 import warp as wp
 
+from egs_warp.launching import warp_stream
+
 _MOST = 64
 """Works of one kind that are kept: steps of other lengths and other numbers of contacts are others."""
 
@@ -33,12 +35,11 @@ class GraphStream:
     def __init__(self, device: torch.device) -> None:
         self.device = device
         self._stream: Any = None
+        self._of_warp: wp.Stream | None = None
         if device.type == "cuda":
-            self._stream = wp.stream_to_torch(wp.get_device(str(device)).stream)
+            self._of_warp = wp.get_device(str(device)).stream
+            self._stream = wp.stream_to_torch(self._of_warp)
         self._others: list[Any] = []
-        self._of_warp: dict[int, wp.Stream] = {}
-        if self._stream is not None:
-            self._of_warp[self._stream.cuda_stream] = wp.get_device(str(device)).stream
         self._pool: Any = None
         self._first: Any = None
 
@@ -61,10 +62,7 @@ class GraphStream:
         if self._stream is None:
             return None
         stream = torch.cuda.current_stream(self.device)
-        # Kept: with a name goes what Warp holds for that stream, whoever else has a name of it.
-        if stream.cuda_stream not in self._of_warp:
-            self._of_warp[stream.cuda_stream] = wp.stream_from_torch(stream)
-        return self._of_warp[stream.cuda_stream]
+        return self._of_warp if stream.cuda_stream == self._stream.cuda_stream else warp_stream(stream)
 
     def wait(self) -> None:
         """Until all is done that was begun."""
@@ -130,8 +128,9 @@ class GraphStream:
         return graph
 
     def pinned(self, count: int) -> torch.Tensor:
-        """(count,) of zeros on the host, which a GPU reads and writes by itself."""
-        return torch.zeros(count, dtype=torch.float64, pin_memory=self._stream is not None)
+        """(count,) of zeros on the host, which a GPU reads and writes by itself. Warp's: torch would note, when its own
+        go, where Warp's stream is then, which ends the program if that went before, as it may at the end."""
+        return wp.to_torch(wp.zeros(count, dtype=wp.float64, device="cpu", pinned=self._stream is not None))
 
 
 class Upload:

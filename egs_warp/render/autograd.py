@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ import warp as wp
 from egs_warp.errors import UserError
 from egs_warp.geometry.camera import Camera
 from egs_warp.geometry.gaussians import GaussianCloud
-from egs_warp.launching import available_threads
+from egs_warp.launching import available_threads, warp_stream
 from egs_warp.render.backward import backward
 from egs_warp.render.compositing import BegunImage, RenderedImage
 from egs_warp.render.projection import ProjectedGaussians, project, view_from_camera
@@ -127,13 +127,7 @@ def torch_stream(device: torch.device) -> AbstractContextManager[Any]:
     """Warp works on the stream that torch works on, where there are streams."""
     if device.type != "cuda":
         return nullcontext()
-    return wp.ScopedStream(_warp_stream(torch.cuda.current_stream(device)), sync_enter=False)
-
-
-@cache
-def _warp_stream(stream: torch.cuda.Stream) -> wp.Stream:
-    """Made once: there are few streams, and each is used at every step."""
-    return wp.stream_from_torch(stream)
+    return wp.ScopedStream(warp_stream(torch.cuda.current_stream(device)), sync_enter=False)
 
 
 def _cloud_of(tensors: tuple[torch.Tensor, ...]) -> GaussianCloud:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
@@ -112,3 +114,27 @@ def test_works_at_once_are_over_before_what_comes_next(device: str) -> None:
             again()
             stream.wait()
         assert float(here[0]) == 10.0 * count * value
+
+
+_ENDS = """
+import numpy as np, torch
+from egs_warp.fem.graphs import GraphStream, Upload
+
+stream = GraphStream(torch.device("{device}"))
+told = Upload(stream, 8)
+with stream:
+    told.take(np.arange(8.0))
+kept = told.here.numpy()
+again = stream.recorded(told.send)
+for _ in range(3):
+    again()
+stream.wait()
+assert float(told.there.sum()) == 28.0
+del told, stream, again
+"""
+
+
+def test_a_program_ends_with_what_it_still_holds(device: str) -> None:
+    """A view of page-locked memory that goes when Warp and torch do."""
+    done = subprocess.run([sys.executable, "-c", _ENDS.format(device=device)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
