@@ -97,7 +97,9 @@ def test_a_launch_made_again_takes_its_new_arguments(device: str) -> None:
         outputs=[wp.zeros(1, dtype=wp.vec3, device=target)],
         device=target,
     )
-    with ThreadPoolExecutor(2) as pool:
+    # Warp turns to another stream while it copies: two threads at once may leave it there.
+    stream = target.stream if target.is_cuda else None
+    with wp.ScopedStream(stream, sync_enter=False), ThreadPoolExecutor(2) as pool:
         for done in [pool.submit(run, seed) for seed in (1, 2)]:
             done.result()
 

@@ -124,11 +124,11 @@ stream = GraphStream(torch.device("{device}"))
 told = Upload(stream, 8)
 with stream:
     told.take(np.arange(8.0))
+    again = stream.recorded(told.send)
+    for _ in range(3):
+        again()
+    stream.wait()
 kept = told.here.numpy()
-again = stream.recorded(told.send)
-for _ in range(3):
-    again()
-stream.wait()
 assert float(told.there.sum()) == 28.0
 del told, stream, again
 """
