@@ -283,7 +283,7 @@ BESIDE_THE_PAPER: list[Mutation] = [
         ),
         (
             *("twist: the spin of the standing body, not of the crouched one", "motions/twist.py"),
-            *("return inertia @ spin_that_turns(", "return self.body.inertia(state.positions) @ spin_that_turns("),
+            *("return inertia @ spin_that_turns(", "return seen.inertia @ spin_that_turns("),
             "motions/test_twist.py::test_a_twist_asks_friction_for_the_spin_that_is_left",
         ),
         (
