@@ -16,19 +16,18 @@ from egs_warp.contact.coupled_step import (
     ADDED,
     ANSWERED,
     CREEPS,
-    ITERATIONS,
     JOINING,
-    MEMORY,
     PUSH_OUT,
     ROUNDS,
     SHORTEST,
     SINKS,
-    SLOW,
     UNANSWERED,
 )
+from egs_warp.contact.course import ITERATIONS
 from egs_warp.contact.response import SINGULAR
 from egs_warp.fem.batch_problem import BatchProblem, BatchTurning, inverse_of
 from egs_warp.fem.worlds import Worlds, indices
+from egs_warp.kernels.contact.course import MEMORY, SLOW
 
 
 class Stages(Protocol):

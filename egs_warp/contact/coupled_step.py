@@ -6,19 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from egs_warp.contact.course import ITERATIONS, Course
 from egs_warp.contact.detection import ContactDetector, ContactSet, push_out_speeds
 from egs_warp.contact.points import ContactPoints
 from egs_warp.contact.response import ContactResponse, Iterate, Seen
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.muscles.tension import MuscleTension
 
-ITERATIONS = 60
-SLOW = 0.7
-"""A tangent is made anew where the residual falls by less than this factor, but in the first step of a round, in which
-forces of contacts that are new come about. It takes as long as many steps by an old one."""
 SHORTEST = 1e-3
-MEMORY = 3
-"""Residuals of which the largest must be undercut."""
 ROUNDS = 6
 PUSH_OUT = 0.2
 """Of the depth beyond the tolerance, a step."""
@@ -76,6 +71,11 @@ class CoupledSolver:
         what is deeper than the tolerance comes out gently."""
         return push_out_speeds(contacts.gaps, dt, self.push_out_cap, PUSH_OUT, self.penetration_tolerance)
 
+    def course(self, problem: StepProblem, *, last: bool = False) -> Course:
+        """Of a round of the step, which in the ``last`` no points join."""
+        answered = ANSWERED * problem.unit / problem.body.mass
+        return Course(self.tolerance, 0.0 if last else JOINING, answered)
+
     def solve(
         self,
         response: ContactResponse,
@@ -129,44 +129,35 @@ class CoupledSolver:
         problem, contacts = response.tangent.problem, response.contacts
         shift = self.shift(contacts, problem.dt)
         friction = self.detector.geometry.friction
-        answered = ANSWERED * problem.unit / problem.body.mass
-        none = contacts.points[:0]
+        course, none = self.course(problem, last=last), contacts.points[:0]
         tangents, unanswered, fresh = 0, 0, False
-        now = trial = response.at(tension, velocities, forces)
-        before: Iterate | None = None
-        recent: list[float] = []
-        for iteration in range(1, ITERATIONS + 1):
-            # If it falls as in the step before.
-            coming = np.inf if before is None else now.size * (now.size / before.size)
-            ends = coming <= self.tolerance or (coming <= JOINING < now.size and not last)
-            wanted, missed, trial = now.onward(shift, friction, further=not ends)
-            unanswered += missed > answered
-            length, better = 1.0, False
-            while length > SHORTEST:
-                if length < 1.0:
-                    trial = now.toward(wanted, length)
-                # Contacts that open, close or begin to slide change the forces at once: the residual need not fall in
-                # every step. It is no number where an element is inverted.
-                least = max((1.0 - 1e-4 * length) * max(recent, default=np.inf), self.tolerance)
-                better = np.isfinite(trial.size) and (iteration == 1 or trial.size < least)
-                if better:
-                    break
+        now = response.at(tension, velocities, forces)
+        while course.steps < ITERATIONS:
+            stretch = now.onward(shift, friction, course)
+            now, trial, missed = stretch.base, stretch.end, stretch.missed
+            course, fresh = course.after(*stretch.sizes), fresh and not stretch.sizes
+            obeys = missed <= course.answered
+            unanswered += not obeys
+            length = 1.0
+            while not (better := course.is_better(trial.size, length)) and length > 2.0 * SHORTEST:
                 length *= 0.5
+                trial = now.toward(stretch.forces, length)
             if better:
                 before, now = now, trial
-                recent = [*recent[1 - MEMORY :], now.size]
                 # After a whole step the contact velocities are those that were solved for, by linearity.
-                obeys = length == 1.0 and missed <= answered
-                ended = obeys and now.size <= self.tolerance
-                if obeys and not last and (ended or before.size > JOINING >= now.size):
+                obeys = obeys and length == 1.0
+                ended = obeys and now.size <= course.tolerance
+                slow = course.is_slow(now.size, before.size) or not obeys
+                joins = not last and obeys and (ended or course.may_join(now.size, before.size))
+                course = course.after(now.size)
+                if joins:
                     added = self._sinking(problem, contacts, now)
                     if len(added) > 0:
-                        return _result(now, ended, iteration, tangents), added
+                        return _result(now, ended, course.steps, tangents), added
                 if ended:
-                    return _result(now, True, iteration, tangents), none
-                slow = (iteration > 1 and now.size > SLOW * before.size) or length < 1.0 or missed > answered
+                    return _result(now, True, course.steps, tangents), none
             else:
-                slow = True
+                course, slow = course.in_vain(), True
                 if fresh:
                     break
             if unanswered > UNANSWERED:
@@ -175,7 +166,7 @@ class CoupledSolver:
             if slow:
                 now = now.anew()
                 tangents, fresh = tangents + 1, True
-        return _result(now, False, iteration, tangents), none
+        return _result(now, False, course.steps, tangents), none
 
 
 def _result(end: Iterate, converged: bool, iterations: int, tangents: int) -> CoupledResult:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,23 @@ _DIRECTIONS = 64
 """Of muscles' stiffness so many are added at a time."""
 
 
+@dataclass(frozen=True)
+class Ended:
+    """Where a solve has ended."""
+
+    velocities: np.ndarray
+    """(N, 3) m/s, after a step of ``dt`` seconds."""
+    dt: float
+    points: np.ndarray
+    """(n,) of its contacts."""
+    places: int
+
+    def places_for(self, state: BodyState, dt: float, points: np.ndarray) -> int | None:
+        """The places, if a step of ``dt`` seconds from ``state`` goes on from there."""
+        same = self.velocities is state.velocities and self.points is points and self.dt == dt
+        return self.places if same else None
+
+
 class BodyRoom:
     """Of one body with dense ``factors``, where its elements are: a step's start, and what keeps its momentum."""
 
@@ -40,7 +58,7 @@ class BodyRoom:
         self.masses = self.tensor(body.node_mass)
         self._start = Upload(self.stream, 2 * size)
         self.positions, self.velocities = self._start.there.split(size)
-        self.arms, self.start, self.ballistic = self.zeros(3, size)
+        self.arms, self.start, self.ballistic, self._next_ballistic = self.zeros(4, size)
         self.turns, self.rates = self.zeros(size, 3), self.zeros(1, 3, 3)
         """See ``StepProblem``; ``ballistic`` is where the nodes would end without forces, metres."""
         self._ends = vectors(self.positions), vectors(self.ballistic)
@@ -56,6 +74,10 @@ class BodyRoom:
         """What lies there: the state that a step of so many seconds begins from."""
         self._looked_for: np.ndarray | None = None
         """(m,) points of the step before with which contacts are being chosen."""
+        self.ended: Ended | None = None
+        """Where the solve has ended that came last: contacts of a step from there are chosen already."""
+        self._places: int | None = None
+        """As many places had the contacts there, if these are asked for."""
         self.foreseen: Any = None
         """The start of which a plan has begun there; None once anything else was done."""
         self.looked_at: StepProblem | None = None
@@ -80,6 +102,7 @@ class BodyRoom:
         self._taken, self.looked_at, self.foreseen = (state, dt), None, None
         self._start.write(state.positions, state.velocities)
         self._works.run(dt, lambda: self._enqueue_start(dt))
+        self._start.sent()
 
     def _enqueue_start(self, dt: float) -> None:
         self._start.send()
@@ -94,16 +117,19 @@ class BodyRoom:
             block_dim=lanes,
         )
         self.elements.enqueue_start(vectors(self.positions), self.gradients)
-        torch.add(self.velocities, self._gravity, alpha=dt, out=self.ballistic)
-        self.ballistic.mul_(dt).add_(self.positions)
+        self._enqueue_ballistic(self.positions, self.velocities, dt, self.ballistic)
 
     def look_ahead(self, state: BodyState, dt: float, before: np.ndarray) -> None:
         """Begin ``choose`` for a step of ``dt`` seconds from ``state``; nobody waits."""
         with self.stream:
             self._leave()
             self._take(state, dt)
-            self.sight.look(*self._ends, before)
-        self._looked_for = before
+            self._places = self.ended.places_for(state, dt, before) if self.ended else None
+            if self._places is None:
+                self.sight.look(*self._ends, before)
+            else:
+                self.sight.go_on()
+        self._looked_for, self.ended = before, None
 
     def choose(self, problem: StepProblem, before: np.ndarray, loaded: np.ndarray) -> ContactSet:
         """Contacts of a step that begins there, see ``DeviceSight``."""
@@ -112,13 +138,24 @@ class BodyRoom:
         if self._looked_for is None or not np.array_equal(self._looked_for, before):
             self.look_ahead(problem.state, problem.dt, before)
         self.looked_at, self._looked_for = problem, None
-        return self.sight.choose(before, loaded, problem.state.positions)
+        return self.sight.choose(before, loaded, problem.state.positions, places=self._places)
 
     def _leave(self) -> None:
         """What was begun and nobody has asked for: what was told for it may still be on its way."""
         if self._looked_for is not None:
             self._looked_for = None
             self.stream.wait()
+
+    def enqueue_next(self, ends: torch.Tensor, velocities: torch.Tensor, dt: float, points: torch.Tensor) -> None:
+        """Begin ``choose`` for a step from ``ends`` (3N,) at ``velocities`` (3N,), after ``points`` (K,) int32."""
+        self._enqueue_ballistic(ends, velocities, dt, self._next_ballistic)
+        self.sight.enqueue_next(vectors(self._next_ballistic), points)
+
+    def _enqueue_ballistic(
+        self, positions: torch.Tensor, velocities: torch.Tensor, dt: float, ballistic: torch.Tensor
+    ) -> None:
+        torch.add(velocities, self._gravity, alpha=dt, out=ballistic)
+        ballistic.mul_(dt).add_(positions)
 
     def enqueue_factors(self, ends: wp.array, dt: float) -> None:
         """Of the step's matrix at the positions ``ends``, without muscles."""

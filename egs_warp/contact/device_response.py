@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from egs_warp.contact.coulomb import ASTRAY
+from egs_warp.contact.course import Course
 from egs_warp.contact.detection import ContactSet
-from egs_warp.contact.device_body import BodyRoom
+from egs_warp.contact.device_body import BodyRoom, Ended
 from egs_warp.contact.device_room import KEPT, TRIED, ContactRoom, Tried
 from egs_warp.contact.device_sight import DeviceSight
-from egs_warp.contact.response import ContactResponse, Iterate, Seen
+from egs_warp.contact.response import ContactResponse, Seen, Stretch
 from egs_warp.fem.body import SoftBody
 from egs_warp.fem.dense_factors import DenseFactors
 from egs_warp.fem.step_problem import Tangent
+from egs_warp.kernels.contact.course import FIRST
 from egs_warp.launching import by_steps
 from egs_warp.muscles.muscle_set import MuscleSet
 from egs_warp.muscles.tension import MuscleTension
@@ -38,10 +41,11 @@ class DeviceResponder(BodyRoom):
         room, self.foreseen = self.room_for(contacts), None
         with self.stream:
             self.take(tangent.problem)
-            delassus = room.respond(tangent.problem, contacts)
+            room.respond(tangent.problem, contacts)
             if not tangent.settle():
-                delassus = room.respond(tangent.problem, contacts)
-        self.at_hand = DeviceResponse.there(tangent, contacts, self, room, delassus)
+                room.respond(tangent.problem, contacts)
+        room.at_base = room.at_trial = room.coming = None
+        self.at_hand = DeviceResponse.there(tangent, contacts, self, room)
         return self.at_hand
 
     def ahead(
@@ -79,12 +83,17 @@ class DeviceResponse(ContactResponse):
     room: ContactRoom
 
     @classmethod
-    def there(
-        cls, tangent: Tangent, contacts: ContactSet, owner: DeviceResponder, room: ContactRoom, delassus: np.ndarray
-    ) -> DeviceResponse:
-        """What the ``room`` has, whose ``delassus`` operator (3K, 3K) has come."""
-        width = 3 * contacts.count
-        return cls(tangent, contacts, room.columns[:, :width], delassus[:width, :width], owner, room)
+    def there(cls, tangent: Tangent, contacts: ContactSet, owner: DeviceResponder, room: ContactRoom) -> DeviceResponse:
+        """What the ``room`` has, or will have."""
+        return cls(tangent, contacts, room.columns[:, : 3 * contacts.count], owner, room)
+
+    @cached_property
+    def delassus(self) -> np.ndarray:
+        """See ``ContactResponse``; of the one that is at hand."""
+        assert self.owner.at_hand is self
+        self.owner.stream.wait()
+        width = 3 * self.contacts.count
+        return self.room.delassus_here()[:width, :width]
 
     def wider(self, contacts: ContactSet) -> DeviceResponse:
         """See ``ContactResponse``."""
@@ -101,8 +110,8 @@ class DeviceResponse(ContactResponse):
         """``at``, where the room's last trial is then."""
         assert self.owner.at_hand is self
         room = self.room
-        found = room.begin(self.tangent.problem, tension, velocities, forces)
-        room.at_base, room.at_trial, room.coming = None, self.made(tension, forces, found), None
+        room.begin(self.tangent.problem, tension, velocities, forces)
+        room.at_base, room.at_trial, room.coming = None, DeviceIterate(self, tension, velocities, forces), None
         return room.at_trial
 
     def made(self, tension: MuscleTension | None, forces: np.ndarray, found: Tried) -> DeviceIterate:
@@ -121,23 +130,60 @@ class DeviceResponse(ContactResponse):
     ) -> DeviceIterate:
         """At those ``velocities`` (3N,), under ``forces`` (n, 3), where the equation misses ``size`` N s and contacts
         go on at ``speeds`` (3K,)."""
-        return DeviceIterate(
-            *(self, tension, velocities.reshape(-1, 3).copy(), forces),
-            *(size / self.tangent.problem.unit, speeds[: 3 * self.contacts.count].copy(), seen),
-        )
+        place = DeviceIterate(self, tension, velocities.reshape(-1, 3).copy(), forces)
+        place.know(size / self.tangent.problem.unit, speeds, seen)
+        return place
 
 
-@dataclass(frozen=True, eq=False)
 class DeviceIterate:
-    """``Iterate`` that lies on the device."""
+    """``Iterate`` that lies on the device. What it is asked for may be on its way, and its tangent only begun."""
 
-    response: DeviceResponse
-    tension: MuscleTension | None
-    velocities: np.ndarray
-    forces: np.ndarray
-    size: float
-    speeds: np.ndarray
-    seen: Seen | None
+    def __init__(
+        self, response: DeviceResponse, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray
+    ) -> None:
+        self._response, self.tension, self.velocities, self.forces = response, tension, velocities, forces
+        self._size: float | None = None
+        self._speeds: np.ndarray | None = None
+        self._seen: Seen | None = None
+        self._begun = False
+
+    def know(self, size: float, speeds: np.ndarray, seen: Seen | None) -> None:
+        """What has come: of the residual, ``speeds`` (3K,) of the contacts, and what is ``seen``."""
+        self._size, self._seen = size, seen
+        self._speeds = speeds[: 3 * self._response.contacts.count].copy()
+
+    @property
+    def response(self) -> DeviceResponse:
+        """See ``Iterate``."""
+        return self._response
+
+    @property
+    def size(self) -> float:
+        """See ``Iterate``."""
+        if self._size is None:
+            self._wait()
+        assert self._size is not None
+        return self._size
+
+    @property
+    def speeds(self) -> np.ndarray:
+        """See ``Iterate``."""
+        if self._speeds is None:
+            self._wait()
+        assert self._speeds is not None
+        return self._speeds
+
+    @property
+    def seen(self) -> Seen | None:
+        """See ``Iterate``."""
+        if self._size is None:
+            self._wait()
+        return self._seen
+
+    @property
+    def feasible(self) -> bool:
+        """See ``Iterate``."""
+        return bool(np.isfinite(self.size))
 
     def is_at(
         self, response: DeviceResponse, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray
@@ -149,13 +195,9 @@ class DeviceIterate:
             return tension is self.tension
         return np.array_equal(tension.tensions, self.tension.tensions)
 
-    @property
-    def feasible(self) -> bool:
-        """See ``Iterate``."""
-        return bool(np.isfinite(self.size))
-
     def toward(self, forces: np.ndarray, length: float = 1.0) -> DeviceIterate:
         """See ``Iterate``."""
+        self._settle()
         room, problem = self.response.room, self.response.tangent.problem
         assert self.response.owner.at_hand is self.response
         found = room.go(problem, length=length, push=True, wanted=forces, base=self._base())
@@ -163,51 +205,89 @@ class DeviceIterate:
         room.at_base, room.at_trial, room.coming = self, self.response.made(self.tension, told, found), None
         return room.at_trial
 
-    def onward(self, shift: np.ndarray, friction: float, *, further: bool = False) -> tuple[np.ndarray, float, Iterate]:
+    def onward(self, shift: np.ndarray, friction: float, course: Course | None = None) -> Stretch:
         """See ``Iterate``."""
-        room, count, problem = self.response.room, self.response.contacts.count, self.response.tangent.problem
-        number = room.slot
-        assert self.response.owner.at_hand is self.response
-        if room.coming is self:
-            assert room.coulomb.knows(shift, friction)
-        else:
+        response, room = self.response, self.response.room
+        owner, problem, count = response.owner, response.tangent.problem, response.contacts.count
+        course = course or Course(0.0, 0.0, np.inf, most=1)
+        assert owner.at_hand is response
+        if room.coming is not self or room.course != course or not room.coulomb.knows(shift, friction):
             base = self._base()
             if base == KEPT and room.at_trial is not None:
                 # The speeds are the trial's.
                 room.again(base=base)
-            number = room.begin_onward(problem, shift, friction, base=base)
-        if further:
-            # The device goes on while the host looks at what has come.
-            room.begin_onward(problem, shift, friction, base=TRIED)
-        found = room.arrived(number)
-        missed, forces = float(found.missed[0]), found.forces[: 3 * count].reshape(-1, 3).copy()
-        trial = self.response.made(self.tension, forces, found)
-        if further:
-            room.at_base, room.at_trial, room.coming = trial, None, trial
+            room.begin_onward(problem, shift, friction, course, base=base, size=self._size)
+        found = room.arrived()
+        if self._begun and not owner.factors.ready:
+            room.at_base = room.at_trial = room.coming = None
+            self._settle()
+            return self.onward(shift, friction, course)
+        self._begun = False
+        if found.taken == 0:
+            # A plan that was not as usual: the device has stayed there.
+            room.at_base, room.at_trial, room.coming = None, self, None
+            return self.onward(shift, friction, course)
+        sizes, first = found.sizes, self
+        if len(sizes) == 1:
+            if self._speeds is None:
+                self.know(float(found.course[FIRST]) / problem.unit, found.speeds_before, self._seen)
         else:
-            room.at_base, room.at_trial, room.coming = self, trial, None
-        if missed <= ASTRAY:
-            return forces, missed, trial
-        forces, missed = self.response.forces(self.speeds, shift, friction, self.forces)
-        return forces, missed, self.toward(forces)
+            forces = found.forces_before[: 3 * count].reshape(-1, 3).copy()
+            first = response.iterate(
+                self.tension, forces, float(sizes[-2]), found.speeds_before, found.velocities_before, None
+            )
+        forces, missed = found.forces[: 3 * count].reshape(-1, 3).copy(), float(found.missed[0])
+        end = response.made(self.tension, forces, found)
+        room.at_base, room.at_trial, room.coming = first, end, None
+        owner.ended = Ended(end.velocities, problem.dt, response.contacts.points, room.places)
+        if missed > ASTRAY:
+            forces, missed = response.forces(first.speeds, shift, friction, first.forces)
+            end = first.toward(forces)
+        return Stretch(tuple(sizes[:-1] / problem.unit), first, forces, missed, end)
 
     def anew(self) -> DeviceIterate:
         """See ``Iterate``. No response but that is at hand then."""
         old, owner, room = self.response, self.response.owner, self.response.room
         assert owner.at_hand is old
-        problem, base = old.tangent.problem, self._base()
-        found = room.anew(problem, self.tension, self.velocities, base=base)
-        if found is None:
-            # A sum may be definite where its first part is not.
-            response = owner(problem.tangent(owner.factors, self.velocities, self.tension), old.contacts)
-            found = room.again(base=base)
-        else:
-            tangent = Tangent(problem, owner.factors)
-            response = DeviceResponse.there(tangent, old.contacts, owner, room, room.delassus_here())
-            owner.at_hand = response
-        room.at_trial = room.coming = None
-        room.at_base = replace(self, response=response, speeds=found.speeds[: len(self.speeds)].copy())
-        return room.at_base
+        problem = old.tangent.problem
+        room.anew(problem, self.tension, self.velocities, base=self._base())
+        response = DeviceResponse.there(Tangent(problem, owner.factors), old.contacts, owner, room)
+        place = DeviceIterate(response, self.tension, self.velocities, self.forces)
+        place._size, place._seen, place._begun = self._size, self._seen, True
+        owner.at_hand, room.at_base, room.at_trial, room.coming = response, place, None, None
+        return place
+
+    def _wait(self) -> None:
+        """For what is on its way, which nothing has gone past."""
+        self._settle()
+        room = self.response.room
+        assert room.coming is None
+        if self is room.at_base and room.at_trial is None:
+            self.response.owner.stream.wait()
+            assert self._size is not None
+            self.know(self._size, room.answer.speeds, self._seen)
+            return
+        assert self is room.at_trial
+        self.response.owner.stream.wait()
+        found = room.answer
+        seen = Seen.of(found.seen) if self.response.owner.looked_at is self.response.tangent.problem else None
+        self.know(float(found.size[0]) / self.response.tangent.problem.unit, found.speeds, seen)
+
+    def _settle(self) -> None:
+        """Wait for a tangent that is begun; if it is not definite, another is made: a sum may be where its first part
+        is not."""
+        if not self._begun:
+            return
+        self._begun = False
+        owner, old = self.response.owner, self.response
+        if owner.factors.ready:
+            return
+        problem = old.tangent.problem
+        self._response = owner(problem.tangent(owner.factors, self.velocities, self.tension), old.contacts)
+        self._speeds = None
+        room = self._response.room
+        room.begin(problem, self.tension, self.velocities, self.forces)
+        room.at_trial = self
 
     def _base(self) -> float:
         """Where it lies; what the device has left behind is told it again."""
@@ -216,5 +296,5 @@ class DeviceIterate:
             return KEPT
         if self is not room.at_trial:
             room.begin(self.response.tangent.problem, self.tension, self.velocities, self.forces)
-            room.at_base, room.at_trial = None, self
+            room.at_base, room.at_trial, room.coming = None, self, None
         return TRIED

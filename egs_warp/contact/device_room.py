@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import warp as wp
 
+from egs_warp.contact.course import ITERATIONS, Course
 from egs_warp.contact.detection import ContactSet
 from egs_warp.contact.device_body import BodyRoom, vectors
 from egs_warp.contact.device_coulomb import CoulombRoom
@@ -16,16 +18,19 @@ from egs_warp.fem.graphs import Recordings, Upload
 from egs_warp.fem.step_problem import StepProblem
 from egs_warp.fem.worlds import shared
 from egs_warp.kernels.contact import batch_contacts as of_worlds
+from egs_warp.kernels.contact import course as courses
 from egs_warp.kernels.contact import iterate as kernels
 from egs_warp.muscles.tension import MuscleTension
 from egs_warp.precision import Mat33, Vec3, Vec4, real
 
 KEPT, TRIED, BEGUN = 0.0, 1.0, 2.0
 """Where a trial begins: at the base as it is, at the last trial, or at what was told."""
+_FORWARD = (1.0, 1.0, TRIED)
+"""What is told of a whole Newton step from the last trial."""
 
 
 class Tried(NamedTuple):
-    """What is asked of a trial, in memory that the next but one takes."""
+    """What is asked of a trial, in memory that the next one takes."""
 
     size: np.ndarray
     """(1,) N s that the step's equation misses; not finite where an element is inverted."""
@@ -39,6 +44,22 @@ class Tried(NamedTuple):
     """(3K,) newtons, these."""
     seen: np.ndarray
     """(5,), see ``Seen``."""
+    course: np.ndarray
+    """Of the round, see ``judge_kernel``, with N s after each step."""
+    speeds_before: np.ndarray
+    """(3K,) m/s, the speeds where the last step began, of which the next are the velocities and forces."""
+    velocities_before: np.ndarray
+    forces_before: np.ndarray
+
+    @property
+    def taken(self) -> int:
+        """Steps without a look."""
+        return int(self.course[courses.TAKEN])
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """(taken,) N s after each of them."""
+        return self.course[courses.HEADER :][: self.taken]
 
 
 class ContactRoom:
@@ -67,14 +88,16 @@ class ContactRoom:
         self._told = Upload(owner.stream, 3 + width)
         self.told, self.wanted = self._told.there.split([3, width])
         """Of a trial its length, whether forces push, where it begins; and the forces (3K,) newtons."""
-        parts = [1, width, size, 1, width, 5]
-        self._asked, self._asked_here = owner.zeros(sum(parts)), [owner.stream.pinned(sum(parts)) for _ in range(2)]
-        self._arrivals: list[Any] = [None, None]
-        self.slot = 0
-        """Where what was asked for last comes; one more may be on its way."""
-        self.size, self.speeds_after, self.velocities, self.missed, self._found, seen = self._asked.split(parts)
-        self._seen, self._torque_seen = seen.split([2, 3])
-        self._answers = [Tried(*np.split(each.numpy(), np.cumsum(parts)[:-1])) for each in self._asked_here]
+        parts = [1, width, size, 1, width, 5, courses.HEADER + ITERATIONS, width, size, width]
+        self._asked, self._asked_here = owner.zeros(sum(parts)), owner.stream.pinned(sum(parts))
+        self.size, self.speeds_after, self.velocities, self.missed, self._found, *others = self._asked.split(parts)
+        seen, self._course, self._speeds_before, *self._before = others
+        self._sinking, self._least, self._torque_seen = seen.split([1, 1, 3])
+        self.answer = Tried(*np.split(self._asked_here.numpy(), np.cumsum(parts)[:-1]))
+        # A loop of Newton steps: what it is told, whether it goes on, and when it has come to an end.
+        self._course_told = Upload(owner.stream, courses.HEADER)
+        self._going, self._always = (torch.full((1,), each, dtype=torch.int32, device=count.device) for each in (0, 1))
+        self._forward, self._arrival = owner.tensor(np.array(_FORWARD)), None
         self.coulomb = CoulombRoom(owner.stream, places, count)
         self._begun = Upload(owner.stream, 3 * size + width + owner.segment_count)
         self.begun, self.tensions = self._begun.there.split([3 * size + width, owner.segment_count])
@@ -83,14 +106,14 @@ class ContactRoom:
         self._base, self._trial = owner.zeros(3 * size + width), owner.zeros(3 * size + width)
         self.ends, self._gradient, self._rest, self._solved, self._pushed, self._half = owner.zeros(6, size)
         self._torque, self._turn = owner.zeros(2, 3)
-        # A whole Newton step from the trial, or from the base.
-        self._onward = {base: owner.tensor(np.array([1.0, 1.0, base])) for base in (KEPT, TRIED)}
         self._works = Recordings(owner.stream)
         self.at_base: Any = None
         self.at_trial: Any = None
         """The iterates that lie there."""
         self.coming: Any = None
-        """The iterate at the base from which ``begin_onward`` went last."""
+        """The iterate from which ``begin_onward`` went, if nobody has waited for that."""
+        self.course: Course | None = None
+        """That of which it was told."""
 
     def tried(self) -> Any:
         """Of the last trial, see ``parts``."""
@@ -116,15 +139,13 @@ class ContactRoom:
             [shared(made[None], real)],
         )
 
-    def respond(self, problem: StepProblem, contacts: ContactSet) -> np.ndarray:
-        """(3K, 3K) m/(N s) of ``contacts``, which are those of this room from now on, by the factors at hand."""
+    def respond(self, problem: StepProblem, contacts: ContactSet) -> None:
+        """To ``contacts``, which are those of this room from now on, by the factors at hand; nobody waits."""
         self.take(contacts)
         self._do(self.enqueue_response, problem.dt, 1.0 + problem.dt * problem.drag)
-        self.owner.stream.wait()
-        return self.delassus_here()
 
     def delassus_here(self) -> np.ndarray:
-        """What has come of ``respond``."""
+        """(3K, 3K) m/(N s), what has come of ``respond``."""
         return self._delassus_here.numpy().reshape(3 * self.places, -1).copy()
 
     def take(self, contacts: ContactSet) -> None:
@@ -190,11 +211,13 @@ class ContactRoom:
 
     def begin(
         self, problem: StepProblem, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray
-    ) -> Tried:
-        """A trial at the very ``velocities`` (N, 3) and ``forces`` (n, 3), under ``tension``."""
+    ) -> None:
+        """A trial at the very ``velocities`` (N, 3) and ``forces`` (n, 3), under ``tension``; nobody waits."""
         with self.owner.stream:
             self.begin_at(tension, velocities, forces)
-        return self.go(problem, length=0.0, push=False, wanted=forces, base=BEGUN)
+            self._tell(0.0, False, forces, BEGUN)
+            self._do(self._enqueue_trial, problem.dt, 1.0 + problem.dt * problem.drag)
+            self._told.sent()
 
     def begin_at(self, tension: MuscleTension | None, velocities: np.ndarray, forces: np.ndarray) -> None:
         """Tell where a trial may begin."""
@@ -207,34 +230,79 @@ class ContactRoom:
         self._tell(length, push, wanted, base)
         return self._ask(self._enqueue_trial, problem.dt, 1.0 + problem.dt * problem.drag)
 
-    def begin_onward(self, problem: StepProblem, shifts: np.ndarray, friction: float, *, base: float) -> int:
-        """A trial at the end of a Newton step from the ``base`` (``KEPT`` or ``TRIED``) under the forces that obey
-        contact and friction there; nobody waits for it but ``arrived``, with the number that this gives. At most two
-        are on their way."""
+    def begin_onward(
+        self,
+        problem: StepProblem,
+        shifts: np.ndarray,
+        friction: float,
+        course: Course,
+        *,
+        base: float,
+        size: float | None = None,
+        usual: torch.Tensor | None = None,
+    ) -> None:
+        """Newton steps from the ``base`` (``KEPT`` or ``TRIED``), where the residual has this ``size``, or that of the
+        last trial, each under the forces that obey contact and friction
+        where it begins, as long as the ``course`` of the round says nothing else, or none where ``usual`` (1,) int32
+        turns out to be 0; nobody waits for them but ``arrived``."""
+        dt, ratio = problem.dt, 1.0 + problem.dt * problem.drag
+        self.course, self.owner.ended = course, None
         with self.owner.stream:
             self.coulomb.tell(shifts, friction)
-            self.slot = 1 - self.slot
-            self._do(self._enqueue_onward, problem.dt, 1.0 + problem.dt * problem.drag, base, self.slot)
-            self._arrivals[self.slot] = self.owner.stream.mark(self._arrivals[self.slot])
-        return self.slot
+            self._course_told.take(course.told(problem.unit, size))
+            work = partial(self._enqueue_course, base, self._always if usual is None else usual)
+            self._works.run(("course", base, usual is None), work)
+            self._works.repeat((dt, ratio), lambda: self._enqueue_next_step(dt, ratio), self._going)
+            self._do(self._enqueue_end, dt)
+            self._arrival = self.owner.stream.mark(self._arrival)
 
-    def arrived(self, number: int) -> Tried:
+    def arrived(self) -> Tried:
         """What has come of ``begin_onward``."""
-        if self._arrivals[number] is not None:
-            self._arrivals[number].synchronize()
-        return self._answer(number)
+        if self._arrival is not None:
+            self._arrival.synchronize()
+        return self.answer
 
-    def _enqueue_onward(self, dt: float, ratio: float, base: float, slot: int) -> None:
-        self.wanted.copy_(self.parts(self._trial if base == TRIED else self._base)[3])
-        self.told.copy_(self._onward[base])
+    def _enqueue_course(self, base: float, usual: torch.Tensor) -> None:
+        if base == KEPT:
+            self._trial.copy_(self._base)
+        self._course[: courses.HEADER].copy_(self._course_told.there)
+        self._launch(
+            courses.begin_kernel,
+            1,
+            [shared(usual, wp.int32), shared(self.size, real)],
+            [shared(self._course, real), shared(self._going, wp.int32)],
+        )
+        self.told.copy_(self._forward)
+
+    def _enqueue_next_step(self, dt: float, ratio: float) -> None:
+        """From the last trial, and whether another comes after it."""
+        self.wanted.copy_(self.tried()[3])
+        self._speeds_before.copy_(self.speeds_after)
         self.enqueue_onward(dt, ratio)
+        self._enqueue_sinking()
+        self._launch(
+            courses.judge_kernel,
+            1,
+            [shared(each, real) for each in (self.size, self.missed, self._sinking)],
+            [shared(self._course, real), shared(self._going, wp.int32)],
+        )
+
+    def _enqueue_end(self, dt: float) -> None:
+        """What is asked of the last trial, of where its step began, and of a step that begins there."""
+        velocities, _, _, forces = self.parts(self._base)
+        for there, value in zip(self._before, (velocities, forces), strict=True):
+            there.copy_(value)
         self._look()
-        self._give(slot)
+        self.owner.enqueue_next(self.ends, self.velocities, dt, self._points)
+        self._give()
+
+    def _enqueue_sinking(self) -> None:
+        """Of points at the end of the last trial."""
+        self.owner.sight.enqueue_sinking(vectors(self.ends), self._points, self.coulomb.counts, self._sinking)
 
     def _look(self) -> None:
-        """What is to be seen at the end of the last trial, see ``Seen``."""
-        owner = self.owner
-        owner.sight.enqueue_sinking(vectors(self.ends), self._points, self.coulomb.counts, self._seen)
+        """The rest of what is to be seen there, see ``Seen``."""
+        self.owner.sight.enqueue_least(self._least[0])
         self._torque_seen.copy_(self._torque)
 
     def enqueue_onward(self, dt: float, ratio: float) -> None:
@@ -244,30 +312,32 @@ class ContactRoom:
         self.enqueue_trial(dt, ratio)
 
     def _tell(self, length: float, push: bool, wanted: np.ndarray, base: float) -> None:
-        told = self._told.here.numpy()
-        told[:3], told[3:] = (length, float(push), base), 0.0
-        told[3 : 3 + wanted.size] = wanted.ravel()
+        self._told.write(np.array([length, float(push), base]), wanted)
 
-    def again(self, *, base: float) -> Tried:
-        """The speeds at the ``base`` by the response at hand; the rest is another trial's."""
+    def _tell_base(self, base: float) -> None:
+        self._told.wait()
         self._told.here[2] = base
-        return self._ask(self._enqueue_again)
 
-    def anew(
-        self, problem: StepProblem, tension: MuscleTension | None, velocities: np.ndarray, *, base: float
-    ) -> Tried | None:
+    def again(self, *, base: float) -> None:
+        """The speeds at the ``base`` by the response at hand; the rest is another trial's. Nobody waits."""
+        with self.owner.stream:
+            self._tell_base(base)
+            self._do(self._enqueue_again)
+            self._told.sent()
+
+    def anew(self, problem: StepProblem, tension: MuscleTension | None, velocities: np.ndarray, *, base: float) -> None:
         """Factors and response by the tangent at the ``base``, where these ``velocities`` (N, 3) are, with the muscles'
-        stiffness, and the speeds there; None if it is not definite."""
+        stiffness, and the speeds there, all of which hold if these factors are ``ready``. Nobody waits."""
         owner, ratio = self.owner, 1.0 + problem.dt * problem.drag
-        self._told.here[2] = base
         with owner.stream:
+            self._tell_base(base)
             owner.factors.tell(ratio * np.repeat(owner.body.node_mass, 3))
             self._do(self._enqueue_factors, problem.dt)
+            self._told.sent()
             if tension is not None:
                 owner.enqueue_stiffness(problem, tension, velocities)
             self._do(self._enqueue_anew, problem.dt, ratio)
         owner.factors.begun()
-        return self._answer(0) if owner.factors.ready else None
 
     def _enqueue_factors(self, dt: float) -> None:
         owner = self.owner
@@ -285,11 +355,7 @@ class ContactRoom:
         with self.owner.stream:
             self._do(work, *given)
             self.owner.stream.wait()
-        return self._answer(0)
-
-    def _answer(self, slot: int) -> Tried:
-        """What has come of what was asked of a trial."""
-        return self._answers[slot]
+        return self.answer
 
     def _enqueue_base(self) -> None:
         self._launch(
@@ -305,9 +371,9 @@ class ContactRoom:
         self._enqueue_newton(self._base)
         self._give()
 
-    def _give(self, slot: int = 0) -> None:
+    def _give(self) -> None:
         """What was asked of a trial is on its way to the host."""
-        self._asked_here[slot].copy_(self._asked, non_blocking=True)
+        self._asked_here.copy_(self._asked, non_blocking=True)
 
     def _enqueue_newton(self, state: torch.Tensor) -> None:
         """A Newton step without contact forces from ``state``, and the contacts' speeds after it."""
@@ -351,6 +417,7 @@ class ContactRoom:
     def _enqueue_trial(self, dt: float, ratio: float) -> None:
         self._told.send()
         self.enqueue_trial(dt, ratio)
+        self._enqueue_sinking()
         self._look()
         self._give()
 

@@ -29,7 +29,9 @@ class DeviceSight:
         self._detector, self._points, self._stream = detector, points, stream
         self._tolerance = penetration_tolerance
         count, device = len(detector.geometry.tet_from_point), detector.device
-        self._gaps, self._start_gaps = (wp.zeros(count, dtype=real, device=device) for _ in range(2))
+        self._gaps, self._start_gaps, self._next_gaps, self._next_start_gaps = (
+            wp.zeros(count, dtype=real, device=device) for _ in range(4)
+        )
         self._faces, self._start_faces = (wp.zeros(count, dtype=int, device=device) for _ in range(2))
         bounds = np.searchsorted(points.cell_from_point[points.order], np.arange(points.cell_count + 1))
         self._cells = [wp.array(each.astype(np.int32), dtype=int, device=device) for each in (points.order, bounds)]
@@ -40,29 +42,47 @@ class DeviceSight:
     def look(self, positions: wp.array, ends: wp.array, before: np.ndarray) -> None:
         """Begin to ``choose`` for a step from ``positions`` (N,), which may end at ``ends`` (N,), after the points
         ``before`` (m,); nobody waits."""
-        room = self._room_for(before)
+        room = self._room_of(len(before))
         room.told.write(before)
 
         def look() -> None:
             room.told.send()
             self._detector.enqueue_gaps(positions, self._start_gaps, self._start_faces)
             self._detector.enqueue_gaps(ends, self._gaps, self._faces)
-            self._enqueue_choice(room)
+            self._enqueue_choice(room, self._gaps, self._start_gaps, self._start_faces)
 
         with self._stream:
             self._works.run((len(room.known), positions.ptr, ends.ptr), look)
 
-    def _room_for(self, before: np.ndarray) -> _Room:
-        places = by_steps(len(before), _KNOWN)
+    def _room_of(self, count: int) -> _Room:
+        places = by_steps(count, _KNOWN)
         if places not in self._rooms:
             self._rooms[places] = _Room(self._stream, places, self._points.cell_count)
         return self._rooms[places]
 
-    def choose(self, before: np.ndarray, loaded: np.ndarray, start: np.ndarray) -> ContactSet:
+    def enqueue_next(self, ends: wp.array, points: torch.Tensor) -> None:
+        """``look`` for a step from where the one at hand ends, after ``enqueue_sinking`` there, which may end at
+        ``ends`` (N,), after ``points`` (K,) int32; it counts if ``go_on`` says so."""
+        room = self._room_of(len(points))
+        room.told.there[: len(points)].copy_(points)
+        wp.to_torch(self._next_start_gaps).copy_(wp.to_torch(self._gaps))
+        self._detector.enqueue_gaps(ends, self._next_gaps, self._start_faces)
+        self._enqueue_choice(room, self._next_gaps, self._next_start_gaps, self._faces)
+
+    def go_on(self) -> None:
+        """To the step for which ``enqueue_next`` has looked."""
+        wp.to_torch(self._start_gaps).copy_(wp.to_torch(self._next_start_gaps))
+
+    def choose(
+        self, before: np.ndarray, loaded: np.ndarray, start: np.ndarray, *, places: int | None = None
+    ) -> ContactSet:
         """The contacts of the step for which ``look`` was begun, on the host from ``start`` (N, 3): those of
-        ``ContactPoints.choose`` after the points ``before`` (m,), of which those ``loaded`` (m,) bool pressed."""
-        self._stream.wait()
-        lowest, known = self._room_for(before).found()
+        ``ContactPoints.choose`` after the points ``before`` (m,), of which those ``loaded`` (m,) bool pressed; or what
+        ``enqueue_next`` has found with so many ``places``, which has come already."""
+        if places is None:
+            self._stream.wait()
+        room = self._room_of(len(before) if places is None else places)
+        lowest, known = room.found()
         known = known[: len(before)]
         low = lowest[lowest[:, 0] >= 0.0]
         points = self._points.among(before, loaded, known[:, 1], low[:, 0].astype(int), low[:, 1])
@@ -73,8 +93,8 @@ class DeviceSight:
         chosen = every[np.searchsorted(every[:, 0], points)]
         return self._detector.contact_set_at(points, start, chosen[:, 2], chosen[:, 3].astype(np.int32))
 
-    def _enqueue_choice(self, room: _Room) -> None:
-        gaps = [self._gaps, self._start_gaps, self._start_faces]
+    def _enqueue_choice(self, room: _Room, *gaps: wp.array) -> None:
+        """By ``gaps`` at the end and at the start, and faces there."""
         wp.launch(
             kernels.lowest_kernel,
             (self._points.cell_count, self._lanes),
@@ -93,8 +113,8 @@ class DeviceSight:
         room.give()
 
     def enqueue_sinking(self, ends: wp.array, points: torch.Tensor, counts: torch.Tensor, seen: torch.Tensor) -> None:
-        """Into ``seen`` (2,), of a step that was begun by ``choose`` and ends at ``ends`` (N,), how many points sink
-        that are none of ``counts`` (1,) ``points`` (K,) int32, and the least gap of all, metres."""
+        """Into ``seen`` (1,), of a step that was begun by ``choose`` and ends at ``ends`` (N,), how many points sink
+        that are none of ``counts`` (1,) ``points`` (K,) int32."""
         self._detector.enqueue_gaps(ends, self._gaps, self._faces)
         seen.zero_()
         wp.launch(
@@ -107,7 +127,10 @@ class DeviceSight:
             outputs=[shared(seen, real)],
             device=self._detector.device,
         )
-        torch.amin(wp.to_torch(self._gaps), dim=0, out=seen[1])
+
+    def enqueue_least(self, least: torch.Tensor) -> None:
+        """Into ``least`` () the least gap of all, metres, after ``enqueue_sinking``."""
+        torch.amin(wp.to_torch(self._gaps), dim=0, out=least)
 
 
 class _Room:

@@ -9,6 +9,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from egs_warp.contact.coulomb import coulomb_forces
+from egs_warp.contact.course import Course
 from egs_warp.contact.detection import ContactSet
 from egs_warp.contact.newton_room import NewtonRoom, NewtonState, address_of, newton_room
 from egs_warp.fem.body import BodyState
@@ -28,8 +29,6 @@ class ContactResponse:
     contacts: ContactSet
     columns: Any
     """(3N, 3n) m/s for each newton, where the factors are."""
-    delassus: np.ndarray
-    """(3n, 3n) m/(N s), contact velocities for each newton."""
 
     @classmethod
     def of(cls, tangent: Tangent, contacts: ContactSet, columns: np.ndarray | None = None) -> ContactResponse:
@@ -37,8 +36,12 @@ class ContactResponse:
         if columns is None:
             columns = tangent.solve(contacts.frame.T)
             columns *= tangent.problem.dt
-        delassus = contacts.speeds(columns)
-        return cls(tangent, contacts, columns, delassus)
+        return cls(tangent, contacts, columns)
+
+    @cached_property
+    def delassus(self) -> np.ndarray:
+        """(3n, 3n) m/(N s), contact velocities for each newton."""
+        return self.contacts.speeds(self.columns)
 
     @cached_property
     def columns_at(self) -> int:
@@ -196,9 +199,9 @@ class Iterate(Protocol):
         """``length`` of the way to the end of a Newton step with contact ``forces`` (n, 3)."""
         ...
 
-    def onward(self, shift: np.ndarray, friction: float, *, further: bool = False) -> tuple[np.ndarray, float, Iterate]:
-        """Forces (n, 3) that obey contact and friction if the contacts move at these ``speeds`` without them, the m/s
-        by which they miss that, and the end of a Newton step with them, from which it will go ``further``, likely."""
+    def onward(self, shift: np.ndarray, friction: float, course: Course | None = None) -> Stretch:
+        """A Newton step with the forces that obey contact and friction if the contacts move at these ``speeds`` without
+        them; where the ``course`` of a round is known, as many of them as go well, if nobody need look at each."""
         ...
 
     def anew(self) -> Iterate:
@@ -206,10 +209,25 @@ class Iterate(Protocol):
         ...
 
 
-def _onward(now: VectorIterate | HostIterate, shift: np.ndarray, friction: float) -> tuple[np.ndarray, float, Iterate]:
-    """``Iterate.onward``, one after the other."""
+@dataclass(frozen=True)
+class Stretch:
+    """Newton steps with contact, of which the last is to be looked at."""
+
+    sizes: tuple[float, ...]
+    """Residuals after those before it, which went well."""
+    base: Iterate
+    """Where it begins."""
+    forces: np.ndarray
+    """(n, 3) newtons, with which it is."""
+    missed: float
+    """m/s by which they miss contact and friction."""
+    end: Iterate
+
+
+def _onward(now: VectorIterate | HostIterate, shift: np.ndarray, friction: float) -> Stretch:
+    """``Iterate.onward`` by one step."""
     forces, missed = now.response.forces(now.speeds, shift, friction, now.forces)
-    return forces, missed, now.toward(forces)
+    return Stretch((), now, forces, missed, now.toward(forces))
 
 
 def _response_at(place: VectorIterate | HostIterate) -> ContactResponse:
@@ -276,7 +294,7 @@ class VectorIterate:
         found = _room_of(response).trial(response.tangent.problem, self.tension, self._after, step)
         return type(self)(response, self.tension, *found)
 
-    def onward(self, shift: np.ndarray, friction: float, *, further: bool = False) -> tuple[np.ndarray, float, Iterate]:
+    def onward(self, shift: np.ndarray, friction: float, course: Course | None = None) -> Stretch:
         """See ``Iterate``."""
         return _onward(self, shift, friction)
 
@@ -343,7 +361,7 @@ class HostIterate:
             forces=self.forces + length * (forces - self.forces),
         )
 
-    def onward(self, shift: np.ndarray, friction: float, *, further: bool = False) -> tuple[np.ndarray, float, Iterate]:
+    def onward(self, shift: np.ndarray, friction: float, course: Course | None = None) -> Stretch:
         """See ``Iterate``."""
         return _onward(self, shift, friction)
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import numpy as np
@@ -102,8 +103,13 @@ class GraphStream:
         second time. It must not wait for the device."""
         return work if self._stream is None else _Graph(work, self)
 
-    def record(self, work: Callable[[], None]) -> torch.cuda.CUDAGraph:
-        """What ``work`` asks of the device, none of which is done.
+    def repeated(self, work: Callable[[], None], going: torch.Tensor) -> Callable[[], None]:
+        """``work`` again and again while ``going`` (1,) int32 is not 0, as it says itself: on a GPU a loop within a
+        graph, for which nobody waits, once ``work`` has run as it is."""
+        return _Loop(work, self, going)
+
+    def record(self, work: Callable[[], None], *, keep: bool = False) -> torch.cuda.CUDAGraph:
+        """What ``work`` asks of the device, none of which is done; a graph to ``keep`` can be part of another.
 
         What graphs make on their way lies in the same memory: they run one after the other, and leave nothing there.
         The first is kept, since with the last of them that memory would go. No other thread may work on the device
@@ -113,19 +119,35 @@ class GraphStream:
         if self._pool is None:
             self._pool = torch.cuda.graph_pool_handle()
         self.wait()
-        graph, looks = torch.cuda.CUDAGraph(), gc.isenabled()
-        gc.disable()
-        try:
+        graph = torch.cuda.CUDAGraph(keep_graph=keep)
+        with _no_garbage():
             graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
             try:
                 work()
             finally:
                 graph.capture_end()
-        finally:
-            if looks:
-                gc.enable()
         self._first = self._first or graph
         return graph
+
+    def loop(self, graph: torch.cuda.CUDAGraph, going: torch.Tensor) -> Callable[[], None]:
+        """What was recorded to be kept, while ``going`` (1,) int32 is not 0: in a graph, if the driver knows loops."""
+        if not wp.is_conditional_graph_supported():
+
+            def replayed() -> None:
+                _repeat(graph.replay, going)
+
+            return replayed
+        stream = self._of_warp
+        assert stream is not None
+        within, condition = wp.Graph(stream.device), wp.from_torch(going)
+        within.graph = ctypes.c_void_p(graph.raw_cuda_graph())
+        with _no_garbage():
+            wp.capture_begin(stream=stream)
+            wp.capture_while(condition, within, stream=stream)
+            loop = wp.capture_end(stream=stream)
+        # Torch's, who gives it back.
+        within.graph = None
+        return lambda: wp.capture_launch(loop, stream=stream)
 
     def pinned(self, count: int) -> torch.Tensor:
         """(count,) of zeros on the host, which a GPU reads and writes by itself. Warp's: torch would note, when its own
@@ -145,18 +167,25 @@ class Upload:
         """``parts`` one behind the other, zeros behind the last."""
         self.write(*parts)
         self.send()
-        self._sent = self._stream.mark(self._sent)
+        self.sent()
 
     def write(self, *parts: np.ndarray) -> None:
-        """The same, for a graph to ``send``; what it has sent before must have gone."""
+        """The same, for a graph to ``send``; what it has sent before must have gone, or be known to be ``sent``."""
         here, at = self.here.numpy(), 0
-        if self._sent is not None:
-            # What was told before may still be on its way.
-            self._sent.synchronize()
+        self.wait()
         for part in parts:
             here[at : at + part.size] = part.ravel()
             at += part.size
         here[at:] = 0.0
+
+    def sent(self) -> None:
+        """It is on its way."""
+        self._sent = self._stream.mark(self._sent)
+
+    def wait(self) -> None:
+        """Until what is on its way has gone."""
+        if self._sent is not None:
+            self._sent.synchronize()
 
     def send(self) -> None:
         """What lies ``here`` now."""
@@ -173,11 +202,21 @@ class Recordings:
     def run(self, key: Hashable, work: Callable[[], None]) -> None:
         """``work``, or what was recorded of that with the same ``key``."""
         if key not in self._kept:
-            self._kept[key] = self._stream.recorded(work)
-            while len(self._kept) > _MOST:
-                self._kept.popitem(last=False)
+            self._keep(key, self._stream.recorded(work))
         self._kept.move_to_end(key)
         self._kept[key]()
+
+    def repeat(self, key: Hashable, work: Callable[[], None], going: torch.Tensor) -> None:
+        """The same again and again while ``going`` (1,) int32 is not 0."""
+        if key not in self._kept:
+            self._keep(key, self._stream.repeated(work, going))
+        self._kept.move_to_end(key)
+        self._kept[key]()
+
+    def _keep(self, key: Hashable, work: Callable[[], None]) -> None:
+        self._kept[key] = work
+        while len(self._kept) > _MOST:
+            self._kept.popitem(last=False)
 
     def forget(self) -> None:
         """All of them."""
@@ -199,3 +238,43 @@ class _Graph:
         if self._graph is None:
             self._graph = self._stream.record(self._work)
         self._graph.replay()
+
+
+class _Loop:
+    """Work that is repeated, and the loop of its graph once there is one."""
+
+    def __init__(self, work: Callable[[], None], stream: GraphStream, going: torch.Tensor) -> None:
+        self._work, self._stream, self._going = work, stream, going
+        self._warm = False
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._looped: Callable[[], None] | None = None
+
+    def __call__(self) -> None:
+        if self._looped is None and (self._going.device.type == "cpu" or not self._warm):
+            self._warm = _repeat(self._work, self._going) > 0
+            return
+        if self._looped is None:
+            self._graph = self._stream.record(self._work, keep=True)
+            self._looped = self._stream.loop(self._graph, self._going)
+        self._looped()
+
+
+def _repeat(work: Callable[[], None], going: torch.Tensor) -> int:
+    """How often ``work`` was done while ``going`` was not 0, at which the host looks each time."""
+    count = 0
+    while int(going) != 0:
+        work()
+        count += 1
+    return count
+
+
+@contextmanager
+def _no_garbage() -> Iterator[None]:
+    """Python looks for none meanwhile."""
+    looks = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if looks:
+            gc.enable()

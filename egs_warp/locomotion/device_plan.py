@@ -13,13 +13,14 @@ import torch
 import warp as wp
 
 from egs_warp.contact.coulomb import ASTRAY
+from egs_warp.contact.course import Course
 from egs_warp.contact.device_body import vectors
 from egs_warp.contact.device_response import DeviceResponder, DeviceResponse
 from egs_warp.contact.device_room import BEGUN, KEPT, TRIED, ContactRoom
 from egs_warp.contact.response import ContactResponse
 from egs_warp.fem.dense_factors import DenseFactors
 from egs_warp.fem.graphs import Recordings, Upload
-from egs_warp.fem.step_problem import Tangent
+from egs_warp.fem.step_problem import StepProblem, Tangent
 from egs_warp.fem.worlds import shared
 from egs_warp.kernels.locomotion import step_program as kernels
 from egs_warp.kernels.locomotion.active_set import FOUND
@@ -44,9 +45,17 @@ LIKELY = 0.5 * COSTLY
 class DevicePlanner:
     """Plans of one body's steps, of the strategy ``pieces``."""
 
-    def __init__(self, planner: StepPlanner, owner: DeviceResponder, linear: DeviceLinearSteps) -> None:
+    def __init__(
+        self,
+        planner: StepPlanner,
+        owner: DeviceResponder,
+        linear: DeviceLinearSteps,
+        course: Callable[[StepProblem], Course],
+    ) -> None:
+        """``course``: of the first round of a step's solve."""
         assert isinstance(planner.factors, DenseFactors)
         self.planner, self.owner, self.linear, self.factors = planner, owner, linear, planner.factors
+        self.course = course
         self.asked, self.others = Transfers(owner.stream), Transfers(owner.stream)
         muscles, body = planner.muscles, planner.body
         self.members = owner.tensor(planner.synergies.members.toarray())
@@ -125,6 +134,8 @@ class PlanRoom:
         self._objective, self._beside = 0.0, False
         # What contact answers where a second search begins, and by how much that misses its laws: it is only a start.
         self._answered, self._answered_missed = zeros(width), zeros(1)
+        # Whether the solve goes on from the first search's end.
+        self._goes_on = torch.zeros(1, dtype=torch.int32, device=body.factors.device)
         self._works, self._arrived = Recordings(body.stream), None
 
     def begin(self, start: StepStart) -> None:
@@ -153,7 +164,7 @@ class PlanRoom:
         if not (verdicts.min() > 0.0 and np.isfinite(sizes).all() and missed.max() <= ASTRAY):
             return None
         tangent = Tangent(problem, body.factors)
-        body.at_hand = DeviceResponse.there(tangent, start.contacts, body, room, room.delassus_here())
+        body.at_hand = DeviceResponse.there(tangent, start.contacts, body, room)
         plan = self._found(start, body.at_hand)
         return None if plan is None else (body.at_hand, plan)
 
@@ -179,13 +190,13 @@ class PlanRoom:
         self.owner.factors.begun()
 
     def _search_for(self, start: StepStart, objectives: Sequence[AnyObjective]) -> None:
-        """The program about the linear step, its search, and the first step of the solve, for which nobody waits."""
+        """The program about the linear step, and its search; the solve, for which nobody waits, if that is settled."""
         dt, ratio = start.problem.dt, 1.0 + start.problem.dt * start.problem.drag
         with self.body.stream:
             self._ask(start, objectives)
             self._beside = start.contacts.count > 0 and self._objective >= LIKELY
             self._do(self._enqueue_search, dt, ratio, self._horizon(dt), self._beside)
-        self._begin_solve(start)
+        self._begin_solve(start, self._goes_on)
 
     def _horizon(self, dt: float) -> float:
         """Seconds."""
@@ -220,7 +231,7 @@ class PlanRoom:
         tension = MuscleTension.of(planner.muscles, activations)
         forces = forces[: 3 * contacts].reshape(-1, 3).copy()
         end = response.iterate(tension, forces, float(size), speeds, velocities, None)
-        room.at_base = room.coming = end
+        room.at_base, room.at_trial, room.coming = None, None, end
         return Plan(activations, end.velocities, end.forces, int(count), int(infeasible))
 
     def _searched_on(self, found: PieceSearch, contacts: int) -> PieceSearch:
@@ -277,7 +288,7 @@ class PlanRoom:
         self._second.enqueue()
 
     def _end_at(self, x: np.ndarray, start: StepStart) -> None:
-        """The end of another search than the first, ``x`` (m + 3n,), and the first step of the solve from there."""
+        """The end of another search than the first, ``x`` (m + 3n,), and the solve from there."""
         body, problem = self.body, start.problem
         with body.stream:
             self._point.take(x, np.zeros(len(self._x) - 1 - len(x)), np.ones(1))
@@ -285,11 +296,12 @@ class PlanRoom:
             self._do(self._enqueue_end, problem.dt, 1.0 + problem.dt * problem.drag)
         self._begin_solve(start)
 
-    def _begin_solve(self, start: StepStart) -> None:
-        """Wait for the plan, while its solve begins."""
+    def _begin_solve(self, start: StepStart, usual: torch.Tensor | None = None) -> None:
+        """Wait for the plan, while its solve goes on if all is as ``usual``."""
         with self.body.stream:
             self._arrived = self.body.stream.mark(self._arrived)
-        self.room.begin_onward(start.problem, start.shift, start.friction, base=TRIED)
+        course = self.owner.course(start.problem)
+        self.room.begin_onward(start.problem, start.shift, start.friction, course, base=TRIED, usual=usual)
         if self._arrived is not None:
             self._arrived.synchronize()
 
@@ -405,6 +417,13 @@ class PlanRoom:
             len(self._x),
             inputs=[shared(laws.counts, wp.int32), self._search.answer, self.m],
             outputs=[shared(self._x, real)],
+            device=target,
+        )
+        wp.launch(
+            kernels.settled_kernel,
+            1,
+            inputs=[shared(laws.counts, wp.int32), self._search.answer, COSTLY],
+            outputs=[shared(self._goes_on, wp.int32)],
             device=target,
         )
         self._answer.copy_(wp.to_torch(self._search.answer))

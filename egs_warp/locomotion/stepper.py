@@ -123,7 +123,7 @@ class LocomotionStepper:
             linear_steps_by(self.respond, muscles, synergies),
         )
         # By this planner; and how the step begins that comes next, likely.
-        self._at_once = _device_planner(self.planner, self.respond)
+        self._at_once = _device_planner(self.planner, self.respond, self.solver)
         self._ahead: tuple[StepMemory, StepStart] | None = None
 
     def with_friction(self, friction: float) -> LocomotionStepper:
@@ -343,10 +343,11 @@ class LocomotionStepper:
         now = response.at(tension, velocities, known)
         forces = known
         for _ in range(LOOKS):
-            forces, _, ahead = now.onward(start.shift, start.friction)
-            if not ahead.feasible:
+            stretch = now.onward(start.shift, start.friction)
+            forces = stretch.forces
+            if not stretch.end.feasible:
                 break
-            now = ahead
+            now = stretch.end
         return Prospect(response, start.shift, start.activations, now.velocities, forces)
 
     def _finish(
@@ -405,7 +406,7 @@ def linear_steps_by(respond: Responder, muscles: MuscleSet, synergies: Synergies
     return DeviceLinearSteps(respond, muscles, synergies)
 
 
-def _device_planner(planner: StepPlanner, respond: Responder) -> Any:
+def _device_planner(planner: StepPlanner, respond: Responder, solver: CoupledSolver) -> Any:
     """Plans where the matrices are, if they are not on the host, and the search is a kernel; else None."""
     settings, device = planner.settings, planner.body.assembly.device
     if isinstance(respond, HostResponder) or Strategy(settings.strategy) is not Strategy.PIECES:
@@ -417,4 +418,4 @@ def _device_planner(planner: StepPlanner, respond: Responder) -> Any:
     from egs_warp.locomotion.device_plan import DevicePlanner
 
     assert isinstance(respond, DeviceResponder) and isinstance(planner.linear_steps, DeviceLinearSteps)
-    return DevicePlanner(planner, respond, planner.linear_steps)
+    return DevicePlanner(planner, respond, planner.linear_steps, solver.course)

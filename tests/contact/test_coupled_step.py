@@ -252,30 +252,6 @@ def test_points_join_before_the_step_without_them_has_converged(monkeypatch: pyt
     np.testing.assert_allclose(soon.velocities, late.velocities, atol=1e-7 * falling.body.speed_unit)
 
 
-def test_what_likely_ends_a_round_is_not_gone_on_from(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Most steps by which a round comes to points that join, or to its end, are known for that by how residuals fell;
-    most others are gone on from at once."""
-    rounds: list[list[bool]] = []
-    onward, solved = responses.VectorIterate.onward, coupled_step.CoupledSolver._round
-
-    def seen(*given: Any, further: bool) -> Any:
-        rounds[-1].append(further)
-        return onward(*given, further=further)
-
-    def begun(*given: Any, **options: Any) -> Any:
-        rounds.append([])
-        return solved(*given, **options)
-
-    monkeypatch.setattr(responses.VectorIterate, "onward", seen)
-    monkeypatch.setattr(coupled_step.CoupledSolver, "_round", begun)
-    falling = block(lift=0.01)
-    for _ in range(12):
-        falling.advance(DT)
-    known = [each for each in rounds if len(each) > 2]
-    last, others = [each[-1] for each in known], [each for one in known for each in one[:-1]]
-    assert len(known) > 8 and np.mean(last) < 0.3 and np.mean(others) > 0.8
-
-
 def test_a_tangent_that_leads_nowhere_is_made_anew() -> None:
     """That of a body without stiffness and a billionth as heavy inverts elements however short its step: the end is the
     one that the body's own tangent leads to, which is made once.

@@ -7,6 +7,7 @@ import pytest
 
 pytest.importorskip("torch")
 
+from egs_warp.contact.course import Course
 from egs_warp.contact.device_response import DeviceResponder
 from egs_warp.contact.response import ContactResponse, Iterate
 from egs_warp.fem import dense_factors
@@ -109,15 +110,16 @@ def test_what_is_at_hand_no_more_is_told_again(
     assert_alike(first.toward(forces), second)
     shift = np.zeros(6)
     begun = first.onward(shift, 0.8)
-    # The device has gone on, past what it has told.
-    again = first.onward(shift, 0.8, further=True)
+    # The device goes on past what it has told first.
+    again = first.onward(shift, 0.8, Course(1e-12, 0.0, np.inf))
+    assert len(again.sizes) > 1
     for one, other in (
-        (begun, again),
         (first.onward(shift, 0.8), begun),
-        (again[2].onward(shift, 0.8), begun[2].onward(shift, 0.8)),
+        (again.end.onward(shift, 0.8), again.end.onward(shift, 0.8)),
+        (begun.end.onward(shift, 0.8), begun.end.onward(shift, 0.8)),
     ):
-        np.testing.assert_allclose(one[0], other[0], rtol=0, atol=1e-10)
-        assert_alike(one[2], other[2])
+        np.testing.assert_allclose(one.forces, other.forces, rtol=0, atol=1e-10)
+        assert_alike(one.end, other.end)
     respond(tangent, contacts)
     for left in (first, second):
         with pytest.raises(AssertionError):
@@ -165,6 +167,8 @@ def test_a_tangent_whose_sum_fails_is_the_host_s(
     place = stepper.respond(tangent, contacts).at(tension, problem.start, forces).toward(2.0 * forces)
     monkeypatch.setattr(dense_factors._InverseRoot, "add", lambda root, directions, sign: 0.0 * directions[0, 0])
     found = place.anew()
+    # Nobody has waited for the sum so far.
+    assert len(found.speeds) == 18
     whole = problem.tangent(stepper.factors, place.velocities, tension)
     expected = ContactResponse.of(whole, contacts).at(tension, place.velocities, place.forces)
     assert_alike(expected, found)

@@ -70,13 +70,29 @@ def test_the_points_of_a_step_are_the_host_s(kind: str, device: str) -> None:
         assert_alike(there, here)
         changed += len(before) > 0 and here.count > 0 and not np.array_equal(before, here.points)
         taken = there.points[::2]
-        seen = torch.zeros(2, dtype=torch.float64, device=device)
+        seen, least = torch.zeros((2, 1), dtype=torch.float64, device=device)
         told = torch.as_tensor(taken.astype(np.int32), device=device)
         sight.enqueue_sinking(ends, told, torch.tensor([len(taken)], dtype=torch.int32, device=device), seen)
         allowed = np.where(gaps < -TOLERANCE, CREEPS, SINKS) * TOLERANCE
         sinks = (gaps < -ADDED * TOLERANCE) & (gaps < detector.gaps(at)[0] - allowed)
         sinks[taken] = False
-        assert seen[0].item() == sinks.sum() and seen[1].item() == pytest.approx(gaps.min(), abs=1e-12)
+        sight.enqueue_least(least[0])
+        assert seen.item() == sinks.sum() and least.item() == pytest.approx(gaps.min(), abs=1e-12)
         sunk += sinks.any()
+        # Where it ends the next step begins.
+        after = then + 0.002 * random.standard_normal(nodes.shape)
+        next_ends = wp.array(after, dtype=Vec3, device=device)
+        places = torch.as_tensor(np.append(taken, [0] * 5).astype(np.int32), device=device)
+        sight.enqueue_next(next_ends, places)
+        sight.go_on()
+        loaded = random.random(len(taken)) < 0.5
+        expected = points.choose(taken, loaded, detector.gaps(after)[0])
+        assert_alike(sight.choose(taken, loaded, then, places=len(places)), detector.contact_set(expected, then))
+        sight.enqueue_sinking(next_ends, told, torch.tensor([len(taken)], dtype=torch.int32, device=device), seen)
+        later = detector.gaps(after)[0]
+        allowed = np.where(later < -TOLERANCE, CREEPS, SINKS) * TOLERANCE
+        sinks = (later < -ADDED * TOLERANCE) & (later < gaps - allowed)
+        sinks[taken] = False
+        assert seen.item() == sinks.sum()
         before = here.points
     assert changed > 1 and sunk > 1

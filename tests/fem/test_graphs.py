@@ -14,6 +14,7 @@ import pytest
 pytest.importorskip("torch")
 
 import torch
+import warp as wp
 
 from egs_warp.fem import graphs
 from egs_warp.fem.graphs import GraphStream, Recordings, Upload
@@ -38,6 +39,36 @@ def test_recorded_work_reads_what_is_told_each_time(device: str) -> None:
         np.testing.assert_array_equal(here.numpy(), expected)
     # A GPU has it run once, and once to record it.
     assert len(runs) == (5 if device == "cpu" else 2)
+
+
+@pytest.mark.parametrize("loops", [True, False])
+def test_repeated_work_goes_on_while_it_says_so(device: str, monkeypatch: pytest.MonkeyPatch, loops: bool) -> None:
+    """From what is told each time, not at all where it says so before; with a driver that knows loops, and with one
+    that does not."""
+    if not loops:
+        monkeypatch.setattr(wp, "is_conditional_graph_supported", lambda: False)
+    stream = GraphStream(torch.device(device))
+    told, here = Upload(stream, 2), stream.pinned(2)
+    going, sums = torch.zeros(1, dtype=torch.int32, device=device), torch.zeros(2, dtype=torch.float64, device=device)
+    works, runs = Recordings(stream), []
+
+    def work() -> None:
+        runs.append(len(runs))
+        # With what is made on the way.
+        sums.add_(torch.stack([torch.ones_like(told.there[0]), told.there[0]]))
+        going.copy_(sums[:1] < told.there[1])
+
+    for number, steps in enumerate([0, 3, 1, 5, 0, 2]):
+        with stream:
+            told.take(np.array([number + 0.5, steps]))
+            sums.zero_()
+            going.fill_(steps > 0)
+            works.repeat("steps", work, going)
+            here.copy_(sums, non_blocking=True)
+            stream.wait()
+        np.testing.assert_array_equal(here.numpy(), [steps, steps * (number + 0.5)])
+    # A GPU has it run three times the first time that there is anything to do, and once to record it.
+    assert len(runs) == (11 if device == "cpu" else 4)
 
 
 def test_the_last_works_are_kept_by_their_keys(device: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -139,15 +139,18 @@ def test_the_solve_goes_on_from_the_plan_s_end(
         monkeypatch.setattr(
             ContactRoom, name, lambda *given, name=name, real=real, **named: asked.append(name) or real(*given, **named)
         )
+    course = stepper.solver.course(start.problem)
     first = response.at(tension, plan.velocities, plan.forces)
-    forces, missed, ahead = first.onward(start.shift, start.friction)
-    assert asked == [] and first.size > 0.0
+    stretch = first.onward(start.shift, start.friction, course)
+    assert asked == [] and first.size > 0.0 and len(stretch.sizes) > 1
     second = response.at(tension, plan.velocities.copy(), plan.forces)
     assert second.size == pytest.approx(first.size, rel=1e-7)
     np.testing.assert_allclose(second.speeds, first.speeds, rtol=0, atol=1e-10)
-    others, _, beyond = second.onward(start.shift, start.friction)
-    assert asked == ["begin", "begin_onward"] and missed < 1e-10
-    np.testing.assert_allclose(others, forces, rtol=0, atol=1e-7 * stepper.body.weight)
+    other = second.onward(start.shift, start.friction, course)
+    ahead, beyond = stretch.end, other.end
+    assert asked == ["begin", "begin_onward"] and stretch.missed < 1e-10
+    np.testing.assert_allclose(other.sizes, stretch.sizes, rtol=1e-3, atol=1e-7)
+    np.testing.assert_allclose(other.forces, stretch.forces, rtol=0, atol=1e-7 * stepper.body.weight)
     np.testing.assert_allclose(beyond.velocities, ahead.velocities, rtol=0, atol=1e-10)
     assert ahead.seen is not None and beyond.seen is not None
     assert ahead.seen.sinking == beyond.seen.sinking
@@ -155,9 +158,9 @@ def test_the_solve_goes_on_from_the_plan_s_end(
     np.testing.assert_allclose(beyond.seen.torque, ahead.seen.torque, rtol=1e-6)
 
 
-@pytest.mark.parametrize("further", [False, True])
-def test_what_is_asked_again_is_the_host_s(creature: Creature, stepper: LocomotionStepper, further: bool) -> None:
-    """About the end of a Newton step, where the device is, or has been: it is on its way ``further``. What it has left
+@pytest.mark.parametrize("last", [False, True])
+def test_what_is_asked_again_is_the_host_s(creature: Creature, stepper: LocomotionStepper, last: bool) -> None:
+    """About the end of the ``last`` Newton step, where the device is, or about where that began. What it has left
     behind is the host's to plan."""
     memory, objectives = stepper.initial_memory(), asks(creature, 0.1)
     start = begun(stepper, on_its_edge(stepper), memory)
@@ -165,7 +168,9 @@ def test_what_is_asked_again_is_the_host_s(creature: Creature, stepper: Locomoti
     assert found is not None
     response, plan = found
     tension = MuscleTension.of(stepper.muscles, plan.activations)
-    _, _, end = response.at(tension, plan.velocities, plan.forces).onward(start.shift, start.friction, further=further)
+    course = stepper.solver.course(start.problem)
+    stretch = response.at(tension, plan.velocities, plan.forces).onward(start.shift, start.friction, course)
+    end = stretch.end if last else stretch.base
     prospect = Prospect(response, start.shift, plan.activations, end.velocities, end.forces)
     again = planner_of(stepper).plan_again(prospect, memory.activations, objectives, start.friction)
     assert again is not None
@@ -174,6 +179,7 @@ def test_what_is_asked_again_is_the_host_s(creature: Creature, stepper: Locomoti
     np.testing.assert_allclose(again.activations, expected.activations, rtol=0, atol=1e-7 * stepper.body.height)
     np.testing.assert_allclose(again.velocities, expected.velocities, rtol=0, atol=1e-7 * stepper.body.speed_unit)
     np.testing.assert_allclose(again.forces, expected.forces, rtol=0, atol=1e-6 * stepper.body.weight)
+    response.begun_at(None, 0.5 * end.velocities, end.forces)
     assert planner_of(stepper).plan_again(prospect, memory.activations, objectives, start.friction) is None
 
 
@@ -231,12 +237,12 @@ def test_a_search_goes_on_as_the_host_s(
     assert asked == again + expected[what]
     found = planner_of(stepper).plan(start, objectives)
     assert found is not None
-    forces, missed, ahead = (
+    stretch = (
         found[0]
         .at(MuscleTension.of(stepper.muscles, found[1].activations), found[1].velocities, found[1].forces)
-        .onward(start.shift, start.friction)
+        .onward(start.shift, start.friction, stepper.solver.course(start.problem))
     )
-    assert missed < 1e-9 and ahead.feasible and forces.shape == found[1].forces.shape
+    assert stretch.missed < 1e-9 and stretch.end.feasible and stretch.forces.shape == found[1].forces.shape
 
 
 @pytest.mark.parametrize("what", ["verdicts", "sizes", "missed", "horizon", "end", "forces"])

@@ -5,13 +5,14 @@ See ``egs_warp/locomotion/device_plan.py``; numbers are told as ``search_kernel`
 
 import warp as wp
 
+from egs_warp.kernels.locomotion.active_set import FOUND
 from egs_warp.kernels.locomotion.piece_search import HEADER, unit_of
 from egs_warp.kernels.locomotion.pieces import FREE, NEARLY, NOTHING, SLIDE, STICK
 from egs_warp.precision import Vec3, real
 
 wp.set_module_options({"enable_backward": False})
 
-_HEADER = wp.constant(HEADER)
+_HEADER, _FOUND = wp.constant(HEADER), wp.constant(int(FOUND))
 _FREE, _STICK, _SLIDE = wp.constant(FREE), wp.constant(STICK), wp.constant(SLIDE)
 _NOTHING, _NEARLY = wp.constant(real(NOTHING)), wp.constant(real(NEARLY))
 
@@ -110,3 +111,20 @@ def take_kernel(
     elif k == last:
         value = real(1.0)
     x_out[k] = value
+
+
+@wp.kernel
+def settled_kernel(
+    # In:
+    counts: wp.array[int],
+    answer: wp.array[real],
+    costly: real,
+    # Out:
+    settled_out: wp.array[int],
+):
+    """1 if the ``answer`` is a point that costs so little that no other is sought, else 0; one that is in no contact
+    has no other."""
+    settled = int(0)
+    if answer[0] == real(_FOUND) and answer[4] == real(1.0) and (counts[0] == 0 or answer[3] < costly):
+        settled = 1
+    settled_out[0] = settled
