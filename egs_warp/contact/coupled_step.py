@@ -87,33 +87,42 @@ class CoupledSolver:
         """The step from a start of ``velocities`` (N, 3), which invert no element, and ``forces`` (n, 3); ``response``
         is kept while it serves.
         """
-        problem = response.tangent.problem
         iterations = tangents = 0
         for number in range(ROUNDS):
-            result, added = self._round(response, tension, velocities, forces, last=number == ROUNDS - 1)
+            result, wider = self._round(response, tension, velocities, forces, last=number == ROUNDS - 1)
             response = result.response
             iterations, tangents = iterations + result.iterations, tangents + result.tangents
             velocities, forces = result.velocities, result.forces
-            if len(added) == 0:
+            if wider is None:
                 break
-            contacts = response.contacts
-            contacts = self.detector.contact_set(np.concatenate([contacts.points, added]), problem.state.positions)
-            response = response.wider(contacts)
-            forces = np.vstack([forces, np.zeros((len(added), 3))])
+            forces = np.vstack([forces, np.zeros((wider.count - len(forces), 3))])
+            response = response.wider(wider)
         return replace(result, iterations=iterations, tangents=tangents)
 
-    def _sinking(self, problem: StepProblem, contacts: ContactSet, end: Iterate) -> np.ndarray:
-        """(k,) points not among ``contacts`` that would ``end`` too deep."""
-        if end.seen is not None and not end.seen.sinking:
-            return contacts.points[:0]
+    def _wider(self, problem: StepProblem, contacts: ContactSet, end: Iterate) -> ContactSet | None:
+        """``contacts``, and points that would ``end`` too deep; None if none would."""
+        seen, start = end.seen, problem.state.positions
+        if seen is not None and not seen.sinking:
+            return None
+        if seen is not None and seen.deepest is not None:
+            joining = seen.deepest[self.points.lowest_first(seen.deepest[:, 0], seen.deepest[:, 1])]
+            return self.detector.contact_set_at(
+                np.concatenate([contacts.points, joining[:, 0].astype(int)]),
+                start,
+                np.concatenate([contacts.gaps, joining[:, 2]]),
+                np.concatenate([contacts.faces, joining[:, 3].astype(np.int32)]),
+            )
         gaps, _ = self.detector.gaps(problem.end_positions(end.velocities))
         depth = ADDED * self.penetration_tolerance
         if gaps.min() >= -depth:
-            return contacts.points[:0]
-        start_gaps, _ = self.detector.gaps(problem.state.positions)
+            return None
+        start_gaps, _ = self.detector.gaps(start)
         # What is deep already is held where it is only once it would go deeper.
         allowed = np.where(gaps < -self.penetration_tolerance, CREEPS, SINKS) * self.penetration_tolerance
-        return self.points.deeper(contacts.points, np.where(gaps < start_gaps - allowed, gaps, 0.0), depth)
+        added = self.points.deeper(contacts.points, np.where(gaps < start_gaps - allowed, gaps, 0.0), depth)
+        if len(added) == 0:
+            return None
+        return self.detector.contact_set(np.concatenate([contacts.points, added]), start)
 
     def _round(
         self,
@@ -123,13 +132,13 @@ class CoupledSolver:
         forces: np.ndarray,
         *,
         last: bool,
-    ) -> tuple[CoupledResult, np.ndarray]:
-        """With the contacts of ``response``: where it ends, or where points are found that are to join them, and these
-        (k,); none in the ``last`` round."""
+    ) -> tuple[CoupledResult, ContactSet | None]:
+        """With the contacts of ``response``: where it ends, or where points are found that are to join them, and all of
+        these; None in the ``last`` round."""
         problem, contacts = response.tangent.problem, response.contacts
         shift = self.shift(contacts, problem.dt)
         friction = self.detector.geometry.friction
-        course, none = self.course(problem, last=last), contacts.points[:0]
+        course = self.course(problem, last=last)
         tangents, unanswered, fresh = 0, 0, False
         now = response.at(tension, velocities, forces)
         while course.steps < ITERATIONS:
@@ -151,11 +160,11 @@ class CoupledSolver:
                 joins = not last and obeys and (ended or course.may_join(now.size, before.size))
                 course = course.after(now.size)
                 if joins:
-                    added = self._sinking(problem, contacts, now)
-                    if len(added) > 0:
-                        return _result(now, ended, course.steps, tangents), added
+                    wider = self._wider(problem, contacts, now)
+                    if wider is not None:
+                        return _result(now, ended, course.steps, tangents), wider
                 if ended:
-                    return _result(now, True, course.steps, tangents), none
+                    return _result(now, True, course.steps, tangents), None
             else:
                 course, slow = course.in_vain(), True
                 if fresh:
@@ -166,7 +175,7 @@ class CoupledSolver:
             if slow:
                 now = now.anew()
                 tangents, fresh = tangents + 1, True
-        return _result(now, False, course.steps, tangents), none
+        return _result(now, False, course.steps, tangents), None
 
 
 def _result(end: Iterate, converged: bool, iterations: int, tangents: int) -> CoupledResult:

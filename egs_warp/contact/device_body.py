@@ -25,6 +25,8 @@ from egs_warp.precision import Mat33, Vec3, real
 
 _DIRECTIONS = 64
 """Of muscles' stiffness so many are added at a time."""
+_SIGNS = (1.0, -1.0)
+"""Of what is added, the second one last."""
 
 
 @dataclass(frozen=True)
@@ -166,15 +168,20 @@ class BodyRoom:
         """Add that of muscles under ``tension`` at the end of ``velocities`` (N, 3) to the matrix that is factored."""
         segments, ways, rates = tension.hessian(problem.end_positions(velocities)).ways(least=NEGLIGIBLE)
         # What pulls adds to it, what pushes takes away; what is there in between adds nothing.
-        of_signs = [(sign, np.flatnonzero(sign * rates > 0.0)) for sign in (1.0, -1.0)]
-        told = [np.zeros((by_steps(len(chosen), _DIRECTIONS), 4)) for _, chosen in of_signs]
-        for (_, chosen), part in zip(of_signs, told, strict=True):
+        of_signs = {sign: np.flatnonzero(sign * rates > 0.0) for sign in _SIGNS}
+        told = [np.zeros((by_steps(len(chosen), _DIRECTIONS), 4)) for chosen in of_signs.values()]
+        for chosen, part in zip(of_signs.values(), told, strict=True):
             part[: len(chosen), 0] = segments[chosen]
             part[: len(chosen), 1:] = problem.dt * np.sqrt(np.abs(rates[chosen]))[:, None] * ways[chosen]
         self._ways.take(*told)
-        parts = self._ways.there[: sum(part.size for part in told)].view(-1, 4).split([len(part) for part in told])
-        for (sign, chosen), part in zip(of_signs, parts, strict=True):
-            if len(chosen) > 0:
+        places, signs = tuple(map(len, told)), tuple(sign for sign, chosen in of_signs.items() if len(chosen) > 0)
+        self._works.run((places, signs), lambda: self._enqueue_sums(places, signs))
+
+    def _enqueue_sums(self, places: tuple[int, ...], signs: tuple[float, ...]) -> None:
+        """Of the ways that were told, so many for each sign, those with these ``signs``."""
+        parts = self._ways.there[: 4 * sum(places)].view(-1, 4).split(places)
+        for sign, part in zip(_SIGNS, parts, strict=True):
+            if sign in signs:
                 directions = self._rows[part[:, 0].long()][:, :, None] * part[:, None, 1:]
                 self.factors.enqueue_sum(directions.view(len(part), -1), sign)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -238,6 +238,8 @@ class DeviceIterate:
             )
         forces, missed = found.forces[: 3 * count].reshape(-1, 3).copy(), float(found.missed[0])
         end = response.made(self.tension, forces, found)
+        if end._seen is not None and end._seen.sinking:
+            end._seen = replace(end._seen, deepest=owner.sight.deepest(room.places))
         room.at_base, room.at_trial, room.coming = first, end, None
         owner.ended = Ended(end.velocities, problem.dt, response.contacts.points, room.places)
         if missed > ASTRAY:

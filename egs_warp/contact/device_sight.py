@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 import warp as wp
@@ -32,7 +34,10 @@ class DeviceSight:
         self._gaps, self._start_gaps, self._next_gaps, self._next_start_gaps = (
             wp.zeros(count, dtype=real, device=device) for _ in range(4)
         )
-        self._faces, self._start_faces = (wp.zeros(count, dtype=int, device=device) for _ in range(2))
+        self._deep = wp.zeros(count, dtype=real, device=device)
+        self._faces, self._start_faces, self._next_faces, self._next_start_faces = (
+            wp.zeros(count, dtype=int, device=device) for _ in range(4)
+        )
         bounds = np.searchsorted(points.cell_from_point[points.order], np.arange(points.cell_count + 1))
         self._cells = [wp.array(each.astype(np.int32), dtype=int, device=device) for each in (points.order, bounds)]
         self._lanes = 1 if device.is_cpu else kernels.BLOCK
@@ -65,13 +70,22 @@ class DeviceSight:
         ``ends`` (N,), after ``points`` (K,) int32; it counts if ``go_on`` says so."""
         room = self._room_of(len(points))
         room.told.there[: len(points)].copy_(points)
-        wp.to_torch(self._next_start_gaps).copy_(wp.to_torch(self._gaps))
-        self._detector.enqueue_gaps(ends, self._next_gaps, self._start_faces)
-        self._enqueue_choice(room, self._next_gaps, self._next_start_gaps, self._faces)
+        for there, values in ((self._next_start_gaps, self._gaps), (self._next_start_faces, self._faces)):
+            wp.to_torch(there).copy_(wp.to_torch(values))
+        self._detector.enqueue_gaps(ends, self._next_gaps, self._next_faces)
+        self._enqueue_lowest(-ADDED * self._tolerance, [self._deep, self._start_gaps, self._start_faces], room.deepest)
+        self._enqueue_choice(room, self._next_gaps, self._next_start_gaps, self._next_start_faces)
 
     def go_on(self) -> None:
         """To the step for which ``enqueue_next`` has looked."""
-        wp.to_torch(self._start_gaps).copy_(wp.to_torch(self._next_start_gaps))
+        for there, values in ((self._start_gaps, self._next_start_gaps), (self._start_faces, self._next_start_faces)):
+            wp.to_torch(there).copy_(wp.to_torch(values))
+
+    def deepest(self, places: int) -> np.ndarray:
+        """(k, 4) of points that sink where ``enqueue_next`` began the deepest of each cell: its number, its gap there,
+        metres, and gap and face at the start of the step."""
+        deepest = self._room_of(places).found()[2]
+        return deepest[deepest[:, 0] >= 0.0]
 
     def choose(
         self, before: np.ndarray, loaded: np.ndarray, start: np.ndarray, *, places: int | None = None
@@ -82,7 +96,7 @@ class DeviceSight:
         if places is None:
             self._stream.wait()
         room = self._room_of(len(before) if places is None else places)
-        lowest, known = room.found()
+        lowest, known, _ = room.found()
         known = known[: len(before)]
         low = lowest[lowest[:, 0] >= 0.0]
         points = self._points.among(before, loaded, known[:, 1], low[:, 0].astype(int), low[:, 1])
@@ -95,14 +109,7 @@ class DeviceSight:
 
     def _enqueue_choice(self, room: _Room, *gaps: wp.array) -> None:
         """By ``gaps`` at the end and at the start, and faces there."""
-        wp.launch(
-            kernels.lowest_kernel,
-            (self._points.cell_count, self._lanes),
-            inputs=[*self._cells, self._points.near, self._points.alike, *gaps],
-            outputs=[shared(room.lowest, Vec4)],
-            device=self._detector.device,
-            block_dim=self._lanes,
-        )
+        self._enqueue_lowest(self._points.near, gaps, room.lowest)
         wp.launch(
             kernels.known_kernel,
             len(room.known),
@@ -111,6 +118,16 @@ class DeviceSight:
             device=self._detector.device,
         )
         room.give()
+
+    def _enqueue_lowest(self, near: float, gaps: Sequence[wp.array], lowest: torch.Tensor) -> None:
+        wp.launch(
+            kernels.lowest_kernel,
+            (self._points.cell_count, self._lanes),
+            inputs=[*self._cells, near, self._points.alike, *gaps],
+            outputs=[shared(lowest, Vec4)],
+            device=self._detector.device,
+            block_dim=self._lanes,
+        )
 
     def enqueue_sinking(self, ends: wp.array, points: torch.Tensor, counts: torch.Tensor, seen: torch.Tensor) -> None:
         """Into ``seen`` (1,), of a step that was begun by ``choose`` and ends at ``ends`` (N,), how many points sink
@@ -124,7 +141,7 @@ class DeviceSight:
                 *(ADDED * self._tolerance, self._tolerance, SINKS, CREEPS),
                 *(shared(points, wp.int32), shared(counts, wp.int32), self._gaps, self._start_gaps),
             ],
-            outputs=[shared(seen, real)],
+            outputs=[shared(seen, real), self._deep],
             device=self._detector.device,
         )
 
@@ -137,16 +154,15 @@ class _Room:
     """What goes there and comes back with so many points that are known."""
 
     def __init__(self, stream: GraphStream, places: int, cells: int) -> None:
-        self.told = Upload(stream, places)
-        self._made = torch.zeros((cells + places, 4), dtype=torch.float64, device=stream.device)
-        self.lowest, self.known = self._made.split([cells, places])
-        self._made_here, self._cells = stream.pinned(self._made.numel()), cells
+        self.told, self._parts = Upload(stream, places), [cells, places, cells]
+        self._made = torch.zeros((sum(self._parts), 4), dtype=torch.float64, device=stream.device)
+        self.lowest, self.known, self.deepest = self._made.split(self._parts)
+        self._made_here = stream.pinned(self._made.numel())
 
     def give(self) -> None:
         """On its way to the host."""
         self._made_here.copy_(self._made.view(-1), non_blocking=True)
 
-    def found(self) -> tuple[np.ndarray, np.ndarray]:
-        """What has come: of the cells, and of the points that were told."""
-        made = self._made_here.numpy().reshape(-1, 4)
-        return made[: self._cells], made[self._cells :]
+    def found(self) -> list[np.ndarray]:
+        """What has come: of the cells, of the points that were told, and of the cells what sinks."""
+        return np.split(self._made_here.numpy().reshape(-1, 4), np.cumsum(self._parts)[:-1])

@@ -75,6 +75,10 @@ class ContactPoints:
         deep[points] = False
         return self._lowest(deep, gaps)
 
+    def lowest_first(self, points: np.ndarray, gaps: np.ndarray) -> np.ndarray:
+        """(n,) the order of ``points`` (n,) with ``gaps`` (n,) metres, each the lowest of its cell, in ``deeper``."""
+        return np.lexsort((points, np.rint(gaps / self.alike)))
+
     def _lowest(self, among: np.ndarray, gaps: np.ndarray) -> np.ndarray:
         """(k,) of the points ``among`` (P,) bool the lowest of each cell, the lowest of all first; of those that lie
         alike the one next to the cell's middle."""
@@ -85,8 +89,8 @@ class ContactPoints:
         begins = np.flatnonzero(np.diff(cells, prepend=-1))
         least = np.repeat(np.minimum.reduceat(heights, begins), np.diff(begins, append=len(points)))
         found = np.flatnonzero(heights == least)
-        found = found[np.diff(cells[found], prepend=-1) > 0]
-        return points[found[np.lexsort((points[found], heights[found]))]]
+        found = points[found[np.diff(cells[found], prepend=-1) > 0]]
+        return found[self.lowest_first(found, gaps[found])]
 
     @staticmethod
     def matched(points: np.ndarray, before: np.ndarray, forces: np.ndarray) -> np.ndarray:

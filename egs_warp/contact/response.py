@@ -150,6 +150,9 @@ class Seen:
     """Metres, of all points."""
     torque: np.ndarray
     """(3,) N m about the centre of mass of the internal gradient at the end."""
+    deepest: np.ndarray | None = None
+    """(k, 4) the deepest of each cell of those that sink: its number, its gap there, metres, and gap and face at the
+    start of the step; None if nobody asked which."""
 
     @classmethod
     def of(cls, found: np.ndarray) -> Seen:

@@ -79,12 +79,19 @@ def test_the_points_of_a_step_are_the_host_s(kind: str, device: str) -> None:
         sight.enqueue_least(least[0])
         assert seen.item() == sinks.sum() and least.item() == pytest.approx(gaps.min(), abs=1e-12)
         sunk += sinks.any()
+        before_it, joining = detector.gaps(at), points.deeper(taken, np.where(sinks, gaps, 0.0), ADDED * TOLERANCE)
         # Where it ends the next step begins.
         after = then + 0.002 * random.standard_normal(nodes.shape)
         next_ends = wp.array(after, dtype=Vec3, device=device)
         places = torch.as_tensor(np.append(taken, [0] * 5).astype(np.int32), device=device)
         sight.enqueue_next(next_ends, places)
         sight.go_on()
+        found = sight.deepest(len(places))
+        found = found[points.lowest_first(found[:, 0], found[:, 1])]
+        assert np.array_equal(found[:, 0], joining)
+        np.testing.assert_allclose(found[:, 1], gaps[joining], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found[:, 2], before_it[0][joining], rtol=0, atol=1e-12)
+        assert np.array_equal(found[:, 3], before_it[1][joining])
         loaded = random.random(len(taken)) < 0.5
         expected = points.choose(taken, loaded, detector.gaps(after)[0])
         assert_alike(sight.choose(taken, loaded, then, places=len(places)), detector.contact_set(expected, then))

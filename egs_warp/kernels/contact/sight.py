@@ -80,11 +80,14 @@ def sinking_kernel(
     start_gaps: wp.array[real],
     # In and out:
     sinking: wp.array[real],
+    # Out:
+    deep_out: wp.array[real],
 ):
     """How many points more than ``depth`` metres deep sink, see ``CoupledSolver``, that are none of ``counts[0]``
-    ``points``."""
+    ``points``; their gaps in ``deep_out``, 0 for all others."""
     point = wp.tid()
     gap = gaps[point]
+    deep = real(0.0)
     if gap < -depth:
         allowed = sinks * tolerance
         if gap < -tolerance:
@@ -96,3 +99,5 @@ def sinking_kernel(
                     among = 1
             if among == 0:
                 wp.atomic_add(sinking, 0, real(1.0))
+                deep = gap
+    deep_out[point] = deep
