@@ -94,6 +94,29 @@ def test_what_inverts_an_element_is_no_number(creature: Creature, device: str, m
     assert near.feasible and near.size == pytest.approx(host.toward(crushed, 1e-6).size, rel=1e-6)
 
 
+def test_what_was_no_number_is_left_behind(creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step is begun alike after another whose matrix had no factor, or whose end was no number."""
+    stepper = on_device(creature, device, monkeypatch)
+    respond, (problem, *_) = stepper.respond, problems(stepper, creature)
+    contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
+    tangent = problem.tangent(stepper.factors, problem.start, None)
+    tension, forces = pulled(creature, 3, 0.02), np.ones((6, 3))
+    host = ContactResponse.of(tangent, contacts)
+    expected = creature.stepper.respond.ahead(tangent, contacts, tension, problem.start, forces)
+    assert expected is not None
+    room = respond.room_for(contacts)
+    for _ in range(3):
+        for part in (room.columns, room.delassus, room.ends, room._base, room._trial, room._pushed, respond.keeping):
+            part.fill_(np.nan)
+        found = respond.ahead(tangent, contacts, tension, problem.start, forces)
+        assert found is not None
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+        room._trial.fill_(np.nan)
+        assert_alike(
+            host.at(tension, problem.start, forces), respond(tangent, contacts).at(tension, problem.start, forces)
+        )
+
+
 def test_what_is_at_hand_no_more_is_told_again(
     creature: Creature, device: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -51,10 +51,13 @@ def trial_kernel(
     ends_out: wp.array[Vec3],
 ):
     """``lengths[0]`` of the way to the end of a Newton step, which moves at ``loose`` without contact forces and is
-    ``pushed`` by them; where the nodes are then, from ``starts`` on."""
+    ``pushed`` by them; where the nodes are then, from ``starts`` on. Where nothing of the way is gone its end need be no
+    number."""
     node = wp.tid()
-    end = loose[node] + pushed[node]
-    velocity = velocities[node] + lengths[0] * (end - velocities[node])
+    velocity = velocities[node]
+    if lengths[0] != real(0.0):
+        end = loose[node] + pushed[node]
+        velocity = velocities[node] + lengths[0] * (end - velocities[node])
     velocities_out[node] = velocity
     ends_out[node] = starts[node] + dt * velocity
 
@@ -70,7 +73,10 @@ def trial_forces_kernel(
 ):
     """``lengths[0]`` of the way from ``forces`` to those that are ``wanted``."""
     contact = wp.tid()
-    forces_out[contact] = forces[contact] + lengths[0] * (wanted[contact] - forces[contact])
+    force = forces[contact]
+    if lengths[0] != real(0.0):
+        force = forces[contact] + lengths[0] * (wanted[contact] - forces[contact])
+    forces_out[contact] = force
 
 
 @wp.kernel
