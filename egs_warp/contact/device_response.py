@@ -1,4 +1,4 @@
-"""Contact responses and iterates on a GPU: matrices stay there, and a Newton step is one graph and one read-back."""
+"""Contact responses and iterates on a GPU: matrices stay there, a round of Newton steps is one loop and one look."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Memory and graphs for a step with contact on a GPU: matrices stay there, and a Newton step is one graph."""
+"""Memory and graphs for a step with contact on a GPU: matrices stay there, and a round of Newton steps is one loop."""
 
 from __future__ import annotations
 

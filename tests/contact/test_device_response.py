@@ -98,6 +98,7 @@ def test_what_was_no_number_is_left_behind(creature: Creature, device: str, monk
     """A step is begun alike after another whose matrix had no factor, or whose end was no number."""
     stepper = on_device(creature, device, monkeypatch)
     respond, (problem, *_) = stepper.respond, problems(stepper, creature)
+    assert isinstance(respond, DeviceResponder)
     contacts = creature.stepper.solver.detector.contact_set(np.arange(6), problem.state.positions)
     tangent = problem.tangent(stepper.factors, problem.start, None)
     tension, forces = pulled(creature, 3, 0.02), np.ones((6, 3))

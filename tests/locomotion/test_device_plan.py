@@ -179,7 +179,7 @@ def test_what_is_asked_again_is_the_host_s(creature: Creature, stepper: Locomoti
     np.testing.assert_allclose(again.activations, expected.activations, rtol=0, atol=1e-7 * stepper.body.height)
     np.testing.assert_allclose(again.velocities, expected.velocities, rtol=0, atol=1e-7 * stepper.body.speed_unit)
     np.testing.assert_allclose(again.forces, expected.forces, rtol=0, atol=1e-6 * stepper.body.weight)
-    response.begun_at(None, 0.5 * end.velocities, end.forces)
+    response.at(None, 0.5 * end.velocities, end.forces)
     assert planner_of(stepper).plan_again(prospect, memory.activations, objectives, start.friction) is None
 
 

@@ -51,8 +51,8 @@ def trial_kernel(
     ends_out: wp.array[Vec3],
 ):
     """``lengths[0]`` of the way to the end of a Newton step, which moves at ``loose`` without contact forces and is
-    ``pushed`` by them; where the nodes are then, from ``starts`` on. Where nothing of the way is gone its end need be no
-    number."""
+    ``pushed`` by them; where the nodes are then, from ``starts`` on. Of a way of which nothing is gone the end need be
+    no number."""
     node = wp.tid()
     velocity = velocities[node]
     if lengths[0] != real(0.0):

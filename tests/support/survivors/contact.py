@@ -18,12 +18,6 @@ CONTACT = [
         "halving 39 times ends an arm 2e-12 of its length from the ground, 40 times 1e-12",
     ),
     Survivor(
-        "contact/coupled_step.py",
-        "SLOW = 0.7",
-        "SLOW = -0.7",
-        "a new tangent in every iteration: slower, to the same end",
-    ),
-    Survivor(
         "contact/points.py",
         "lowest = self._lowest(gaps < self.near, gaps)",
         "lowest = self._lowest(gaps <= self.near, gaps)",
