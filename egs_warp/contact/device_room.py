@@ -242,9 +242,9 @@ class ContactRoom:
         usual: torch.Tensor | None = None,
     ) -> None:
         """Newton steps from the ``base`` (``KEPT`` or ``TRIED``), where the residual has this ``size``, or that of the
-        last trial, each under the forces that obey contact and friction
-        where it begins, as long as the ``course`` of the round says nothing else, or none where ``usual`` (1,) int32
-        turns out to be 0; nobody waits for them but ``arrived``."""
+        last trial, each under the forces that obey contact and friction where it begins, as long as the ``course`` of
+        the round says nothing else, or none where ``usual`` (1,) int32 turns out to be 0; nobody waits for them but
+        ``arrived``."""
         dt, ratio = problem.dt, 1.0 + problem.dt * problem.drag
         self.course, self.owner.ended = course, None
         with self.owner.stream:
