@@ -116,8 +116,11 @@ class DeviceResponse(ContactResponse):
 
     def made(self, tension: MuscleTension | None, forces: np.ndarray, found: Tried) -> DeviceIterate:
         """Of what the room has ``found``."""
-        seen = Seen.of(found.seen) if self.owner.looked_at is self.tangent.problem else None
-        return self.iterate(tension, forces, float(found.size[0]), found.speeds, found.velocities, seen)
+        return self.iterate(tension, forces, float(found.size[0]), found.speeds, found.velocities, self.seen_in(found))
+
+    def seen_in(self, found: Tried) -> Seen | None:
+        """What there is to be seen in what the room has ``found``; None if nobody has looked at the step's start."""
+        return Seen.of(found.seen) if self.owner.looked_at is self.tangent.problem else None
 
     def iterate(
         self,
@@ -200,7 +203,7 @@ class DeviceIterate:
         self._settle()
         room, problem = self.response.room, self.response.tangent.problem
         assert self.response.owner.at_hand is self.response
-        found = room.go(problem, length=length, push=True, wanted=forces, base=self._base())
+        found = room.go(problem, length=length, wanted=forces, base=self._base())
         told = forces if length == 1.0 else self.forces + length * (forces - self.forces)
         room.at_base, room.at_trial, room.coming = self, self.response.made(self.tension, told, found), None
         return room.at_trial
@@ -262,18 +265,14 @@ class DeviceIterate:
     def _wait(self) -> None:
         """For what is on its way, which nothing has gone past."""
         self._settle()
-        room = self.response.room
-        assert room.coming is None
-        if self is room.at_base and room.at_trial is None:
-            self.response.owner.stream.wait()
-            assert self._size is not None
-            self.know(self._size, room.answer.speeds, self._seen)
-            return
-        assert self is room.at_trial
-        self.response.owner.stream.wait()
-        found = room.answer
-        seen = Seen.of(found.seen) if self.response.owner.looked_at is self.response.tangent.problem else None
-        self.know(float(found.size[0]) / self.response.tangent.problem.unit, found.speeds, seen)
+        response, room = self.response, self.response.room
+        assert room.coming is None and self is (room.at_trial or room.at_base)
+        response.owner.stream.wait()
+        size, seen = self._size, self._seen
+        if self is room.at_trial:
+            size, seen = float(room.answer.size[0]) / response.tangent.problem.unit, response.seen_in(room.answer)
+        assert size is not None
+        self.know(size, room.answer.speeds, seen)
 
     def _settle(self) -> None:
         """Wait for a tangent that is begun; if it is not definite, another is made: a sum may be where its first part

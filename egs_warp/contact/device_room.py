@@ -225,9 +225,9 @@ class ContactRoom:
         told = [] if tension is None else [tension.tensions]
         self._begun.take(velocities, velocities, np.zeros(velocities.size), forces, more, *told)
 
-    def go(self, problem: StepProblem, *, length: float, push: bool, wanted: np.ndarray, base: float) -> Tried:
-        """A trial from the ``base`` (``KEPT``, ``TRIED`` or ``BEGUN``)."""
-        self._tell(length, push, wanted, base)
+    def go(self, problem: StepProblem, *, length: float, wanted: np.ndarray, base: float) -> Tried:
+        """A trial at so much of the way from the ``base`` (``KEPT`` or ``TRIED``) to the end of a Newton step."""
+        self._tell(length, True, wanted, base)
         return self._ask(self._enqueue_trial, problem.dt, 1.0 + problem.dt * problem.drag)
 
     def begin_onward(
