@@ -72,9 +72,9 @@ class DevicePlanner:
         self._room_for(start).begin(start)
 
     def plan(self, start: StepStart, objectives: Sequence[AnyObjective]) -> tuple[ContactResponse, Plan] | None:
-        """The response that is at hand then, and the plan for what the ``objectives`` ask, from whose end the solve goes
-        on there; None where something is not as usual: a matrix that is not definite, an element that is inverted, or
-        forces that are not found."""
+        """The response that is at hand then, and the plan for what the ``objectives`` ask, at whose end the solve goes
+        on; None where something is not as usual: a matrix that is not definite, an element that is inverted, or forces
+        that are not found."""
         if self.owner.foreseen is not start:
             self.begin(start)
         return self._room_for(start).plan(start, objectives)
